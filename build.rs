@@ -1,0 +1,133 @@
+//! Makes MuJoCo available to the linker and, at run time, to the binary: without a step by the user.
+//!
+//! `.cargo/config.toml` points mujoco-rs at `third_party/mujoco/link`, where a linker script named `libmujoco.so` asks for
+//! `libmujoco.so.3.17.0`. This script fetches that file into `third_party/mujoco/lib` with pip, by package name and hash.
+//! With `MUJOCO_DYNAMIC_LINK_DIR` or `MUJOCO_STATIC_LINK_DIR` set by the user, nothing is fetched.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::{env, fs};
+
+const VERSION: &str = "3.17.0";
+
+/// Wheels of `mujoco` 3.17.0 by target architecture: (pip platform tag, sha256). The Python tag only selects the wheel;
+/// the library in it does not depend on Python.
+const WHEELS: [(&str, &str, &str); 2] = [
+    ("x86_64", "manylinux_2_28_x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
+    ("aarch64", "manylinux_2_28_aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
+];
+
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
+    println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
+    version_facts();
+    if env::var_os("DOCS_RS").is_some() || env::var_os("MUJOCO_STATIC_LINK_DIR").is_some() {
+        return;
+    }
+    let root = PathBuf::from(variable("CARGO_MANIFEST_DIR"));
+    let linked = PathBuf::from(variable("MUJOCO_DYNAMIC_LINK_DIR"));
+    let library_folder = if linked.starts_with(root.join("third_party")) {
+        let folder = root.join("third_party/mujoco/lib");
+        let library = folder.join(format!("libmujoco.so.{VERSION}"));
+        println!("cargo::rerun-if-changed={}", library.display());
+        if !library.is_file()
+            && let Err(reason) = fetch(&library)
+        {
+            fail(&reason);
+        }
+        println!("cargo::rustc-link-search=native={}", folder.display());
+        folder
+    } else {
+        linked
+    };
+    // A binary finds the library beside itself, in a `lib` folder beside or above itself, or where it was built.
+    for place in ["$ORIGIN", "$ORIGIN/lib", "$ORIGIN/../lib", &library_folder.display().to_string()] {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{place}");
+    }
+}
+
+/// What `version.txt` of a run records about the build.
+fn version_facts() {
+    for path in [".git/HEAD", ".git/logs/HEAD"] {
+        if Path::new(path).exists() {
+            println!("cargo::rerun-if-changed={path}");
+        }
+    }
+    let output = |command: &mut Command| {
+        let output = command.output().ok().filter(|o| o.status.success())?;
+        Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    };
+    let commit = output(Command::new("git").args(["describe", "--always", "--dirty", "--abbrev=12"]));
+    let rustc = output(Command::new(variable("RUSTC")).arg("--version"));
+    println!("cargo::rustc-env=SHADOW_REPOSE_COMMIT={}", commit.unwrap_or_else(|| "unknown".into()));
+    println!("cargo::rustc-env=SHADOW_REPOSE_RUSTC={}", rustc.unwrap_or_else(|| "unknown".into()));
+    println!("cargo::rustc-env=SHADOW_REPOSE_TARGET={}", variable("TARGET"));
+}
+
+/// Downloads the wheel with pip (which checks the hash) and moves the library out of it to `library`.
+fn fetch(library: &Path) -> Result<(), String> {
+    let (os, arch) = (variable("CARGO_CFG_TARGET_OS"), variable("CARGO_CFG_TARGET_ARCH"));
+    let (_, platform, hash) = WHEELS
+        .iter()
+        .find(|(name, ..)| os == "linux" && *name == arch)
+        .ok_or(format!("there is no prepared download for {os} on {arch}"))?;
+    let work = PathBuf::from(variable("OUT_DIR")).join("mujoco-wheel");
+    let told = |error: std::io::Error| error.to_string();
+    let _ = fs::remove_dir_all(&work);
+    fs::create_dir_all(&work).map_err(told)?;
+    let requirement = work.join("requirement.txt");
+    fs::write(&requirement, format!("mujoco=={VERSION} --hash=sha256:{hash}\n")).map_err(told)?;
+    let pip = "-m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --python-version 311 \
+               --implementation cp --abi cp311 --require-hashes --platform";
+    python(
+        Command::new("python3")
+            .args(pip.split_whitespace())
+            .arg(platform)
+            .arg("-r")
+            .arg(&requirement)
+            .arg("-d")
+            .arg(&work),
+    )?;
+    let wheel = fs::read_dir(&work)
+        .map_err(told)?
+        .flatten()
+        .map(|entry| entry.path())
+        .find(|path| path.extension().is_some_and(|e| e == "whl"))
+        .ok_or("pip reported success but left no wheel")?;
+    python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(&work))?;
+    let unpacked = work.join(format!("mujoco/libmujoco.so.{VERSION}"));
+    let folder = library.parent().expect("the library lies in a folder");
+    fs::create_dir_all(folder).map_err(told)?;
+    // Copied under another name and renamed: an interrupted build leaves no half library behind.
+    let partial = folder.join(format!("libmujoco.partial.{}", std::process::id()));
+    fs::copy(&unpacked, &partial).map_err(|e| format!("{}: {e}", unpacked.display()))?;
+    fs::rename(&partial, library).map_err(told)?;
+    let _ = fs::remove_dir_all(&work);
+    Ok(())
+}
+
+fn python(command: &mut Command) -> Result<(), String> {
+    let output = command.output().map_err(|e| format!("python3 could not be started ({e})"))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    let last: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).rev().take(3).collect();
+    let last: Vec<&str> = last.into_iter().rev().collect();
+    Err(format!("python3 -m pip said: {}", last.join(" / ")))
+}
+
+fn fail(reason: &str) -> ! {
+    eprintln!(
+        "\nMuJoCo {VERSION} (libmujoco.so.{VERSION}) is missing and could not be fetched: {reason}\n\
+         Two ways out:\n  \
+         1. make `python3 -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index), then build again;\n  \
+         2. unpack a MuJoCo {VERSION} release yourself and build with MUJOCO_DYNAMIC_LINK_DIR=/absolute/path/to/its/lib\n"
+    );
+    std::process::exit(1);
+}
+
+fn variable(name: &str) -> String {
+    env::var(name).unwrap_or_else(|_| fail(&format!("the build variable {name} is not set")))
+}

@@ -1,0 +1,107 @@
+//! The Shadow Hand in a scene: its names, bound once, in the order of the task, and the layouts that follow from them.
+
+use anyhow::{Context, Result, ensure};
+
+use crate::sim::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
+
+/// Numbers in an action, one for each actuator.
+pub const ACTION_SIZE: usize = 20;
+
+/// Numbers in an observation: joints, their velocities, cube (13), goal (7), relative rotation (4), fingertips (5 × 13),
+/// previous action.
+pub const OBSERVATION_SIZE: usize = 24 + 24 + 13 + 7 + 4 + 65 + ACTION_SIZE;
+
+/// Joints in the order of the observation.
+const JOINTS: [&str; 24] = [
+    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
+    "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
+];
+
+/// Actuators in the order of the action; a J0 drives the sum of J2 and J1.
+const ACTUATORS: [&str; ACTION_SIZE] = [
+    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "RFJ4", "RFJ3", "RFJ0",
+    "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
+];
+
+/// Fingertips in the order of the observation.
+const FINGERTIPS: [&str; 5] = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"];
+
+/// Where everything that the task uses lies in a scene.
+pub struct Hand {
+    /// In the order of the observation.
+    pub joints: [Hinge; 24],
+    /// In the order of the action.
+    pub actuators: [Actuator; ACTION_SIZE],
+    /// For each actuator the joints whose angles it drives the sum of, as indices into `joints`.
+    pub driven: [Vec<usize>; ACTION_SIZE],
+    /// Index, middle, ring, little finger, thumb.
+    pub fingertips: [Body; 5],
+    /// The cube.
+    pub cube: FreeJoint,
+    /// The cube that shows the goal.
+    pub target: Mocap,
+}
+
+impl Hand {
+    /// Finds every name in `scene`, in whatever order its file has them.
+    ///
+    /// # Errors
+    /// The first name that is missing or belongs to something else, with the scene's file.
+    pub fn bind(scene: &Scene) -> Result<Self> {
+        let joints = each(JOINTS, |joint| scene.hinge(&format!("rh_{joint}")))?;
+        let driven = each(ACTUATORS, |actuator| Ok(driven_by(actuator)))?;
+        let actuators = each(ACTUATORS, |actuator| {
+            let coupled: Vec<String> = match actuator.strip_suffix("J0") {
+                Some(finger) => vec![format!("rh_{finger}J2"), format!("rh_{finger}J1")],
+                None => Vec::new(),
+            };
+            scene.actuator(&format!("rh_A_{actuator}"), &format!("rh_{actuator}"), &coupled)
+        })?;
+        ensure!(
+            scene.controls() == ACTION_SIZE,
+            "{}: has {} controls, but the hand has {ACTION_SIZE} and nothing else may need one",
+            scene.origin(),
+            scene.controls()
+        );
+        Ok(Self {
+            joints,
+            driven,
+            actuators,
+            fingertips: each(FINGERTIPS, |tip| scene.body(tip))?,
+            cube: scene.free_body("cube")?,
+            target: scene.mocap("target")?,
+        })
+    }
+}
+
+/// Indices into [`JOINTS`] of what an actuator drives.
+fn driven_by(actuator: &str) -> Vec<usize> {
+    let drives = |joint: &str| match actuator.strip_suffix("J0") {
+        Some(finger) => joint.strip_prefix(finger).is_some_and(|rest| rest == "J2" || rest == "J1"),
+        None => joint == actuator,
+    };
+    (0..JOINTS.len()).filter(|&i| drives(JOINTS[i])).collect()
+}
+
+fn each<T, const N: usize>(names: [&str; N], find: impl FnMut(&str) -> Result<T>) -> Result<[T; N]> {
+    let found: Vec<T> = names.into_iter().map(find).collect::<Result<_>>()?;
+    found.try_into().ok().context("one result for each name")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coupled_actuators_drive_two_joints_and_all_joints_are_driven_once() {
+        assert_eq!(driven_by("FFJ0").iter().map(|&i| JOINTS[i]).collect::<Vec<_>>(), ["FFJ2", "FFJ1"]);
+        let mut all: Vec<usize> = ACTUATORS.iter().flat_map(|a| driven_by(a)).collect();
+        all.sort_unstable();
+        assert_eq!(all, (0..24).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn the_observation_has_157_numbers() {
+        assert_eq!(OBSERVATION_SIZE, 157);
+    }
+}

@@ -1,0 +1,307 @@
+//! The task: a Shadow Hand turns the cube in its palm to one orientation after the other.
+//!
+//! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter and new
+//! goal, ends, observation with the goal in force next.
+
+use std::sync::Arc;
+
+use anyhow::{Result, ensure};
+
+use super::{ACTION_SIZE, End, Env, EpisodeStats, Hand, OBSERVATION_SIZE, RewardTerms, Transition};
+use crate::config::{EnvConfig, SuccessHold};
+use crate::quat::{self, Quat};
+use crate::rng::{self, Rng};
+use crate::sim::{Physics, Scene, Simulation};
+
+/// What all environments of a run share: the scene, the hand in it, the settings.
+pub struct Task {
+    scene: Scene,
+    hand: Hand,
+    config: EnvConfig,
+}
+
+impl Task {
+    /// Loads the scene that `config` names and binds the hand in it.
+    ///
+    /// # Errors
+    /// A scene that cannot be loaded or lacks a name, with its file.
+    pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
+        let scene = Scene::load(config.model_file(), config.sim_dt)?;
+        let hand = Hand::bind(&scene)?;
+        ensure!(hand.joints.len() == config.num_hand_dofs && ACTION_SIZE == config.num_actuators);
+        Ok(Arc::new(Self { scene, hand, config: config.clone() }))
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &EnvConfig {
+        &self.config
+    }
+
+    /// The scene.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+}
+
+/// One hand with its cube.
+pub struct Repose {
+    task: Arc<Task>,
+    sim: Simulation,
+    rng: Rng,
+    goal: Quat,
+    /// As the observation shows it: clipped to [-1, 1].
+    previous_action: [f32; ACTION_SIZE],
+    /// What the actuators were last told, rad, in the order of the action.
+    targets: [f64; ACTION_SIZE],
+    /// Control steps since the reset, or more after `skip_ahead`.
+    age: u32,
+    held: u32,
+    episode: EpisodeStats,
+    recent: Recent,
+    last: StepDetails,
+}
+
+/// Sums since they were last taken, across episodes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Recent {
+    /// Control steps.
+    pub steps: u64,
+    /// Rewards by term.
+    pub reward: RewardTerms,
+    /// Steps on which the physics diverged.
+    pub diverged: u64,
+}
+
+/// What happened in the last step.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepDetails {
+    /// The goal in force during the step.
+    pub goal: Quat,
+    /// Rotation error after the step, rad.
+    pub rot_dist: f64,
+    /// Distance of the cube from the goal position after the step, m.
+    pub goal_dist: f64,
+    /// The reward by term.
+    pub reward: RewardTerms,
+    /// Whether the physics diverged.
+    pub diverged: bool,
+}
+
+impl Repose {
+    /// An environment of `task`; it must be reset before it is stepped.
+    pub fn new(task: &Arc<Task>) -> Self {
+        Self {
+            sim: task.scene.simulate(),
+            task: task.clone(),
+            rng: rng::stream(0, "unused", 0),
+            goal: [1.0, 0.0, 0.0, 0.0],
+            previous_action: [0.0; ACTION_SIZE],
+            targets: [0.0; ACTION_SIZE],
+            age: 0,
+            held: 0,
+            episode: EpisodeStats::default(),
+            recent: Recent::default(),
+            last: StepDetails::default(),
+        }
+    }
+
+    /// What happened in the last step.
+    pub fn last_step(&self) -> &StepDetails {
+        &self.last
+    }
+
+    /// The goal orientation in force next.
+    pub fn goal(&self) -> Quat {
+        self.goal
+    }
+
+    /// Steps within tolerance that count towards the present goal.
+    pub fn held(&self) -> u32 {
+        self.held
+    }
+
+    /// The physics state.
+    pub fn simulation(&self) -> &Simulation {
+        &self.sim
+    }
+
+    /// The physics state, to be changed; [`Simulation::refresh`] must follow.
+    pub fn simulation_mut(&mut self) -> &mut Simulation {
+        &mut self.sim
+    }
+
+    /// The sums since the last call.
+    pub fn take_recent(&mut self) -> Recent {
+        std::mem::take(&mut self.recent)
+    }
+
+    fn draw_rotation(&mut self) -> Quat {
+        let mut draw = || rng::uniform(&mut self.rng, 0.0, 1.0);
+        quat::uniform([draw(), draw(), draw()])
+    }
+
+    fn set_goal(&mut self) {
+        self.goal = self.draw_rotation();
+        let [x, y, z] = self.task.config.goal_position;
+        self.sim.place(self.task.hand.target, [x, y, z + self.task.config.target_height], self.goal);
+    }
+
+    fn cube(&self) -> ([f64; 3], Quat) {
+        let at = self.task.hand.cube.qpos;
+        let q = self.sim.qpos();
+        ([q[at], q[at + 1], q[at + 2]], [q[at + 3], q[at + 4], q[at + 5], q[at + 6]])
+    }
+
+    /// Clips the action, turns it into actuator targets and writes them as controls.
+    fn actuate(&mut self, action: &[f32]) {
+        let alpha = self.task.config.act_moving_average;
+        for (i, actuator) in self.task.hand.actuators.iter().enumerate() {
+            let clipped = action[i].clamp(-1.0, 1.0);
+            let [low, high] = actuator.range;
+            let asked = low + (f64::from(clipped) + 1.0) / 2.0 * (high - low);
+            let target = (alpha * asked + (1.0 - alpha) * self.targets[i]).clamp(low, high);
+            self.previous_action[i] = clipped;
+            self.targets[i] = target;
+            self.sim.ctrl_mut()[actuator.ctrl] = target;
+        }
+    }
+
+    /// Counts a step within tolerance or not, and draws a new goal when this one has been held long enough.
+    fn hold(&mut self, within: bool) {
+        if within {
+            self.held += 1;
+            self.episode.in_tolerance += 1;
+        } else if self.task.config.success_hold == SuccessHold::Consecutive {
+            self.held = 0;
+        }
+        if self.held >= self.task.config.max_consecutive_successes {
+            self.held = 0;
+            self.episode.goals += 1;
+            self.set_goal();
+        }
+    }
+
+    /// Writes the 157 numbers in the order of the task.
+    fn observe(&self, observation: &mut [f32]) {
+        assert_eq!(observation.len(), OBSERVATION_SIZE, "length of an observation");
+        let (hand, config) = (&self.task.hand, &self.task.config);
+        let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
+        let mut cells = observation.iter_mut();
+        // The one place where the doubles of the physics become the floats of the learner.
+        let mut put = |value: f64| *cells.next().expect("157 numbers") = value as f32;
+        hand.joints.iter().for_each(|joint| put(qpos[joint.qpos]));
+        hand.joints.iter().for_each(|joint| put(config.vel_obs_scale * qvel[joint.dof]));
+
+        let (position, orientation) = self.cube();
+        let velocity = &qvel[hand.cube.dof..hand.cube.dof + 6];
+        // MuJoCo keeps the angular velocity of a free joint in the body's frame.
+        let spin = quat::rotate(orientation, [velocity[3], velocity[4], velocity[5]]);
+        position.into_iter().for_each(&mut put);
+        quat::canonical(orientation).into_iter().for_each(&mut put);
+        velocity[..3].iter().copied().for_each(&mut put);
+        spin.into_iter().for_each(|x| put(config.vel_obs_scale * x));
+        config.goal_position.into_iter().for_each(&mut put);
+        quat::canonical(self.goal).into_iter().for_each(&mut put);
+        let relative = quat::mul(orientation, quat::conj(self.goal));
+        quat::canonical(relative).into_iter().for_each(&mut put);
+
+        for &tip in &hand.fingertips {
+            let (position, orientation) = self.sim.pose(tip);
+            let (linear, angular) = self.sim.velocity(tip);
+            position.into_iter().chain(orientation).chain(linear).chain(angular).for_each(&mut put);
+        }
+        self.previous_action.iter().for_each(|&action| put(f64::from(action)));
+    }
+}
+
+impl Env for Repose {
+    type Episode = EpisodeStats;
+
+    fn observation_size(&self) -> usize {
+        OBSERVATION_SIZE
+    }
+
+    fn action_size(&self) -> usize {
+        ACTION_SIZE
+    }
+
+    fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
+        let task = self.task.clone();
+        let (hand, config) = (&task.hand, &task.config);
+        self.rng = rng;
+        self.sim.reset();
+        for joint in &hand.joints {
+            let noise = rng::uniform(&mut self.rng, -config.reset_dof_pos_noise, config.reset_dof_pos_noise);
+            let angle = &mut self.sim.qpos_mut()[joint.qpos];
+            *angle = (*angle + noise).clamp(joint.range[0], joint.range[1]);
+        }
+        for joint in &hand.joints {
+            let noise = rng::uniform(&mut self.rng, -config.reset_dof_vel_noise, config.reset_dof_vel_noise);
+            self.sim.qvel_mut()[joint.dof] = noise;
+        }
+        for (axis, start) in config.goal_position.into_iter().enumerate() {
+            let noise = rng::uniform(&mut self.rng, -config.reset_position_noise, config.reset_position_noise);
+            self.sim.qpos_mut()[hand.cube.qpos + axis] = start + noise;
+        }
+        let orientation = self.draw_rotation();
+        self.sim.qpos_mut()[hand.cube.qpos + 3..hand.cube.qpos + 7].copy_from_slice(&orientation);
+        self.set_goal();
+        for (i, actuator) in hand.actuators.iter().enumerate() {
+            let angle: f64 = hand.driven[i].iter().map(|&joint| self.sim.qpos()[hand.joints[joint].qpos]).sum();
+            self.targets[i] = angle.clamp(actuator.range[0], actuator.range[1]);
+            self.sim.ctrl_mut()[actuator.ctrl] = self.targets[i];
+        }
+        self.previous_action = [0.0; ACTION_SIZE];
+        (self.age, self.held) = (0, 0);
+        self.episode = EpisodeStats::default();
+        self.last = StepDetails::default();
+        self.sim.refresh();
+        self.observe(observation);
+    }
+
+    fn skip_ahead(&mut self, share: f64) {
+        self.age = (share * f64::from(self.task.config.max_episode_steps())) as u32;
+    }
+
+    fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
+        self.actuate(action);
+        let task = self.task.clone();
+        let config = &task.config;
+        let diverged = self.sim.step(config.substeps()) == Physics::Diverged;
+
+        let (position, orientation) = self.cube();
+        let rot_dist = quat::angle_between(orientation, self.goal);
+        let offset = [0, 1, 2].map(|axis| position[axis] - config.goal_position[axis]);
+        let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let reward = match diverged {
+            true => RewardTerms::default(),
+            false => RewardTerms::of_step(config, rot_dist, goal_dist, &self.previous_action),
+        };
+        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged };
+
+        self.age += 1;
+        self.episode.length += 1;
+        self.episode.reward += reward;
+        self.episode.diverged = diverged;
+        self.episode.dropped = !diverged && goal_dist >= config.fall_dist;
+        self.recent.steps += 1;
+        self.recent.reward += reward;
+        self.recent.diverged += u64::from(diverged);
+        if !diverged {
+            self.episode.rot_dist_sum += rot_dist;
+            self.hold(rot_dist <= config.success_tolerance);
+        }
+
+        let end = if diverged || self.episode.dropped {
+            Some(End::Terminated)
+        } else {
+            (self.age >= config.max_episode_steps()).then_some(End::Truncated)
+        };
+        self.observe(observation);
+        Transition { reward: reward.total() as f32, end }
+    }
+
+    fn episode(&self) -> EpisodeStats {
+        self.episode
+    }
+}

@@ -1,0 +1,91 @@
+//! The reward of one control step, term by term.
+
+use std::ops::AddAssign;
+
+use crate::config::EnvConfig;
+
+/// The terms of a reward; their sum is what is paid.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RewardTerms {
+    /// For a small rotation error.
+    pub rotation: f64,
+    /// For the cube's distance from the goal position.
+    pub distance: f64,
+    /// For the size of the action.
+    pub action: f64,
+    /// For being within the tolerance.
+    pub bonus: f64,
+    /// For dropping the cube.
+    pub fall: f64,
+}
+
+impl RewardTerms {
+    /// The names under which the terms are logged, in the order of [`RewardTerms::values`].
+    pub const NAMES: [&'static str; 5] = ["rotation", "distance", "action", "bonus", "fall"];
+
+    /// The terms of a step that ends with the rotation error `rot_dist` (rad) and the distance `goal_dist` (m), after the
+    /// clipped `action`.
+    pub fn of_step(config: &EnvConfig, rot_dist: f64, goal_dist: f64, action: &[f32]) -> Self {
+        let effort: f64 = action.iter().map(|&a| f64::from(a) * f64::from(a)).sum();
+        Self {
+            rotation: config.rot_reward_scale / (rot_dist + config.rot_eps),
+            distance: config.dist_reward_scale * goal_dist,
+            action: config.action_penalty_scale * effort,
+            bonus: if rot_dist <= config.success_tolerance { config.reach_goal_bonus } else { 0.0 },
+            fall: if goal_dist >= config.fall_dist { config.fall_penalty } else { 0.0 },
+        }
+    }
+
+    /// The terms in the order of [`RewardTerms::NAMES`].
+    pub fn values(&self) -> [f64; 5] {
+        [self.rotation, self.distance, self.action, self.bonus, self.fall]
+    }
+
+    /// What is paid.
+    pub fn total(&self) -> f64 {
+        self.values().iter().sum()
+    }
+}
+
+impl AddAssign for RewardTerms {
+    fn add_assign(&mut self, other: Self) {
+        self.rotation += other.rotation;
+        self.distance += other.distance;
+        self.action += other.action;
+        self.bonus += other.bonus;
+        self.fall += other.fall;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn terms(rot_dist: f64, goal_dist: f64, action: &[f32]) -> RewardTerms {
+        let mut config = Config::resolve(None, &[]).unwrap().env;
+        config.fall_penalty = -7.0;
+        RewardTerms::of_step(&config, rot_dist, goal_dist, action)
+    }
+
+    #[test]
+    fn each_term_is_the_one_of_the_task() {
+        // 1 / (0.4 + 0.1), -10 * 0.05, -0.0002 * (1 + 0.25)
+        let reward = terms(0.4, 0.05, &[1.0, -0.5]);
+        let expected = [2.0, -0.5, -0.00025, 0.0, 0.0];
+        assert!(reward.values().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12), "{reward:?}");
+        assert!((reward.total() - 1.49975).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_bonus_is_paid_up_to_the_tolerance_itself() {
+        assert_eq!(terms(0.1, 0.0, &[]).bonus, 2.0);
+        assert_eq!(terms(0.1 + 1e-9, 0.0, &[]).bonus, 0.0);
+    }
+
+    #[test]
+    fn the_fall_penalty_is_paid_from_the_limit_on() {
+        assert_eq!(terms(1.0, 0.24, &[]).fall, -7.0);
+        assert_eq!(terms(1.0, 0.24 - 1e-9, &[]).fall, 0.0);
+    }
+}

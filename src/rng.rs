@@ -1,0 +1,49 @@
+//! Randomness without state: a generator is named by (seed, purpose, index).
+//!
+//! No generator is carried from one iteration or episode to the next, so whoever knows the three names can draw the same
+//! numbers again, on any thread, in any order, after any interruption.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// The one generator of the program; its values are the same in every version of its crate.
+pub type Rng = ChaCha8Rng;
+
+/// The generator of stream `index` for `purpose` (at most 24 bytes) under `seed`; different names never share numbers.
+pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
+    let mut key = [0; 32];
+    key[..8].copy_from_slice(&seed.to_le_bytes());
+    key[8..8 + purpose.len()].copy_from_slice(purpose.as_bytes());
+    let mut rng = Rng::from_seed(key);
+    rng.set_stream(index);
+    rng
+}
+
+/// A uniform number in [low, high).
+pub fn uniform(rng: &mut Rng, low: f64, high: f64) -> f64 {
+    low + (high - low) * rng.random::<f64>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_repeats_and_differs_in_each_of_its_names() {
+        let draw = |seed, purpose, index| uniform(&mut stream(seed, purpose, index), 0.0, 1.0);
+        let first = draw(1, "episode", 2);
+        assert_eq!(first, draw(1, "episode", 2));
+        assert_ne!(first, draw(2, "episode", 2));
+        assert_ne!(first, draw(1, "noise", 2));
+        assert_ne!(first, draw(1, "episode", 3));
+    }
+
+    #[test]
+    fn uniform_numbers_fill_their_range() {
+        let mut rng = stream(0, "test", 0);
+        let drawn: Vec<f64> = (0..10_000).map(|_| uniform(&mut rng, -3.0, 1.0)).collect();
+        let mean = drawn.iter().sum::<f64>() / drawn.len() as f64;
+        assert!(drawn.iter().all(|x| (-3.0..1.0).contains(x)));
+        assert!((mean + 1.0).abs() < 0.05, "mean {mean}");
+    }
+}

@@ -1,0 +1,212 @@
+//! A loaded scene and its names: each lookup gives an index that stays valid, or an error with file and name.
+
+use std::path::Path;
+use std::sync::{Arc, Once};
+
+use anyhow::{Result, anyhow, bail, ensure};
+use mujoco_rs::prelude::{MjModel, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
+use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
+
+use super::Simulation;
+
+/// The scene that is built into the program.
+const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
+
+/// A compiled MuJoCo model that any number of simulations share.
+#[derive(Clone)]
+pub struct Scene {
+    pub(super) model: Arc<MjModel>,
+    origin: String,
+}
+
+/// A hinge joint with limits.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hinge {
+    /// Index of its angle in `qpos`.
+    pub qpos: usize,
+    /// Index of its velocity in `qvel`.
+    pub dof: usize,
+    /// Limits, rad.
+    pub range: [f64; 2],
+}
+
+/// A free joint: position and orientation w,x,y,z from `qpos`, linear (world) and angular (body frame) velocity from `dof`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FreeJoint {
+    /// First of its seven numbers in `qpos`.
+    pub qpos: usize,
+    /// First of its six numbers in `qvel`.
+    pub dof: usize,
+}
+
+/// A body.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Body(pub(super) usize);
+
+/// A mocap body, which is drawn where it is put.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mocap(pub(super) usize);
+
+/// An actuator with one control.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Actuator {
+    /// Index of its control in `ctrl`.
+    pub ctrl: usize,
+    /// Control limits, rad.
+    pub range: [f64; 2],
+}
+
+impl Scene {
+    /// Loads the built-in scene (`None`) or a user's MJCF file, with the physics timestep `sim_dt` in s.
+    ///
+    /// # Errors
+    /// MuJoCo's own message, with the file's name, where it refuses the scene.
+    pub fn load(file: Option<&Path>, sim_dt: f64) -> Result<Self> {
+        quieten_mujoco();
+        let origin = file.map_or("the built-in scene".into(), |path| path.display().to_string());
+        let model = match file {
+            None => MjModel::from_xml_string(BUILTIN),
+            Some(path) => {
+                ensure!(path.is_file(), "{origin}: env.model must name a MuJoCo scene, but there is no such file");
+                MjModel::from_xml(path)
+            }
+        };
+        let mut model = model.map_err(|error| anyhow!("{origin}: MuJoCo refuses this scene: {error}"))?;
+        model.opt_mut().timestep = sim_dt;
+        let scene = Self { model: Arc::new(model), origin };
+        if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {
+            bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);
+        }
+        Ok(scene)
+    }
+
+    /// A new simulation of this scene, in its default state.
+    pub fn simulate(&self) -> Simulation {
+        Simulation::new(self.model.clone())
+    }
+
+    /// Number of controls.
+    pub fn controls(&self) -> usize {
+        self.model.nu() as usize
+    }
+
+    /// The limited hinge joint `name`.
+    ///
+    /// # Errors
+    /// No such joint, another kind of joint, or no limits.
+    pub fn hinge(&self, name: &str) -> Result<Hinge> {
+        let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
+        let kind = self.model.jnt_type()[id];
+        ensure!(kind == MjtJoint::mjJNT_HINGE, "{}: joint `{name}` must be a hinge, but is {kind:?}", self.origin);
+        ensure!(self.model.jnt_limited()[id], "{}: joint `{name}` must have a range", self.origin);
+        Ok(Hinge {
+            qpos: self.model.jnt_qposadr()[id] as usize,
+            dof: self.model.jnt_dofadr()[id] as usize,
+            range: self.model.jnt_range()[id],
+        })
+    }
+
+    /// The free joint of body `name`.
+    ///
+    /// # Errors
+    /// No such body, or its only joint is not a free joint.
+    pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
+        let Body(body) = self.body(name)?;
+        let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
+        let free = joint.filter(|&j| self.model.jnt_type()[j] == MjtJoint::mjJNT_FREE);
+        let joint = free.ok_or_else(|| anyhow!("{}: body `{name}` must have a free joint", self.origin))?;
+        Ok(FreeJoint { qpos: self.model.jnt_qposadr()[joint] as usize, dof: self.model.jnt_dofadr()[joint] as usize })
+    }
+
+    /// The body `name`.
+    ///
+    /// # Errors
+    /// No such body.
+    pub fn body(&self, name: &str) -> Result<Body> {
+        Ok(Body(self.find(MjtObjBase::mjOBJ_BODY, "body", name)?))
+    }
+
+    /// The mocap body `name`.
+    ///
+    /// # Errors
+    /// No such body, or no mocap body.
+    pub fn mocap(&self, name: &str) -> Result<Mocap> {
+        let Body(body) = self.body(name)?;
+        let id = usize::try_from(self.model.body_mocapid()[body]).ok();
+        Ok(Mocap(id.ok_or_else(|| anyhow!("{}: body `{name}` must have mocap=\"true\"", self.origin))?))
+    }
+
+    /// The actuator `name`, which must have one limited control and drive the joint `target`, or the fixed tendon `target`
+    /// that is the sum of the joints `summed`.
+    ///
+    /// # Errors
+    /// No such actuator or target, or an actuator that drives something else.
+    pub fn actuator(&self, name: &str, target: &str, summed: &[String]) -> Result<Actuator> {
+        let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
+        let (kind, transmission) = match summed {
+            [] => (MjtObjBase::mjOBJ_JOINT, MjtTrn::mjTRN_JOINT),
+            _ => (MjtObjBase::mjOBJ_TENDON, MjtTrn::mjTRN_TENDON),
+        };
+        let what = if summed.is_empty() { "joint" } else { "tendon" };
+        let target_id = self.find(kind, what, target)?;
+        let drives_it =
+            self.model.actuator_trntype()[id] == transmission && self.model.actuator_trnid()[id][0] == target_id as i32;
+        ensure!(drives_it, "{}: actuator `{name}` must drive the {what} `{target}`", self.origin);
+        if !summed.is_empty() {
+            self.check_sum(target, target_id, summed)?;
+        }
+        let single = self.model.actuator_ctrlnum()[id] == 1;
+        let ctrl = self.model.actuator_ctrladr()[id] as usize;
+        ensure!(
+            single && self.model.actuator_ctrllimited()[ctrl],
+            "{}: actuator `{name}` must have one control with a ctrlrange",
+            self.origin
+        );
+        Ok(Actuator { ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
+    }
+
+    /// The file of the scene, for messages.
+    pub fn origin(&self) -> &str {
+        &self.origin
+    }
+
+    fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
+        self.model.name_to_id(kind, name).ok_or_else(|| anyhow!("{}: there is no {what} `{name}` in it", self.origin))
+    }
+
+    fn check_sum(&self, tendon: &str, id: usize, joints: &[String]) -> Result<()> {
+        let first = self.model.tendon_adr()[id] as usize;
+        let path = first..first + self.model.tendon_num()[id] as usize;
+        let mut parts: Vec<(usize, f64)> = path
+            .filter(|&wrap| self.model.wrap_type()[wrap] == MjtWrap::mjWRAP_JOINT)
+            .map(|wrap| (self.model.wrap_objid()[wrap] as usize, self.model.wrap_prm()[wrap]))
+            .collect();
+        let mut expected = Vec::new();
+        for joint in joints {
+            expected.push((self.find(MjtObjBase::mjOBJ_JOINT, "joint", joint)?, 1.0));
+        }
+        parts.sort_by_key(|&(joint, _)| joint);
+        expected.sort_by_key(|&(joint, _)| joint);
+        ensure!(parts == expected, "{}: tendon `{tendon}` must be the sum {}", self.origin, joints.join(" + "));
+        Ok(())
+    }
+}
+
+/// Sends MuJoCo's messages nowhere but for its fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
+/// [`Simulation::step`] reports as a value.
+fn quieten_mujoco() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        // SAFETY: every use of MuJoCo in this program begins with a loaded scene, so no other thread can be inside it.
+        unsafe { mujoco_rs::logging::set_log_handler(report_fatal) };
+    });
+}
+
+/// MuJoCo ends the process with code 1 after this returns from an error.
+fn report_fatal(message: &MjLogMessage) {
+    if message.level() == MjtLogLevel::mjLOG_ERROR {
+        let text = format!("error: MuJoCo cannot go on: {}\n", message.subject());
+        // A panic must not cross MuJoCo's frames, so a closed stderr is ignored.
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes());
+    }
+}
