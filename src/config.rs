@@ -463,10 +463,10 @@ mod tests {
 
     #[test]
     fn all_violations_are_named_together_with_the_rule() {
-        let text = errors(&["ppo.minibatches=7", "env.num_envs=0", "ppo.gama=1", "env.sim_dt=fast", "ppo.clip=-1"]);
+        let text = errors(&["ppo.minibatches=7", "env.rot_eps=0", "ppo.gama=1", "env.sim_dt=fast", "ppo.clip=-1"]);
         for part in [
             "ppo.minibatches = 7: must divide num_envs * horizon",
-            "env.num_envs = 0: must be at least 1",
+            "env.rot_eps = 0: must be above 0",
             "ppo.gama: unknown key; did you mean ppo.gamma?",
             "env.sim_dt = \"fast\": must be a number",
             "ppo.clip = -1: must be above 0",
@@ -488,6 +488,7 @@ mod tests {
         for (bad, part) in [
             ("env.rot_eps=nan", "must be a finite number"),
             ("env.num_envs=-3", "must be a whole number, not negative"),
+            ("env.num_envs=0", "must be at least 1"),
             ("env.num_envs=1.5", "must be a whole number, not negative"),
             ("ppo.hidden=3", "must be an array"),
             ("ppo.hidden=[]", "must hold one or more sizes"),

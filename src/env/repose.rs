@@ -72,6 +72,14 @@ pub struct Recent {
     pub diverged: u64,
 }
 
+impl std::ops::AddAssign for Recent {
+    fn add_assign(&mut self, other: Self) {
+        self.steps += other.steps;
+        self.reward += other.reward;
+        self.diverged += other.diverged;
+    }
+}
+
 /// What happened in the last step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepDetails {

@@ -1,0 +1,176 @@
+//! The losses of one minibatch, as pure functions of tensors. M samples, A numbers in an action.
+
+use std::f64::consts::{E, TAU};
+
+use candle_core::{D, Result, Tensor};
+
+use crate::config::PpoConfig;
+
+/// What a minibatch is learnt from.
+pub struct Minibatch {
+    /// `[M, O]`, normalised
+    pub observations: Tensor,
+    /// `[M, A]`
+    pub actions: Tensor,
+    /// `[M, A]`, of the distribution that the actions were drawn from
+    pub old_means: Tensor,
+    /// `[M]`, of the actions under that distribution
+    pub old_log_probs: Tensor,
+    /// `[M]`, of the critic at that time
+    pub old_values: Tensor,
+    /// `[M]`
+    pub advantages: Tensor,
+    /// `[M]`
+    pub returns: Tensor,
+}
+
+/// Scalars of a minibatch.
+pub struct Losses {
+    /// What is minimised.
+    pub total: Tensor,
+    /// The clipped surrogate, negated.
+    pub policy: Tensor,
+    /// The clipped squared error of the values.
+    pub value: Tensor,
+    /// Mean entropy of the action distribution, nats.
+    pub entropy: Tensor,
+    /// Mean KL divergence of the present distribution from the one that acted, nats.
+    pub kl: Tensor,
+    /// Probability ratios of the actions, `[M]`.
+    pub ratios: Tensor,
+}
+
+/// Logarithm of the probability density of `actions` `[M, A]` under Gaussians with `means` `[M, A]` and standard
+/// deviations exp(`log_std`) `[A]` → `[M]`.
+///
+/// # Errors
+/// Shapes that do not fit.
+pub fn log_prob(actions: &Tensor, means: &Tensor, log_std: &Tensor) -> Result<Tensor> {
+    let z = (actions - means)?.broadcast_div(&log_std.exp()?)?;
+    let constant = 0.5 * TAU.ln() * actions.dim(D::Minus1)? as f64;
+    let log_scale = (log_std.sum_all()? + constant)?;
+    (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
+}
+
+/// Mean over the samples of the KL divergence KL(old ‖ new) of diagonal Gaussians; standard deviations `[A]`.
+///
+/// # Errors
+/// Shapes that do not fit.
+pub fn kl([old_means, old_std]: [&Tensor; 2], [means, log_std]: [&Tensor; 2]) -> Result<Tensor> {
+    let variance = (log_std * 2.0)?.exp()?;
+    let moved = (old_means - means)?.sqr()?.mean(0)?;
+    let spread = ((old_std.sqr()? + moved)? / variance)?;
+    ((log_std - old_std.log()?)? + (spread * 0.5)?)?.sum_all()? - 0.5 * log_std.elem_count() as f64
+}
+
+/// The losses of a minibatch for which the nets gave `means` `[M, A]` and `values` `[M]`.
+///
+/// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
+///
+/// # Errors
+/// Shapes that do not fit.
+pub fn losses(
+    config: &PpoConfig,
+    batch: &Minibatch,
+    [means, values]: [&Tensor; 2],
+    [log_std, old_std]: [&Tensor; 2],
+) -> Result<Losses> {
+    let ratios = (log_prob(&batch.actions, means, log_std)? - &batch.old_log_probs)?.exp()?;
+    let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
+    let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
+    let policy = surrogate.mean_all()?.neg()?;
+
+    let step = (values - &batch.old_values)?.clamp(-config.clip, config.clip)?;
+    let clipped = (&batch.old_values + step)?;
+    let error = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?;
+    let value = error.mean_all()?;
+
+    let entropy = (log_std.sum_all()? + 0.5 * (TAU * E).ln() * log_std.elem_count() as f64)?;
+    let total = ((&policy + (&value * config.value_coef)?)? - (&entropy * config.entropy_coef)?)?;
+    let kl = kl([&batch.old_means, old_std], [&means.detach(), &log_std.detach()])?;
+    Ok(Losses { total, policy, value, entropy, kl, ratios: ratios.detach() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use candle_core::{Device, Var};
+
+    fn tensor(values: &[f32], shape: &[usize]) -> Tensor {
+        Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
+    }
+
+    #[track_caller]
+    fn assert_close(found: &Tensor, expected: &[f32]) {
+        let found: Vec<f32> = found.flatten_all().unwrap().to_vec1().unwrap();
+        let close = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
+        assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
+    }
+
+    /// The numbers are those of this program (PyTorch). One sample's ratio is clipped, two are not; one value is clipped:
+    /// ```python
+    /// import torch
+    /// from torch.distributions import Normal, kl_divergence
+    /// mean = torch.tensor([[0.1, -0.2], [0.5, 0.3], [-0.4, 0.8]], requires_grad=True)
+    /// log_std = torch.tensor([-0.5, 0.2], requires_grad=True)
+    /// value = torch.tensor([0.3, -0.6, 1.4], requires_grad=True)
+    /// old_mean = torch.tensor([[0.0, -0.1], [0.4, 0.5], [-0.5, 0.5]])
+    /// old_std = torch.tensor([0.7, 1.1])
+    /// old_value = torch.tensor([0.2, -0.1, 1.0])
+    /// action = torch.tensor([[0.5, -1.0], [-0.3, 0.9], [0.2, 1.5]])
+    /// advantage = torch.tensor([1.0, 0.5, -2.0])
+    /// returns = torch.tensor([0.5, 0.1, 0.9])
+    /// dist, old = Normal(mean, log_std.exp()), Normal(old_mean, old_std)
+    /// log_prob = dist.log_prob(action).sum(1)
+    /// ratio = (log_prob - old.log_prob(action).sum(1)).exp()
+    /// policy = -torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
+    /// clipped = old_value + (value - old_value).clamp(-0.2, 0.2)
+    /// critic = torch.max((value - returns) ** 2, (clipped - returns) ** 2).mean()
+    /// entropy = dist.entropy().sum(1).mean()
+    /// kl = kl_divergence(old, dist).sum(1).mean()
+    /// (policy + 2.0 * critic - 0.01 * entropy).backward()
+    /// for x in (log_prob, ratio, policy, critic, entropy, kl, mean.grad, log_std.grad, value.grad):
+    ///     print(x.tolist())
+    /// ```
+    #[test]
+    fn losses_and_gradients_match_pytorch() {
+        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        (config.clip, config.value_coef, config.entropy_coef) = (0.2, 2.0, 0.01);
+        let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
+        let log_std = Var::from_tensor(&tensor(&[-0.5, 0.2], &[2])).unwrap();
+        let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
+        let old_std = tensor(&[0.7, 1.1], &[2]);
+        let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
+        let old_means = tensor(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[3, 2]);
+        let batch = Minibatch {
+            observations: tensor(&[0.0; 3], &[3, 1]),
+            old_log_probs: log_prob(&actions, &old_means, &old_std.log().unwrap()).unwrap(),
+            actions,
+            old_means,
+            old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
+            advantages: tensor(&[1.0, 0.5, -2.0], &[3]),
+            returns: tensor(&[0.5, 0.1, 0.9], &[3]),
+        };
+        let found = losses(&config, &batch, [&mean, &value], [&log_std, &old_std]).unwrap();
+        let log_probs = log_prob(&batch.actions, &mean, &log_std).unwrap();
+        assert_close(&log_probs, &[-1.969_842_1, -2.528_384_9, -2.191_396_2]);
+        assert_close(&found.ratios, &[1.217_114_7, 0.679_935_9, 1.347_618_7]);
+        assert_close(&found.policy, &[0.385_089_8]);
+        assert_close(&found.value, &[0.26]);
+        assert_close(&found.entropy, &[2.537_877]);
+        assert_close(&found.kl, &[0.062_119_63]);
+        let grads = found.total.backward().unwrap();
+        let mean_grad = [0.0, 0.0, 0.246_434_33, -0.045_577_466, 1.465_282_9, 0.421_556_7];
+        assert_close(grads.get(&mean).unwrap(), &mean_grad);
+        assert_close(grads.get(&log_std).unwrap(), &[-0.113_067_5, -0.527_346_6]);
+        assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
+    }
+
+    #[test]
+    fn a_distribution_has_no_divergence_from_itself() {
+        let (means, std) = (tensor(&[0.3, -2.0], &[1, 2]), tensor(&[0.5, 2.0], &[2]));
+        let kl = kl([&means, &std], [&means, &std.log().unwrap()]).unwrap();
+        assert!(kl.to_scalar::<f32>().unwrap().abs() < 1e-6);
+    }
+}

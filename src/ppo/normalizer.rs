@@ -1,0 +1,116 @@
+//! Running mean and variance of the observations, saved with the policy that has learnt on them.
+
+use rayon::prelude::*;
+
+/// Added to the variance, so that a constant input does not divide by zero.
+const EPSILON: f64 = 1e-5;
+
+/// Normalised observations are clipped to ± this many standard deviations, so that a rare shock does not shake the nets.
+const CLIP: f32 = 5.0;
+
+/// Rows whose sums one task takes; fixed, so that the result does not depend on the number of threads.
+const ROWS_PER_TASK: usize = 1024;
+
+/// Statistics of each of the O numbers of an observation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Normalizer {
+    /// `[O]`
+    pub mean: Vec<f64>,
+    /// `[O]`, variance.
+    pub variance: Vec<f64>,
+    /// Observations seen.
+    pub count: f64,
+}
+
+impl Normalizer {
+    /// One that has seen nothing and leaves observations of `size` numbers almost as they are.
+    pub fn new(size: usize) -> Self {
+        Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
+    }
+
+    /// Writes the normalised rows of `raw` `[B, O]` into `out` `[B, O]`.
+    pub fn apply(&self, raw: &[f32], out: &mut [f32]) {
+        let size = self.mean.len();
+        let mean: Vec<f32> = self.mean.iter().map(|&m| m as f32).collect();
+        let scale: Vec<f32> = self.variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect();
+        let rows = raw.par_chunks_exact(size).zip_eq(out.par_chunks_exact_mut(size)).with_min_len(64);
+        rows.for_each(|(raw, out)| {
+            for (((out, raw), mean), scale) in out.iter_mut().zip(raw).zip(&mean).zip(&scale) {
+                *out = ((raw - mean) * scale).clamp(-CLIP, CLIP);
+            }
+        });
+    }
+
+    /// Takes the rows of `raw` `[B, O]` into the statistics.
+    ///
+    /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances"
+    /// (1979), eq. 2.1.
+    pub fn update(&mut self, raw: &[f32]) {
+        let size = self.mean.len();
+        let rows = (raw.len() / size) as f64;
+        let mean = column_means(raw, size, |x, _| x);
+        let variance = column_means(raw, size, |x, column| (x - mean[column]).powi(2));
+        let total = self.count + rows;
+        for i in 0..size {
+            let delta = mean[i] - self.mean[i];
+            let between = delta * delta * self.count * rows / total;
+            self.variance[i] = (self.variance[i] * self.count + variance[i] * rows + between) / total;
+            self.mean[i] += delta * rows / total;
+        }
+        self.count = total;
+    }
+}
+
+/// The mean of `f(value, column)` over the rows, for each column.
+fn column_means(raw: &[f32], size: usize, f: impl Fn(f64, usize) -> f64 + Sync) -> Vec<f64> {
+    let partial: Vec<Vec<f64>> = raw
+        .par_chunks(ROWS_PER_TASK * size)
+        .map(|rows| {
+            let mut sums = vec![0.0; size];
+            for row in rows.chunks_exact(size) {
+                for (column, (sum, &x)) in sums.iter_mut().zip(row).enumerate() {
+                    *sum += f(f64::from(x), column);
+                }
+            }
+            sums
+        })
+        .collect();
+    let rows = (raw.len() / size) as f64;
+    (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum::<f64>() / rows).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng;
+
+    #[test]
+    fn many_batches_give_the_mean_and_variance_of_all_rows_at_once() {
+        let mut rng = rng::stream(0, "test", 0);
+        // The second column is far from zero: a naive sum of squares would lose its variance.
+        let rows: Vec<f32> = (0..5000)
+            .flat_map(|_| [rng::uniform(&mut rng, -1.0, 3.0) as f32, rng::uniform(&mut rng, 4000.0, 4001.0) as f32])
+            .collect();
+        let mut normalizer = Normalizer::new(2);
+        for batch in [&rows[..14], &rows[14..3000], &rows[3000..]] {
+            normalizer.update(batch);
+        }
+        for column in 0..2 {
+            let values: Vec<f64> = rows.iter().skip(column).step_by(2).map(|&x| f64::from(x)).collect();
+            let mean = values.iter().sum::<f64>() / 5000.0;
+            let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / 5000.0;
+            assert!((normalizer.mean[column] - mean).abs() < 1e-9 * mean.abs());
+            assert!((normalizer.variance[column] / variance - 1.0).abs() < 1e-9);
+        }
+        assert_eq!(normalizer.count, 5000.0);
+    }
+
+    #[test]
+    fn normalised_values_are_in_standard_deviations_and_clipped() {
+        let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
+        let mut out = [0.0; 3];
+        normalizer.apply(&[4.0, 2.0, 400.0], &mut out);
+        assert!((out[0] - 1.0).abs() < 1e-5, "{out:?}");
+        assert_eq!(out[1..], [0.0, CLIP]);
+    }
+}

@@ -1,0 +1,31 @@
+//! The outside of a run: its folder, its logs, the terminal, signals. Knows neither environments nor learning.
+
+mod events;
+mod folder;
+mod interrupt;
+mod report;
+
+pub use folder::{RunFolder, newest_checkpoint, read_bytes, read_text, resolve_checkpoint, write_whole};
+pub use interrupt::on_interrupt;
+pub use report::{Report, Status};
+
+use anyhow::{Context, Result};
+
+/// Prints text on stdout; a reader that has gone away is no error.
+pub fn print(text: &str) {
+    let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
+}
+
+/// Prints a line on stderr.
+pub fn say(line: &str) {
+    let _ = std::io::Write::write_all(&mut std::io::stderr(), format!("{line}\n").as_bytes());
+}
+
+/// Gives rayon, and with it every part of the program, this many worker threads (0: one for every core); once.
+///
+/// # Errors
+/// Threads that the system refuses.
+pub fn start_threads(threads: usize) -> Result<()> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+    pool.build_global().with_context(|| format!("cannot start {threads} worker threads"))
+}

@@ -1,0 +1,319 @@
+//! Training, from top to bottom: collect, learn, evaluate, report, checkpoint. The only place where environments and the
+//! learner meet.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+
+use crate::cli::TrainArgs;
+use crate::config::{Config, Override, Source};
+use crate::env::{End, Env, EnvPool, Recent, Repose, Score, StepBuffers, Task};
+use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::ppo::{Checkpoint, Ppo, Progress, Rollout, UpdateStats};
+use crate::run::{self, Report, RunFolder, Status};
+
+/// How a training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All its steps are made.
+    Finished,
+    /// It was asked to stop, and has saved.
+    Interrupted,
+}
+
+/// The names under which an iteration is logged, in order.
+const TAGS: [&str; 30] = [
+    "episode/return",
+    "episode/length",
+    "episode/goals",
+    "episode/in_tolerance",
+    "episode/drop_rate",
+    "episode/rot_dist",
+    "episode/steps_per_goal",
+    "reward/rotation",
+    "reward/distance",
+    "reward/action",
+    "reward/bonus",
+    "reward/fall",
+    "eval/goals",
+    "eval/drop_rate",
+    "eval/rot_dist",
+    "eval/return",
+    "loss/policy",
+    "loss/value",
+    "policy/entropy",
+    "policy/kl",
+    "policy/first_kl",
+    "policy/clip_fraction",
+    "policy/std",
+    "value/explained_variance",
+    "optim/learning_rate",
+    "optim/grad_norm",
+    "time/collect_s",
+    "time/update_s",
+    "time/steps_per_s",
+    "sim/diverged",
+];
+
+/// Trains as asked, until all steps are made or `interrupted` is set.
+///
+/// # Errors
+/// Settings, files or a scene that cannot be used; a run folder that cannot be written to; a loss that is not finite.
+pub fn train(args: &TrainArgs, interrupted: &AtomicBool) -> Result<Outcome> {
+    let mut session = match &args.resume {
+        Some(place) => Session::resume(place, args)?,
+        None => Session::begin(args)?,
+    };
+    if session.finished() {
+        run::say(&format!("{} is finished: {}", session.folder.path().display(), session.steps_made()));
+        return Ok(Outcome::Finished);
+    }
+    run::say(&format!("run folder: {}", session.folder.path().display()));
+    let mut report = session.open_report()?;
+    session.start_episodes();
+
+    while !session.finished() {
+        let started = Instant::now();
+        let iteration = session.progress.iteration + 1;
+        if !session.collect(iteration, interrupted)? {
+            return session.stop(&report);
+        }
+        let collected = Instant::now();
+        let update = session.ppo.update(&mut session.rollout, iteration)?;
+        session.rollout.carry_over();
+        let updated = Instant::now();
+        session.progress.iteration = iteration;
+        session.progress.env_steps += session.config.steps_per_iteration();
+        session.progress.next_episode = session.pool.next_episode();
+
+        let mut evaluation = None;
+        if iteration.is_multiple_of(session.config.run.eval_every) || session.finished() {
+            evaluation = session.evaluate(interrupted, &report)?;
+        }
+        let seconds = [collected - started, updated - collected].map(|time| time.as_secs_f64());
+        session.report(&mut report, &update, evaluation, seconds);
+        if iteration.is_multiple_of(session.config.run.checkpoint_every) || session.finished() {
+            session.checkpoint(&session.folder.latest())?;
+        }
+    }
+    report.finish();
+    run::say(&format!("finished: {}; {}", session.steps_made(), session.folder.path().display()));
+    Ok(Outcome::Finished)
+}
+
+/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile.
+///
+/// # Errors
+/// Only if candle cannot allocate.
+pub fn collect<E: Env>(
+    pool: &mut EnvPool<E>,
+    ppo: &Ppo,
+    rollout: &mut Rollout,
+    iteration: u64,
+    scratch: &mut Scratch,
+    interrupted: &AtomicBool,
+) -> Result<bool> {
+    let mut noise = ppo.noise(iteration);
+    for t in 0..rollout.horizon() {
+        if interrupted.load(Ordering::Relaxed) {
+            return Ok(false);
+        }
+        let mut step = rollout.step_mut(t);
+        ppo.act(&mut step, &mut noise)?;
+        let buffers = StepBuffers {
+            rewards: step.rewards,
+            ends: &mut scratch.ends,
+            observations: step.next_observations,
+            final_observations: &mut scratch.final_observations,
+        };
+        pool.step(step.actions, buffers);
+        step.dones.iter_mut().zip(&scratch.ends).for_each(|(done, end)| *done = end.is_some());
+        let truncated = scratch.ends.iter().map(|&end| end == Some(End::Truncated));
+        ppo.settle(step.rewards, truncated, &scratch.final_observations)?;
+    }
+    Ok(true)
+}
+
+/// Arrays that a collection needs besides the rollout.
+pub struct Scratch {
+    ends: Vec<Option<End>>,
+    final_observations: Vec<f32>,
+}
+
+impl Scratch {
+    /// For the environments of `pool`.
+    pub fn new<E: Env>(pool: &EnvPool<E>) -> Self {
+        Self { ends: vec![None; pool.len()], final_observations: vec![0.0; pool.len() * pool.observation_size()] }
+    }
+}
+
+/// All that a training owns.
+struct Session {
+    config: Config,
+    folder: RunFolder,
+    task: Arc<Task>,
+    pool: EnvPool<Repose>,
+    ppo: Ppo,
+    rollout: Rollout,
+    scratch: Scratch,
+    progress: Progress,
+}
+
+impl Session {
+    fn begin(args: &TrainArgs) -> Result<Self> {
+        let user = match &args.settings.config {
+            Some(path) => Some(Source { path: path.clone(), text: run::read_text(path)? }),
+            None => None,
+        };
+        let mut overrides = args.settings.set.clone();
+        overrides.extend(asked(args));
+        let mut config = Config::resolve(user.as_ref(), &overrides)?;
+        if let Some(model) = config.env.model_file() {
+            // The run can be played from any folder.
+            let model = model.canonicalize().with_context(|| format!("env.model: cannot find {}", model.display()))?;
+            config.env.model = model.display().to_string();
+        }
+        run::start_threads(config.run.threads)?;
+        let task = Task::new(&config.env)?;
+        let folder = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
+        Self::new(config, folder, task, Progress::default())
+    }
+
+    fn resume(place: &Path, args: &TrainArgs) -> Result<Self> {
+        let folder = RunFolder::containing(place)?;
+        let path = if place.is_dir() { folder.latest() } else { place.to_owned() };
+        let context = || format!("cannot resume from {}", path.display());
+        let checkpoint = Checkpoint::parse(&run::read_bytes(&path)?).with_context(context)?;
+        let config = Config::from_text(&path, &checkpoint.config, &asked(args))?;
+        run::start_threads(config.run.threads)?;
+        let task = Task::new(&config.env)?;
+        let mut session = Self::new(config, folder, task, checkpoint.progress)?;
+        session.ppo.restore(checkpoint).with_context(context)?;
+        Ok(session)
+    }
+
+    fn new(config: Config, folder: RunFolder, task: Arc<Task>, progress: Progress) -> Result<Self> {
+        let envs = (0..config.env.num_envs).map(|_| Repose::new(&task)).collect();
+        let pool = EnvPool::new(config.run.seed, envs);
+        let ppo = Ppo::new(&config.ppo, pool.observation_size(), pool.action_size(), config.run.seed)?;
+        let rollout = ppo.rollout(pool.len());
+        let scratch = Scratch::new(&pool);
+        Ok(Self { config, folder, task, pool, ppo, rollout, scratch, progress })
+    }
+
+    fn finished(&self) -> bool {
+        self.progress.env_steps >= self.config.run.total_steps
+    }
+
+    fn steps_made(&self) -> String {
+        format!("{} iterations, {} env steps", self.progress.iteration, self.progress.env_steps)
+    }
+
+    fn open_report(&self) -> Result<Report> {
+        self.folder.describe(&self.config.to_text(), &version())?;
+        let Progress { iteration, env_steps, .. } = self.progress;
+        Ok(Report::open(self.folder.path(), &TAGS, iteration, env_steps, self.config.run.total_steps))
+    }
+
+    fn start_episodes(&mut self) {
+        self.pool.reset(self.progress.next_episode, self.rollout.first_observations_mut());
+    }
+
+    fn collect(&mut self, iteration: u64, interrupted: &AtomicBool) -> Result<bool> {
+        collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, interrupted)
+    }
+
+    /// Saves the state at the end of the last iteration.
+    fn stop(&self, report: &Report) -> Result<Outcome> {
+        report.finish();
+        let path = self.folder.latest();
+        self.checkpoint(&path)?;
+        run::say(&format!("interrupted after {}; go on with", self.steps_made()));
+        run::say(&format!("  shadow-repose train --resume {}", self.folder.path().display()));
+        Ok(Outcome::Interrupted)
+    }
+
+    fn checkpoint(&self, path: &Path) -> Result<()> {
+        run::write_whole(path, &self.ppo.save(&self.config.to_text(), &self.progress)?)
+    }
+
+    /// Plays the evaluation episodes, and saves the policy if it is the best so far: more goals, then less rotation error.
+    fn evaluate(&mut self, interrupted: &AtomicBool, report: &Report) -> Result<Option<Score>> {
+        let episodes =
+            Episodes { seed: self.config.run.seed, purpose: "evaluation", count: self.config.run.eval_episodes };
+        let actor = Actor::Mean(self.ppo.policy());
+        let Some(played) = evaluate(&self.task, &actor, episodes, interrupted, &mut |_| {})? else { return Ok(None) };
+        let score = Score::of(&played);
+        report.say(&format!(
+            "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
+            self.progress.env_steps,
+            score.episodes,
+            score.goals,
+            score.rot_dist,
+            100.0 * score.drop_rate
+        ));
+        let better = |[goals, rot_dist]: [f64; 2]| (score.goals, -score.rot_dist) > (goals, -rot_dist);
+        if self.progress.best.is_none_or(better) {
+            self.progress.best = Some([score.goals, score.rot_dist]);
+            self.checkpoint(&self.folder.best())?;
+        }
+        Ok(Some(score))
+    }
+
+    fn report(&mut self, report: &mut Report, update: &UpdateStats, evaluation: Option<Score>, seconds: [f64; 2]) {
+        let episodes = Score::of(&self.pool.take_finished());
+        let mut recent = Recent::default();
+        for env in self.pool.envs_mut() {
+            recent += env.take_recent();
+        }
+        let evaluation = evaluation.unwrap_or_else(|| Score::of(&[]));
+        let [collect_s, update_s] = seconds;
+        let steps_per_s = self.config.steps_per_iteration() as f64 / (collect_s + update_s);
+        let mut values = vec![
+            episodes.episode_return,
+            episodes.length,
+            episodes.goals,
+            episodes.in_tolerance,
+            episodes.drop_rate,
+            episodes.rot_dist,
+            episodes.steps_per_goal,
+        ];
+        values.extend(recent.reward.values().map(|sum| sum / recent.steps as f64));
+        values.extend([evaluation.goals, evaluation.drop_rate, evaluation.rot_dist, evaluation.episode_return]);
+        values.extend([update.policy_loss, update.value_loss]);
+        values.extend([update.entropy, update.kl, update.first_kl, update.clip_fraction, update.std]);
+        values.extend([update.explained_variance, update.learning_rate, update.grad_norm]);
+        values.extend([collect_s, update_s, steps_per_s, recent.diverged as f64]);
+        assert_eq!(values.len(), TAGS.len(), "one value for each tag");
+        let tagged: Vec<(&str, f64)> = TAGS.into_iter().zip(values).collect();
+        let Progress { iteration, env_steps, .. } = self.progress;
+        let status = Status { env_steps, steps_per_s, goals: episodes.goals, drop_rate: episodes.drop_rate };
+        report.iteration(iteration, &tagged, &status);
+    }
+}
+
+/// The settings that have options of their own.
+fn asked(args: &TrainArgs) -> Vec<Override> {
+    let options = [
+        ("run.seed", args.seed),
+        ("run.threads", args.threads.map(|n| n as u64)),
+        ("run.total_steps", args.total_steps),
+    ];
+    let given = options.into_iter().filter_map(|(key, value)| Some((key, value?)));
+    given.map(|(key, value)| Override { key: key.into(), value: value.to_string() }).collect()
+}
+
+/// What a run folder says about the program that made it.
+fn version() -> String {
+    format!(
+        "shadow-repose {}\ncommit {}\nmujoco {}\n{}\ntarget {}\n",
+        env!("CARGO_PKG_VERSION"),
+        env!("SHADOW_REPOSE_COMMIT"),
+        crate::sim::mujoco_version(),
+        env!("SHADOW_REPOSE_RUSTC"),
+        env!("SHADOW_REPOSE_TARGET"),
+    )
+}
