@@ -6,7 +6,9 @@
 
 mod adam;
 mod checkpoint;
+mod elementwise;
 mod gae;
+mod layer;
 mod loss;
 mod matmul;
 mod normalizer;

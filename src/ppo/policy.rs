@@ -1,11 +1,11 @@
 //! What acts: two MLPs, actor and critic, a standard deviation that does not depend on the state, and the normaliser.
 
 use anyhow::Result;
-use candle_core::{DType, Device, Module, Tensor, Var};
-use candle_nn::Linear;
+use candle_core::{DType, Device, Tensor, Var};
 use rand::RngExt;
 
 use super::Normalizer;
+use super::layer::FusedLinear;
 use crate::config::{Activation, PpoConfig};
 use crate::rng::{self, Rng};
 
@@ -24,7 +24,8 @@ pub struct Policy {
 
 /// One network on the present parameters.
 pub struct Mlp {
-    layers: Vec<Linear>,
+    /// Weight and bias of each layer.
+    layers: Vec<[Tensor; 2]>,
     activation: Activation,
 }
 
@@ -35,16 +36,9 @@ impl Mlp {
     /// Inputs of another width than the first layer's.
     pub fn forward(&self, inputs: &Tensor) -> candle_core::Result<Tensor> {
         let mut x = inputs.clone();
-        for (i, layer) in self.layers.iter().enumerate() {
-            x = layer.forward(&x)?;
-            if i + 1 < self.layers.len() {
-                x = match self.activation {
-                    Activation::Elu => x.elu(1.0)?,
-                    Activation::Relu => x.relu()?,
-                    Activation::Silu => x.silu()?,
-                    Activation::Tanh => x.tanh()?,
-                };
-            }
+        for (i, [weight, bias]) in self.layers.iter().enumerate() {
+            let hidden = i + 1 < self.layers.len();
+            x = FusedLinear { activation: hidden.then_some(self.activation) }.forward(&x, weight, bias)?;
         }
         Ok(x)
     }
@@ -115,7 +109,7 @@ impl Policy {
     fn build(&self, tensor: impl Fn(&Var) -> Tensor) -> [Mlp; 2] {
         let pairs: Vec<&[(String, Var)]> = self.parameters.chunks_exact(2).collect();
         [&pairs[..self.layers], &pairs[self.layers..]].map(|net| Mlp {
-            layers: net.iter().map(|pair| Linear::new(tensor(&pair[0].1), Some(tensor(&pair[1].1)))).collect(),
+            layers: net.iter().map(|pair| [tensor(&pair[0].1), tensor(&pair[1].1)]).collect(),
             activation: self.activation,
         })
     }
