@@ -189,8 +189,8 @@ impl Repose {
         }
     }
 
-    /// Writes the 157 numbers in the order of the task.
-    fn observe(&self, observation: &mut [f32]) {
+    /// Writes the observation `[157]` of the present state, in the order of the task.
+    pub fn observe(&self, observation: &mut [f32]) {
         assert_eq!(observation.len(), OBSERVATION_SIZE, "length of an observation");
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());

@@ -10,7 +10,7 @@ mod elementwise;
 mod gae;
 mod layer;
 mod loss;
-mod matmul;
+mod measure;
 mod normalizer;
 mod policy;
 mod rollout;
@@ -22,7 +22,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 pub use checkpoint::{Checkpoint, Progress};
 pub use gae::gae;
-pub use matmul::matmul_gflops;
+pub use measure::{matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use policy::{Mlp, Policy};
 pub use rollout::{Rollout, RolloutStep};

@@ -7,7 +7,7 @@ mod report;
 
 pub use folder::{RunFolder, newest_checkpoint, read_bytes, read_text, resolve_checkpoint, write_whole};
 pub use interrupt::on_interrupt;
-pub use report::{Report, Status};
+pub use report::{EpisodeBar, Report, Status};
 
 use anyhow::{Context, Result};
 

@@ -154,6 +154,31 @@ impl Shown {
     }
 }
 
+/// A bar that counts the episodes that have ended; invisible where stderr is no terminal.
+pub struct EpisodeBar {
+    bar: ProgressBar,
+}
+
+impl EpisodeBar {
+    /// A bar at zero.
+    pub fn new(episodes: u64) -> Self {
+        let style = ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {pos}/{len} episodes");
+        let style = style.expect("a template that indicatif knows").progress_chars("=> ");
+        Self { bar: ProgressBar::new(episodes).with_style(style) }
+    }
+
+    /// Counts one.
+    pub fn episode_ended(&self) {
+        self.bar.inc(1);
+    }
+}
+
+impl Drop for EpisodeBar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
+
 fn progress_bar(done: u64, total: u64) -> ProgressBar {
     let style = ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {human_pos}/{human_len} steps  {msg}");
     let bar = ProgressBar::new(total).with_style(style.expect("a template that indicatif knows").progress_chars("=> "));

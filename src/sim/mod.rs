@@ -7,4 +7,4 @@ mod simulation;
 
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
-pub use simulation::{BareSimulation, Physics, Simulation};
+pub use simulation::{BareSimulation, Physics, Simulation, SimulationState};

@@ -17,6 +17,14 @@ pub enum Physics {
     Diverged,
 }
 
+/// All that the next step depends on besides the controls.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimulationState {
+    qpos: Vec<f64>,
+    qvel: Vec<f64>,
+    warm_start: Vec<f64>,
+}
+
 /// The state of one world. Positions of bodies, velocities and joints are always those of the same instant.
 pub struct Simulation {
     data: MjData<Arc<MjModel>>,
@@ -90,6 +98,15 @@ impl Simulation {
         self.data.ctrl_mut()
     }
 
+    /// A copy of the state.
+    pub fn state(&self) -> SimulationState {
+        SimulationState {
+            qpos: self.data.qpos().to_vec(),
+            qvel: self.data.qvel().to_vec(),
+            warm_start: self.data.qacc_warmstart().to_vec(),
+        }
+    }
+
     /// Position (m) and orientation of a body's frame in the world.
     pub fn pose(&self, Body(id): Body) -> ([f64; 3], Quat) {
         (self.data.xpos()[id], self.data.xquat()[id])
@@ -120,11 +137,12 @@ impl BareSimulation {
         Self { data: MjData::new(scene.model.clone()) }
     }
 
-    /// Starts from a state; lengths as in [`Simulation::qpos`] and [`Simulation::qvel`].
-    pub fn start(&mut self, qpos: &[f64], qvel: &[f64]) {
+    /// Starts from a state of a simulation of the same scene.
+    pub fn start(&mut self, state: &SimulationState) {
         self.data.reset();
-        self.data.qpos_mut().copy_from_slice(qpos);
-        self.data.qvel_mut().copy_from_slice(qvel);
+        self.data.qpos_mut().copy_from_slice(&state.qpos);
+        self.data.qvel_mut().copy_from_slice(&state.qvel);
+        self.data.qacc_warmstart_mut().copy_from_slice(&state.warm_start);
     }
 
     /// Takes `substeps` physics steps with these controls.

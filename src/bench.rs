@@ -1,0 +1,257 @@
+//! Measures this machine: what the physics alone can do, the environments around it, the learner, and all together.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use anyhow::{Result, ensure};
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+use serde_json::json;
+
+use crate::cli::BenchArgs;
+use crate::config::{Config, Source};
+use crate::env::{ACTION_SIZE, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition};
+use crate::ppo::{Ppo, matmul_gflops, time_gradient_steps};
+use crate::rng::{self, Rng};
+use crate::run;
+use crate::sim::{BareSimulation, SimulationState};
+use crate::train::{Scratch, collect};
+
+/// Measurements of physics and pool, taken in turn.
+const ROUNDS: usize = 5;
+
+/// Control steps before the measured ones, so that most cubes have come to lie in the hand.
+const WARM_UP: usize = 64;
+
+/// Measured control steps over all environments, at least.
+const STEPS: usize = 32_768;
+
+/// Gradient steps and matrix products that are measured.
+const REPEATS: usize = 11;
+
+/// Seconds after which no further whole iteration is begun, and the most iterations.
+const END_TO_END: (f64, usize) = (8.0, 4);
+
+/// Measures and prints.
+///
+/// # Errors
+/// Settings or a scene that cannot be used.
+pub fn bench(args: &BenchArgs) -> Result<()> {
+    let user = match &args.settings.config {
+        Some(path) => Some(Source { path: path.clone(), text: run::read_text(path)? }),
+        None => None,
+    };
+    let mut config = Config::resolve(user.as_ref(), &args.settings.set)?;
+    config.run.threads = args.threads.unwrap_or(config.run.threads);
+    run::start_threads(config.run.threads)?;
+    let task = Task::new(&config.env)?;
+    let (physics, pool, share) = physics_and_pool(&task, &config)?;
+    let (samples, gflops, matmul) = learner(&task, &config)?;
+    let end_to_end = end_to_end(&task, &config)?;
+    let threads = rayon::current_num_threads();
+    if args.json {
+        let object = json!({
+            "physics_steps_per_s": physics,
+            "pool_steps_per_s": pool,
+            "pool_share": share,
+            "learner_samples_per_s": samples,
+            "learner_gflops": gflops,
+            "matmul_gflops": matmul,
+            "end_to_end_steps_per_s": end_to_end,
+            "threads": threads,
+            "hidden": config.ppo.hidden,
+            "num_envs": config.env.num_envs,
+        });
+        run::print(&format!("{object}\n"));
+    } else {
+        run::print(&format!(
+            "{threads} threads, {} environments, nets {:?}, minibatches of {}\n\
+             physics alone (mj_step)   {physics:>10.0} steps/s\n\
+             environments              {pool:>10.0} steps/s   {:.1} % of the physics\n\
+             learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
+             its matrix products alone                      {matmul:.1} GFLOP/s\n\
+             end to end                {end_to_end:>10.0} steps/s\n",
+            config.env.num_envs,
+            config.ppo.hidden,
+            config.steps_per_iteration() / config.ppo.minibatches as u64,
+            100.0 * share,
+        ));
+    }
+    Ok(())
+}
+
+/// What an environment did: its state when the measurement begins, its controls at each step, and where it was reset.
+struct Recording {
+    start: SimulationState,
+    steps: Vec<Vec<f64>>,
+    /// Steps after which an episode began, with its state.
+    resets: Vec<(usize, SimulationState)>,
+}
+
+/// An environment that writes down what its physics is given.
+struct Recorder {
+    env: Repose,
+    recording: Option<Recording>,
+}
+
+impl Env for Recorder {
+    type Episode = EpisodeStats;
+
+    fn observation_size(&self) -> usize {
+        self.env.observation_size()
+    }
+
+    fn action_size(&self) -> usize {
+        self.env.action_size()
+    }
+
+    fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
+        self.env.reset(rng, observation);
+        if let Some(recording) = &mut self.recording {
+            recording.resets.push((recording.steps.len(), self.env.simulation().state()));
+        }
+    }
+
+    fn skip_ahead(&mut self, share: f64) {
+        self.env.skip_ahead(share);
+    }
+
+    fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
+        let transition = self.env.step(action, observation);
+        if let Some(recording) = &mut self.recording {
+            recording.steps.push(self.env.simulation().ctrl().to_vec());
+        }
+        transition
+    }
+
+    fn episode(&self) -> EpisodeStats {
+        self.env.episode()
+    }
+}
+
+/// Env steps per second of bare physics and of the pool, medians of rounds taken in turn, and the median of their ratios.
+fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
+    let envs = config.env.num_envs;
+    let steps = STEPS.div_ceil(envs);
+    let mut noise = rng::stream(config.run.seed, "bench", 0);
+    let mut action = || -> f32 {
+        config.ppo.init_std as f32 * <StandardNormal as Distribution<f32>>::sample(&StandardNormal, &mut noise)
+    };
+    let actions: Vec<Vec<f32>> =
+        (0..WARM_UP + steps).map(|_| (0..envs * ACTION_SIZE).map(|_| action()).collect()).collect();
+
+    let recorders = (0..envs).map(|_| Recorder { env: Repose::new(task), recording: None }).collect();
+    let mut recorders = EnvPool::new(config.run.seed, recorders);
+    play(&mut recorders, &actions[..WARM_UP], true);
+    for recorder in recorders.envs_mut() {
+        let start = recorder.env.simulation().state();
+        recorder.recording = Some(Recording { start, steps: Vec::new(), resets: Vec::new() });
+    }
+    play(&mut recorders, &actions[WARM_UP..], false);
+    let ends: Vec<Vec<f64>> = recorders.envs_mut().map(|r| r.env.simulation().qpos().to_vec()).collect();
+    let recordings: Vec<Recording> = recorders.envs_mut().filter_map(|r| r.recording.take()).collect();
+    drop(recorders);
+
+    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Repose::new(task)).collect());
+    let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
+    let mut rates: [Vec<f64>; 3] = Default::default();
+    for _ in 0..ROUNDS {
+        play(&mut pool, &actions[..WARM_UP], true);
+        let pool_seconds = play(&mut pool, &actions[WARM_UP..], false);
+        let bare_seconds = replay(&mut bare, &recordings, config.env.substeps());
+        // The replay did the same physics only if it ended in the same states.
+        ensure!(bare.iter().zip(&ends).all(|(bare, end)| bare.qpos() == end), "the replay has left the recorded path");
+        let done = (steps * envs) as f64;
+        rates[0].push(done / bare_seconds);
+        rates[1].push(done / pool_seconds);
+        rates[2].push(bare_seconds / pool_seconds);
+    }
+    let [physics, pool, share] = rates.map(median);
+    Ok((physics, pool, share))
+}
+
+/// Steps a pool with these actions, from the start if `reset`; the seconds that the steps took.
+fn play<E: Env>(pool: &mut EnvPool<E>, actions: &[Vec<f32>], reset: bool) -> f64 {
+    let envs = pool.len();
+    let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
+    let mut final_observations = observations.clone();
+    let (mut rewards, mut ends) = (vec![0.0; envs], vec![None; envs]);
+    if reset {
+        pool.reset(0, &mut observations);
+    }
+    let start = Instant::now();
+    for actions in actions {
+        let buffers = StepBuffers {
+            rewards: &mut rewards,
+            ends: &mut ends,
+            observations: &mut observations,
+            final_observations: &mut final_observations,
+        };
+        pool.step(actions, buffers);
+    }
+    start.elapsed().as_secs_f64()
+}
+
+/// Replays the recordings; the seconds that it took. All environments take a step before any takes the next, as in the pool.
+fn replay(bare: &mut [BareSimulation], recordings: &[Recording], substeps: usize) -> f64 {
+    bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| bare.start(&recording.start));
+    let steps = recordings[0].steps.len();
+    let start = Instant::now();
+    for step in 0..steps {
+        bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| {
+            bare.step(&recording.steps[step], substeps);
+            if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, _)| after) {
+                bare.start(&recording.resets[i].1);
+            }
+        });
+    }
+    start.elapsed().as_secs_f64()
+}
+
+/// Samples per second and GFLOP/s of gradient steps, and GFLOP/s of their matrix products alone.
+fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
+    let (mut ppo, mut pool) = agent(task, config)?;
+    let mut rollout = ppo.rollout(pool.len());
+    let mut scratch = Scratch::new(&pool);
+    pool.reset(0, rollout.first_observations_mut());
+    collect(&mut pool, &ppo, &mut rollout, 0, &mut scratch, &AtomicBool::new(false))?;
+    let size = rollout.samples() / config.ppo.minibatches;
+    let flops = 6.0 * ppo.policy().parameter_count() as f64;
+    time_gradient_steps(&mut ppo, &rollout, 2)?;
+    let samples = size as f64 / median(time_gradient_steps(&mut ppo, &rollout, REPEATS)?);
+    let matmul = median(matmul_gflops(ppo.policy(), size, REPEATS)?);
+    Ok((samples, 1e-9 * flops * samples, matmul))
+}
+
+/// Env steps per second of whole iterations, the first one aside if it is short.
+fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
+    let (mut ppo, mut pool) = agent(task, config)?;
+    let mut rollout = ppo.rollout(pool.len());
+    let mut scratch = Scratch::new(&pool);
+    pool.reset(0, rollout.first_observations_mut());
+    let begun = Instant::now();
+    let mut seconds = Vec::new();
+    for iteration in 0..=END_TO_END.1 as u64 {
+        let start = Instant::now();
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false))?;
+        ppo.update(&mut rollout, iteration)?;
+        rollout.carry_over();
+        seconds.push(start.elapsed().as_secs_f64());
+        if begun.elapsed().as_secs_f64() > END_TO_END.0 {
+            break;
+        }
+    }
+    let measured = if seconds.len() > 1 { seconds.split_off(1) } else { seconds };
+    Ok(config.steps_per_iteration() as f64 / median(measured))
+}
+
+fn agent(task: &Arc<Task>, config: &Config) -> Result<(Ppo, EnvPool<Repose>)> {
+    let pool = EnvPool::new(config.run.seed, (0..config.env.num_envs).map(|_| Repose::new(task)).collect());
+    Ok((Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, config.run.seed)?, pool))
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}

@@ -1,0 +1,197 @@
+//! Scores a policy: whole episodes, a table or one JSON object, and the trace of the first episodes.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use anyhow::{Context, Result, ensure};
+use serde_json::{Map, Value, json};
+
+use crate::cli::{Baseline, PlayArgs};
+use crate::config::{Config, Override};
+use crate::env::{ACTION_SIZE, OBSERVATION_SIZE, RewardTerms, Score, Task};
+use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::ppo::{Checkpoint, Policy};
+use crate::run;
+use crate::trace::Trace;
+
+/// Plays as asked and prints the score.
+///
+/// # Errors
+/// A checkpoint, setting or scene that cannot be used; a trace that cannot be written.
+pub fn play(args: &PlayArgs) -> Result<()> {
+    let loaded = match args.policy {
+        Some(_) => None,
+        None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
+    };
+    let config = match &loaded {
+        Some(loaded) => loaded.config.clone(),
+        None => Config::resolve(None, of_the_task(&args.set)?)?,
+    };
+    run::start_threads(args.threads)?;
+    let task = Task::new(&config.env)?;
+    let actor = match (&loaded, args.policy) {
+        (Some(loaded), _) if args.stochastic => Actor::Stochastic(&loaded.policy),
+        (Some(loaded), _) => Actor::Mean(&loaded.policy),
+        (None, Some(Baseline::Random)) => Actor::Random,
+        (None, _) => Actor::Zero,
+    };
+    let checkpoint = loaded.as_ref().map(|loaded| loaded.path.display().to_string());
+    let mut trace = args.trace.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
+    let score = score(&task, &actor, args, trace.as_mut())?;
+    if let (Some(path), Some(trace)) = (&args.trace, trace) {
+        run::write_whole(path, trace.finish().as_bytes())?;
+    }
+    if args.json {
+        run::print(&format!("{}\n", json_score(&score, checkpoint.as_deref(), args.seed)));
+        return Ok(());
+    }
+    let name = match &actor {
+        Actor::Mean(_) => "policy",
+        Actor::Stochastic(_) => "policy, stochastic",
+        Actor::Zero => "zero actions",
+        Actor::Random => "random actions",
+    };
+    if let Some(checkpoint) = &checkpoint {
+        run::print(&format!("checkpoint {checkpoint}\n"));
+    }
+    let mut columns = vec![(name, score)];
+    if loaded.is_some() {
+        columns.push(("zero actions", self::score(&task, &Actor::Zero, args, None)?));
+    }
+    run::print(&table(&columns));
+    Ok(())
+}
+
+/// A policy from a file, with the configuration that it was trained with and `--set` on top.
+struct Loaded {
+    path: PathBuf,
+    config: Config,
+    policy: Policy,
+}
+
+impl Loaded {
+    fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
+        let path = match place {
+            Some(place) => run::resolve_checkpoint(place)?,
+            None => run::newest_checkpoint()?,
+        };
+        let overrides = of_the_task(overrides)?;
+        let context = || format!("cannot play {}", path.display());
+        let checkpoint = Checkpoint::parse(&run::read_bytes(&path)?).with_context(context)?;
+        let config = Config::from_text(&path, &checkpoint.config, overrides)?;
+        let mut policy = Policy::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0)?;
+        policy.restore(checkpoint).with_context(context)?;
+        Ok(Self { path, config, policy })
+    }
+}
+
+/// Refuses settings that are not of the task: they would change nothing, or the shape of the policy.
+fn of_the_task(overrides: &[Override]) -> Result<&[Override]> {
+    for set in overrides {
+        let of_env = set.key.starts_with("env.");
+        ensure!(of_env, "--set {}: only the task (env.*) can be changed for a policy that is played", set.key);
+    }
+    Ok(overrides)
+}
+
+fn score(task: &std::sync::Arc<Task>, actor: &Actor, args: &PlayArgs, mut trace: Option<&mut Trace>) -> Result<Score> {
+    let episodes = Episodes { seed: args.seed, purpose: "score", count: args.episodes as usize };
+    let progress = run::EpisodeBar::new(args.episodes);
+    let never = AtomicBool::new(false);
+    let played = evaluate(task, actor, episodes, &never, &mut |moment| {
+        if let Some(trace) = &mut trace {
+            trace.record(&moment);
+        }
+        if moment.step.is_some_and(|(_, end)| end.is_some()) {
+            progress.episode_ended();
+        }
+    })?;
+    Ok(Score::of(&played.context("nothing interrupts these episodes")?))
+}
+
+/// One object with everything that is known; what has no value is null.
+fn json_score(score: &Score, checkpoint: Option<&str>, seed: u64) -> Value {
+    let terms = RewardTerms::NAMES.iter().zip(score.reward.values());
+    let reward: Map<String, Value> = terms.map(|(name, value)| ((*name).to_owned(), json!(value))).collect();
+    json!({
+        "episodes": score.episodes,
+        "env_steps": score.env_steps,
+        "goals_per_episode": score.goals,
+        "goals_ci95": score.goals_ci95,
+        "in_tolerance": score.in_tolerance,
+        "rot_dist": score.rot_dist,
+        "steps_per_goal": score.steps_per_goal,
+        "drop_rate": score.drop_rate,
+        "episode_length": score.length,
+        "return": score.episode_return,
+        "reward": reward,
+        "diverged": score.diverged,
+        "checkpoint": checkpoint,
+        "seed": seed,
+    })
+}
+
+/// A row for each figure, a column for each score.
+fn table(columns: &[(&str, Score)]) -> String {
+    let number = |value: f64, decimals: usize| match value.is_nan() {
+        true => "-".to_owned(),
+        false => format!("{value:.decimals$}"),
+    };
+    let interval = |[low, high]: [f64; 2]| format!("{} … {}", number(low, 3), number(high, 3));
+    type Figure<'a> = Box<dyn Fn(&Score) -> String + 'a>;
+    let mut rows: Vec<(String, Figure)> = vec![
+        ("episodes".into(), Box::new(|s| s.episodes.to_string())),
+        ("goals per episode".into(), Box::new(|s| number(s.goals, 3))),
+        ("  95 % interval".into(), Box::new(|s| interval(s.goals_ci95))),
+        ("steps in tolerance, %".into(), Box::new(|s| number(100.0 * s.in_tolerance, 2))),
+        ("rotation error, rad".into(), Box::new(|s| number(s.rot_dist, 3))),
+        ("steps per goal".into(), Box::new(|s| number(s.steps_per_goal, 0))),
+        ("drop rate, %".into(), Box::new(|s| number(100.0 * s.drop_rate, 1))),
+        ("episode length, steps".into(), Box::new(|s| number(s.length, 1))),
+        ("return".into(), Box::new(|s| number(s.episode_return, 2))),
+    ];
+    for (i, term) in RewardTerms::NAMES.iter().enumerate() {
+        rows.push((format!("  {term}"), Box::new(move |s| number(s.reward.values()[i], 2))));
+    }
+    rows.push(("diverged episodes".into(), Box::new(|s| s.diverged.to_string())));
+    let mut text = format!("{:<24}", "");
+    columns.iter().for_each(|(name, _)| text += &format!("{name:>20}"));
+    for (label, figure) in rows {
+        text += &format!("\n{label:<24}");
+        columns.iter().for_each(|(_, score)| text += &format!("{:>20}", figure(score)));
+    }
+    text + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::env::EpisodeStats;
+
+    #[test]
+    fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {
+        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), None, 3);
+        let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
+        let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal drop_rate \
+                        episode_length return reward diverged checkpoint seed";
+        assert_eq!(keys.join(" "), expected);
+        assert!(value["steps_per_goal"].is_null() && value["checkpoint"].is_null());
+        assert_eq!(value["reward"].as_object().unwrap().len(), 5);
+        assert_eq!(value["seed"], 3);
+    }
+
+    #[test]
+    fn the_table_has_a_column_for_each_score() {
+        let score = Score::of(&[EpisodeStats { length: 10, goals: 2, ..Default::default() }]);
+        let text = table(&[("policy", score), ("zero actions", score)]);
+        let goals = text.lines().find(|line| line.starts_with("goals per episode")).unwrap();
+        assert_eq!(goals.matches("2.000").count(), 2, "{text}");
+    }
+
+    #[test]
+    fn only_the_task_can_be_changed_for_a_policy() {
+        let set = |text: &str| [text.parse::<Override>().unwrap()];
+        assert!(of_the_task(&set("env.sim_dt=0.002")).is_ok());
+        assert!(of_the_task(&set("ppo.hidden=[3]")).is_err());
+    }
+}

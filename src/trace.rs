@@ -1,0 +1,109 @@
+//! The first episodes of a score, step by step, as JSON lines: enough to replay and check each of them elsewhere.
+
+use serde_json::{Map, Value, json};
+
+use crate::config::EnvConfig;
+use crate::env::{End, Env, RewardTerms};
+use crate::evaluate::Moment;
+
+/// Episodes are written, whole and in order, until there are this many records.
+const ENOUGH: usize = 2000;
+
+/// The records of the episodes that may still be among the first [`ENOUGH`].
+pub struct Trace {
+    header: Value,
+    /// Per episode its lines.
+    episodes: Vec<Vec<String>>,
+    /// The last episode that can be needed, as far as is known.
+    last: usize,
+}
+
+impl Trace {
+    /// An empty trace of the task with these settings, played by the policy in `checkpoint`.
+    pub fn new(config: &EnvConfig, checkpoint: Option<&str>) -> Self {
+        let header = json!({
+            "sim_dt": config.sim_dt,
+            "ctrl_dt": config.ctrl_dt,
+            "act_moving_average": config.act_moving_average,
+            "success_tolerance": config.success_tolerance,
+            "max_consecutive_successes": config.max_consecutive_successes,
+            "max_episode_steps": config.max_episode_steps(),
+            "model": config.model,
+            "checkpoint": checkpoint,
+        });
+        Self { header, episodes: Vec::new(), last: usize::MAX }
+    }
+
+    /// Takes a moment, if it can be needed.
+    ///
+    /// Episodes run side by side, and it is not known beforehand how long each will be; but once the episodes up to one have
+    /// enough records together, none after it can be needed any more.
+    pub fn record(&mut self, moment: &Moment) {
+        if moment.episode > self.last {
+            return;
+        }
+        if self.episodes.len() <= moment.episode {
+            self.episodes.resize(moment.episode + 1, Vec::new());
+        }
+        self.episodes[moment.episode].push(record(moment).to_string());
+        let mut records = 0;
+        let full = self.episodes.iter().position(|lines| {
+            records += lines.len();
+            records >= ENOUGH
+        });
+        if let Some(last) = full {
+            self.last = last;
+            self.episodes.truncate(last + 1);
+        }
+    }
+
+    /// The whole text.
+    pub fn finish(self) -> String {
+        let lines = std::iter::once(self.header.to_string()).chain(self.episodes.into_iter().flatten());
+        lines.map(|line| line + "\n").collect()
+    }
+}
+
+fn record(moment: &Moment) -> Value {
+    let env = moment.env;
+    let simulation = env.simulation();
+    let mut record = json!({
+        "episode": moment.episode,
+        "step": env.episode().length,
+        "qpos": simulation.qpos(),
+        "qvel": simulation.qvel(),
+    });
+    let fields = record.as_object_mut().expect("an object was just made");
+    let mut put = |key: &str, value: Value| drop(fields.insert(key.to_owned(), value));
+    match moment.step {
+        None => {
+            put("reset", json!(true));
+            put("goal", json!(env.goal()));
+        }
+        Some((action, end)) => {
+            let details = env.last_step();
+            let terms = RewardTerms::NAMES.iter().zip(details.reward.values());
+            let mut reward: Map<String, Value> =
+                terms.map(|(name, value)| ((*name).to_owned(), json!(value))).collect();
+            reward.insert("total".into(), json!(details.reward.total()));
+            put("ctrl", json!(simulation.ctrl()));
+            put("action", doubles(action));
+            put("goal", json!(details.goal));
+            put("reward", Value::Object(reward));
+            put("rot_dist", json!(details.rot_dist));
+            put("goal_dist", json!(details.goal_dist));
+            put("held", json!(env.held()));
+            put("goals", json!(env.episode().goals));
+            put("terminated", json!(end == Some(End::Terminated)));
+            put("truncated", json!(end == Some(End::Truncated)));
+            put("diverged", json!(details.diverged));
+        }
+    }
+    put("obs", doubles(moment.observation));
+    record
+}
+
+/// Floats as the doubles they are, so that a reader gets them back exactly.
+fn doubles(values: &[f32]) -> Value {
+    values.iter().map(|&x| json!(f64::from(x))).collect()
+}

@@ -1,0 +1,136 @@
+//! What users get wrong: one clear message, exit code 1 (2 for the command line itself), nothing overwritten.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use crate::support::{program, stderr, succeeded, train};
+
+/// Fails unless the program exits with `code` and says each of `parts` on stderr.
+#[track_caller]
+fn refused(folder: &Path, args: &[&str], code: i32, parts: &[&str]) {
+    let output = program(folder, args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(code), "{args:?}\n{said}");
+    assert!(output.stdout.is_empty());
+    for part in parts {
+        assert!(said.contains(part), "{part:?} is not in\n{said}");
+    }
+    assert!(!said.contains("panicked"), "{said}");
+}
+
+#[test]
+fn settings_that_cannot_be_are_named_all_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("my.toml"), "[ppo]\nlearningrate = 1\nhorizon = \"long\"\n[env]\nnum_envs = 0\n")
+        .unwrap();
+    let args = ["train", "--config", "my.toml", "--set", "ppo.gamma=1.5", "--set", "env.ctrl_dt=0.015"];
+    refused(
+        folder.path(),
+        &args,
+        1,
+        &[
+            "my.toml",
+            "ppo.learningrate: unknown key; did you mean ppo.learning_rate?",
+            "ppo.horizon = \"long\": must be a whole number",
+            "env.num_envs = 0: must be at least 1",
+            "ppo.gamma = 1.5: must lie in [0, 1]",
+            "env.ctrl_dt = 0.015: must be a whole multiple of env.sim_dt = 0.01",
+        ],
+    );
+    refused(folder.path(), &["train", "--set", "ppo.minibatches=7"], 1, &["must divide num_envs * horizon = 16384"]);
+    refused(folder.path(), &["bench", "--set", "ppo.minibatches=7"], 1, &["must divide"]);
+    assert!(!folder.path().join("runs").exists(), "nothing is begun");
+}
+
+#[test]
+fn files_that_are_missing_or_no_configurations_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("broken.toml"), "[env\n").unwrap();
+    refused(folder.path(), &["train", "--config", "absent.toml"], 1, &["absent.toml"]);
+    refused(folder.path(), &["train", "--config", "."], 1, &["cannot read ."]);
+    refused(folder.path(), &["train", "--config", "broken.toml"], 1, &["broken.toml", "not a TOML file"]);
+    refused(folder.path(), &["train", "--set", "env.model=absent.xml"], 1, &["absent.xml"]);
+    refused(folder.path(), &["train", "--resume", "absent"], 1, &["absent"]);
+    refused(folder.path(), &["play", "--ckpt", "absent.safetensors"], 1, &["absent.safetensors"]);
+    refused(folder.path(), &["play"], 1, &["train one first"]);
+    fs::create_dir(folder.path().join("empty")).unwrap();
+    refused(folder.path(), &["play", "--ckpt", "empty"], 1, &["empty holds no checkpoint"]);
+    refused(folder.path(), &["train", "--resume", "empty"], 1, &["empty"]);
+}
+
+#[test]
+fn checkpoints_that_are_damaged_or_of_something_else_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    succeeded(program(folder.path(), &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let good = fs::read(folder.path().join("run/checkpoints/latest.safetensors")).unwrap();
+    let write = |name: &str, bytes: &[u8]| fs::write(folder.path().join(name), bytes).unwrap();
+    write("cut.safetensors", &good[..good.len() - 100]);
+    write("text.safetensors", b"hello");
+    // The same bytes, but its configuration asks for a wider net.
+    let text = b"hidden = [16, 8]";
+    let at = good.windows(text.len()).position(|w| w == text).expect("the configuration lies in the file");
+    let mut wider = good.clone();
+    wider[at..at + text.len()].copy_from_slice(b"hidden = [17, 8]");
+    write("wider.safetensors", &wider);
+    refused(folder.path(), &["play", "--ckpt", "cut.safetensors"], 1, &["cannot play cut.safetensors", "cut off"]);
+    refused(folder.path(), &["play", "--ckpt", "text.safetensors"], 1, &["text.safetensors"]);
+    refused(
+        folder.path(),
+        &["play", "--ckpt", "wider.safetensors"],
+        1,
+        &["`actor.0.weight`", "[16, 157]", "[17, 157]"],
+    );
+    fs::write(folder.path().join("run/checkpoints/latest.safetensors"), &good[..50]).unwrap();
+    refused(
+        folder.path(),
+        &["train", "--resume", "run", "--total-steps", "999"],
+        1,
+        &["cannot resume from", "cut off"],
+    );
+}
+
+#[test]
+fn a_folder_that_holds_a_run_is_neither_taken_nor_changed() {
+    let folder = tempfile::tempdir().unwrap();
+    succeeded(program(folder.path(), &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let before = fs::read(folder.path().join("run/metrics.csv")).unwrap();
+    refused(folder.path(), &train(&["--run-dir", "run"]), 1, &["already holds a run"]);
+    assert_eq!(before, fs::read(folder.path().join("run/metrics.csv")).unwrap());
+}
+
+#[test]
+fn a_run_folder_that_cannot_be_written_to_is_an_error_before_anything_is_trained() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("file"), "").unwrap();
+    refused(folder.path(), &train(&["--run-dir", "file/run"]), 1, &["cannot create the run folder"]);
+    // Where the tests run as root, permissions stop nobody.
+    let locked = folder.path().join("locked");
+    fs::create_dir(&locked).unwrap();
+    fs::set_permissions(&locked, fs::Permissions::from_mode(0o555)).unwrap();
+    if fs::write(locked.join("probe"), "").is_err() {
+        refused(folder.path(), &train(&["--run-dir", "locked/run"]), 1, &["cannot create the run folder"]);
+    }
+}
+
+#[test]
+fn usage_errors_exit_with_2() {
+    let folder = tempfile::tempdir().unwrap();
+    for args in [
+        &["fly"][..],
+        &["train", "--sed", "1"],
+        &["train", "--set", "ppo.gamma"],
+        &["train", "--total-steps", "many"],
+        &["train", "--resume", "run", "--seed", "1"],
+        &["train", "--resume", "run", "--set", "ppo.gamma=1"],
+        &["train", "--name", "a", "--run-dir", "b"],
+        &["play", "--policy", "clever"],
+        &["play", "--policy", "zero", "--ckpt", "x"],
+        &["play", "--episodes", "0"],
+    ] {
+        refused(folder.path(), args, 2, &["--help"]);
+    }
+    refused(folder.path(), &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"], 1, &["only the task"]);
+    refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}

@@ -1,0 +1,251 @@
+//! The program itself, as a user runs it.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use serde_json::Value;
+
+use crate::support::{command, program, stderr, succeeded, train};
+
+/// A folder with a finished run of two iterations in `run`.
+fn trained(more: &[&str]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let mut args = train(&["--total-steps", "256", "--run-dir", "run"]);
+    args.extend(more);
+    succeeded(program(folder.path(), &args));
+    folder
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+/// The metrics without the columns of times.
+fn metrics(run: &Path) -> Vec<Vec<String>> {
+    let text = fs::read_to_string(run.join("metrics.csv")).unwrap();
+    let header: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    let kept = |row: &str| {
+        let cells = row.split(',').zip(&header).filter(|(_, name)| !name.starts_with("time/"));
+        cells.map(|(cell, _)| cell.to_owned()).collect()
+    };
+    text.lines().map(kept).collect()
+}
+
+fn json(output: &std::process::Output) -> Value {
+    serde_json::from_slice(&output.stdout).expect("stdout is one JSON object and nothing else")
+}
+
+/// The tensors of a checkpoint.
+fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
+    let bytes = fs::read(path).unwrap();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    let mut found: Vec<_> = tensors.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();
+    found.sort();
+    found
+}
+
+#[test]
+fn a_training_leaves_its_files_and_nothing_else() {
+    let folder = trained(&[]);
+    assert_eq!(names(folder.path()), ["run"], "no MUJOCO_LOG.TXT, nothing beside the run");
+    let run = folder.path().join("run");
+    let found = names(&run);
+    assert_eq!(found.len(), 5, "{found:?}");
+    assert!(found.iter().any(|name| name.starts_with("events.out.tfevents.")));
+    assert_eq!(names(&run.join("checkpoints")), ["best.safetensors", "latest.safetensors"]);
+    assert!(fs::read_to_string(run.join("version.txt")).unwrap().contains("mujoco 3.17.0"));
+    let config: toml::Table = fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap();
+    assert_eq!(config["env"]["num_envs"].as_integer(), Some(16));
+    assert_eq!(config["env"]["reach_goal_bonus"].as_float(), Some(2.0), "the resolved configuration is whole");
+    let rows = metrics(&run);
+    assert_eq!(rows.len(), 3);
+    for column in
+        ["iteration", "env_steps", "reward/rotation", "reward/fall", "episode/goals", "policy/kl", "eval/goals"]
+    {
+        assert!(rows[0].iter().any(|name| name == column), "{column}");
+    }
+    assert_eq!(rows[2][..2], ["2", "256"]);
+}
+
+#[test]
+fn a_checkpoint_alone_is_played_from_anywhere_and_the_score_is_json() {
+    let folder = trained(&[]);
+    let elsewhere = tempfile::tempdir().unwrap();
+    fs::copy(folder.path().join("run/checkpoints/best.safetensors"), elsewhere.path().join("it.safetensors")).unwrap();
+    let args = ["play", "--ckpt", "it.safetensors", "--episodes", "5", "--json"];
+    let score = json(&succeeded(program(elsewhere.path(), &args)));
+    assert_eq!(score["episodes"], 5);
+    assert_eq!(score["checkpoint"], "it.safetensors");
+    // 20 steps at most: the configuration came with the file.
+    assert!(score["episode_length"].as_f64().unwrap() <= 20.0);
+    assert_eq!(names(elsewhere.path()), ["it.safetensors"]);
+}
+
+#[test]
+fn the_newest_run_is_played_by_default_and_the_table_compares_it_with_zero_actions() {
+    let folder = tempfile::tempdir().unwrap();
+    succeeded(program(folder.path(), &train(&["--total-steps", "128", "--name", "mine"])));
+    let runs = names(&folder.path().join("runs/shadow-hand-repose"));
+    assert!(runs.len() == 1 && runs[0].ends_with("-mine"), "{runs:?}");
+    let output = succeeded(program(folder.path(), &["play", "--episodes", "3", "--headless"]));
+    let table = String::from_utf8(output.stdout).unwrap();
+    for part in ["zero actions", "goals per episode", "drop rate", "best.safetensors"] {
+        assert!(table.contains(part), "{part} is not in\n{table}");
+    }
+}
+
+#[test]
+fn scores_do_not_depend_on_threads_or_on_how_many_episodes_are_asked_for() {
+    let folder = trained(&[]);
+    let play = |threads: &str, episodes: &str, more: &[&str]| {
+        let trace = format!("trace-{threads}-{episodes}.jsonl");
+        let mut args = vec!["play", "--ckpt", "run", "--json", "--threads", threads, "--episodes", episodes];
+        args.extend(["--trace", &trace]);
+        args.extend(more);
+        let score = json(&succeeded(program(folder.path(), &args)));
+        (score, fs::read_to_string(folder.path().join(trace)).unwrap())
+    };
+    for more in [&[][..], &["--stochastic"]] {
+        let (one, one_trace) = play("1", "70", more);
+        let (four, four_trace) = play("4", "70", more);
+        assert_eq!(one, four);
+        assert!(one_trace == four_trace);
+        let (_, fewer) = play("2", "3", more);
+        let whole: Vec<&str> = one_trace.lines().collect();
+        let part: Vec<&str> = fewer.lines().collect();
+        assert_eq!(whole[..part.len()], part[..], "the first episodes are the same");
+    }
+}
+
+#[test]
+fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
+    let folder = trained(&[]);
+    let args = ["play", "--ckpt", "run", "--episodes", "150", "--json", "--trace", "t.jsonl"];
+    succeeded(program(folder.path(), &args));
+    let text = fs::read_to_string(folder.path().join("t.jsonl")).unwrap();
+    let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let header: Vec<&String> = lines[0].as_object().unwrap().keys().collect();
+    let expected = "sim_dt ctrl_dt act_moving_average success_tolerance max_consecutive_successes max_episode_steps model \
+                    checkpoint";
+    assert_eq!(header.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" "), expected);
+    let records = &lines[1..];
+    // Episodes of 21 records: enough after 96 of them, without the 97th.
+    assert!((2000..2025).contains(&records.len()), "{} records", records.len());
+    let (mut episode, mut step) = (0, 0);
+    for (i, record) in records.iter().enumerate() {
+        if record["reset"] == true && i > 0 {
+            assert!(records[i - 1]["terminated"] == true || records[i - 1]["truncated"] == true);
+            (episode, step) = (episode + 1, 0);
+        }
+        assert_eq!((record["episode"].as_u64(), record["step"].as_u64()), (Some(episode), Some(step)));
+        assert_eq!(record["obs"].as_array().unwrap().len(), 157);
+        assert_eq!(record["qpos"].as_array().unwrap().len(), 31);
+        if step > 0 {
+            let terms = record["reward"].as_object().unwrap();
+            let sum: f64 =
+                ["rotation", "distance", "action", "bonus", "fall"].map(|t| terms[t].as_f64().unwrap()).iter().sum();
+            assert_eq!(terms["total"].as_f64().unwrap(), sum);
+            assert_eq!(record["ctrl"].as_array().unwrap().len(), 20);
+        }
+        step += 1;
+    }
+    assert!(records[records.len() - 1]["truncated"] == true || records[records.len() - 1]["terminated"] == true);
+}
+
+#[test]
+fn baselines_need_no_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    for policy in ["zero", "random"] {
+        let args = ["play", "--policy", policy, "--episodes", "4", "--json", "--set", "env.max_episode_seconds=0.1"];
+        let score = json(&succeeded(program(folder.path(), &args)));
+        assert!(score["checkpoint"].is_null());
+        assert_eq!(score["episode_length"], 10.0, "--set changes the task");
+    }
+}
+
+#[test]
+fn the_same_seed_trains_the_same_policy_on_any_number_of_threads() {
+    let runs: Vec<_> = ["1", "2", "8"].map(|threads| trained(&["--seed", "5", "--threads", threads])).into();
+    let other = trained(&["--seed", "6"]);
+    let latest = |run: &tempfile::TempDir| weights(run.path().join("run/checkpoints/latest.safetensors"));
+    for run in &runs[1..] {
+        assert_eq!(metrics(&runs[0].path().join("run")), metrics(&run.path().join("run")));
+        assert!(latest(&runs[0]) == latest(run));
+    }
+    assert!(latest(&runs[0]) != latest(&other));
+}
+
+#[test]
+fn a_resumed_run_goes_on_in_its_folder_up_to_the_new_total() {
+    let folder = trained(&[]);
+    let run = folder.path().join("run");
+    let done = succeeded(program(folder.path(), &["train", "--resume", "run"]));
+    assert!(stderr(&done).contains("is finished: 2 iterations"), "{}", stderr(&done));
+    let before = weights(run.join("checkpoints/latest.safetensors"));
+    succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512", "--threads", "1"]));
+    let rows = metrics(&run);
+    let iterations: Vec<&str> = rows[1..].iter().map(|row| row[0].as_str()).collect();
+    assert_eq!(iterations, ["1", "2", "3", "4"]);
+    assert_eq!(rows[4][1], "512");
+    let after = weights(run.join("checkpoints/latest.safetensors"));
+    assert_eq!(before.len(), after.len());
+    assert!(before != after);
+    let checkpoint = run.join("checkpoints/latest.safetensors").display().to_string();
+    succeeded(program(folder.path(), &["train", "--resume", &checkpoint, "--total-steps", "600"]));
+    assert_eq!(metrics(&run).len(), 6);
+}
+
+#[test]
+fn an_interrupted_training_saves_exits_with_130_and_can_be_resumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1000000"]);
+    let mut child = command(folder.path(), &args).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    // The first report of an iteration.
+    while !lines.next().unwrap().unwrap().contains("steps/s") {}
+    let signal = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(signal.success());
+    let rest: Vec<String> = lines.map(|line| line.unwrap()).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(rest.iter().any(|line| line.contains("--resume")), "{rest:?}");
+    let made = metrics(&folder.path().join("run")).len() as u64 - 1;
+    let total = ((made + 1) * 128).to_string();
+    succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", &total]));
+    assert_eq!(metrics(&folder.path().join("run")).len() as u64 - 1, made + 1);
+}
+
+#[test]
+fn an_own_scene_is_trained_on_and_played_from_another_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("own.xml"), crate::support::SCENE).unwrap();
+    let args = train(&["--total-steps", "128", "--run-dir", "run", "--set", "env.model=own.xml"]);
+    succeeded(program(folder.path(), &args));
+    let run = folder.path().join("run").display().to_string();
+    let elsewhere = tempfile::tempdir().unwrap();
+    succeeded(program(elsewhere.path(), &["play", "--ckpt", &run, "--episodes", "2", "--json"]));
+}
+
+#[test]
+fn bench_prints_every_figure() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["bench", "--json", "--set", "env.num_envs=64", "--set", "ppo.hidden=[16]", "--threads", "2"];
+    let figures = json(&succeeded(program(folder.path(), &args)));
+    for key in [
+        "physics_steps_per_s",
+        "pool_steps_per_s",
+        "pool_share",
+        "learner_samples_per_s",
+        "learner_gflops",
+        "matmul_gflops",
+        "end_to_end_steps_per_s",
+    ] {
+        assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
+    }
+    assert_eq!((figures["threads"].as_u64(), figures["num_envs"].as_u64()), (Some(2), Some(64)));
+    assert_eq!(figures["hidden"], serde_json::json!([16]));
+}

@@ -1,0 +1,141 @@
+//! The learner on a task without physics: learning can be tested in seconds.
+
+use std::sync::atomic::AtomicBool;
+
+use shadow_repose::env::{End, Env, EnvPool, Transition};
+use shadow_repose::ppo::Ppo;
+use shadow_repose::rng::{self, Rng};
+use shadow_repose::train::{Scratch, collect};
+
+use crate::support::config;
+
+const STEPS: u32 = 20;
+
+/// A point in the plane that is moved by up to 0.2 a step and should come to the origin.
+struct PointMass {
+    position: [f64; 2],
+    age: u32,
+}
+
+impl PointMass {
+    fn write(&self, observation: &mut [f32]) {
+        observation.copy_from_slice(&self.position.map(|x| x as f32));
+    }
+
+    fn distance(&self) -> f64 {
+        self.position[0].hypot(self.position[1])
+    }
+}
+
+impl Env for PointMass {
+    /// The distance at the end.
+    type Episode = f64;
+
+    fn observation_size(&self) -> usize {
+        2
+    }
+
+    fn action_size(&self) -> usize {
+        2
+    }
+
+    fn reset(&mut self, mut rng: Rng, observation: &mut [f32]) {
+        self.position = [0.0; 2].map(|_| rng::uniform(&mut rng, -1.0, 1.0));
+        self.age = 0;
+        self.write(observation);
+    }
+
+    fn skip_ahead(&mut self, share: f64) {
+        self.age = (share * f64::from(STEPS)) as u32;
+    }
+
+    fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
+        for (x, &a) in self.position.iter_mut().zip(action) {
+            *x += 0.2 * f64::from(a.clamp(-1.0, 1.0));
+        }
+        self.age += 1;
+        self.write(observation);
+        let end =
+            if self.distance() > 3.0 { Some(End::Terminated) } else { (self.age >= STEPS).then_some(End::Truncated) };
+        Transition { reward: -self.distance() as f32, end }
+    }
+
+    fn episode(&self) -> f64 {
+        self.distance()
+    }
+}
+
+fn pool(seed: u64) -> EnvPool<PointMass> {
+    EnvPool::new(seed, (0..64).map(|_| PointMass { position: [0.0; 2], age: 0 }).collect())
+}
+
+fn settings() -> shadow_repose::config::PpoConfig {
+    let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9"];
+    config(&settings).ppo
+}
+
+#[test]
+fn ppo_learns_to_bring_the_point_home_on_three_seeds() {
+    for seed in 0..3 {
+        let (mut pool, mut ppo) = (pool(seed), Ppo::new(&settings(), 2, 2, seed).unwrap());
+        let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+        pool.reset(0, rollout.first_observations_mut());
+        let mut distances = Vec::new();
+        for iteration in 1..=60 {
+            collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
+            ppo.update(&mut rollout, iteration).unwrap();
+            rollout.carry_over();
+            let finished = pool.take_finished();
+            if !finished.is_empty() {
+                distances.push(finished.iter().sum::<f64>() / finished.len() as f64);
+            }
+        }
+        let (first, last) = (distances[0], distances[distances.len() - 1]);
+        assert!(first > 0.5 && last < 0.15, "seed {seed}: {first} → {last}");
+    }
+}
+
+#[test]
+fn the_first_minibatch_sees_the_very_policy_that_acted() {
+    let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings(), 2, 2, 3).unwrap());
+    let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+    pool.reset(0, rollout.first_observations_mut());
+    for iteration in 1..=5 {
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
+        let stats = ppo.update(&mut rollout, iteration).unwrap();
+        rollout.carry_over();
+        assert!(stats.first_kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first_kl);
+        assert!(stats.first_ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first_ratio_error);
+        assert!(stats.kl > 1e-4, "later minibatches must have moved on: {}", stats.kl);
+    }
+}
+
+#[test]
+fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
+    let (mut pool, mut ppo) = (pool(0), Ppo::new(&settings(), 2, 2, 0).unwrap());
+    let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+    pool.reset(0, rollout.first_observations_mut());
+    collect(&mut pool, &ppo, &mut rollout, 17, &mut scratch, &AtomicBool::new(false)).unwrap();
+    rollout.rewards[5] = f32::NAN;
+    let answer = |ppo: &Ppo| {
+        let mut means = [0.0; 2];
+        ppo.policy().means(&[0.3, -0.4], &mut means).unwrap();
+        means
+    };
+    let before = answer(&ppo);
+    let error = format!("{:#}", ppo.update(&mut rollout, 17).unwrap_err());
+    assert!(error.contains("iteration 17") && error.contains("NaN"), "{error}");
+    assert_eq!(before, answer(&ppo), "nothing is learnt from it");
+}
+
+#[test]
+fn truncation_bootstraps_from_the_final_observation() {
+    let ppo = Ppo::new(&settings(), 2, 2, 0).unwrap();
+    let final_observations = [0.1, 0.2, -0.3, 0.4, 9.0, 9.0];
+    let mut value = [0.0];
+    ppo.policy().values(&final_observations[2..4], &mut value).unwrap();
+    let mut rewards = [1.0, 2.0, 3.0];
+    ppo.settle(&mut rewards, [false, true, false].into_iter(), &final_observations).unwrap();
+    let expected = [0.2, 0.4 + 0.9 * value[0], 0.6];
+    assert!(rewards.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{rewards:?}, not {expected:?}");
+}

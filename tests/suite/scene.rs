@@ -1,0 +1,188 @@
+//! The built-in model, and scenes of a user's own.
+
+use std::path::PathBuf;
+
+use shadow_repose::env::{Env, Hand, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::sim::{BareSimulation, Physics, Scene};
+
+use crate::support::{SCENE, env_config, started, task};
+
+/// Writes `text` as a scene and tries to make a task of it; the message of the refusal.
+fn refusal(text: &str) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let path = write(&folder, text);
+    let setting = format!("env.model={}", path.display());
+    match Task::new(&env_config(&[&setting])) {
+        Ok(_) => panic!("must be refused"),
+        Err(error) => format!("{error:#}"),
+    }
+}
+
+fn write(folder: &tempfile::TempDir, text: &str) -> PathBuf {
+    let path = folder.path().join("own_scene.xml");
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+#[track_caller]
+fn edited(from: &str, to: &str) -> String {
+    assert!(SCENE.contains(from), "{from} is not in the scene");
+    SCENE.replace(from, to)
+}
+
+#[track_caller]
+fn assert_range(found: [f64; 2], expected: [f64; 2]) {
+    assert!((0..2).all(|i| (found[i] - expected[i]).abs() < 1e-12), "{found:?} instead of {expected:?}");
+}
+
+#[test]
+fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
+    let scene = Scene::load(None, 0.01).unwrap();
+    let hand = Hand::bind(&scene).unwrap();
+    assert_eq!(scene.controls(), 20);
+    for (name, range) in [
+        ("rh_WRJ2", [-0.523599, 0.174533]),
+        ("rh_WRJ1", [-0.698132, 0.488692]),
+        ("rh_FFJ4", [-0.349066, 0.349066]),
+        ("rh_LFJ5", [0.0, 0.785398]),
+        ("rh_RFJ3", [-0.261799, 1.5708]),
+        ("rh_MFJ2", [0.0, 1.5708]),
+        ("rh_THJ5", [-1.0472, 1.0472]),
+        ("rh_THJ1", [-0.261799, 1.5708]),
+    ] {
+        assert_range(scene.hinge(name).unwrap().range, range);
+    }
+    // THJ5 … THJ1, FFJ4, FFJ3, FFJ0: a coupled actuator has the sum of two ranges.
+    assert_range(hand.actuators[0].range, [-1.0472, 1.0472]);
+    assert_range(hand.actuators[7].range, [0.0, 3.1415]);
+    assert_range(hand.actuators[18].range, [-0.523599, 0.174533]);
+}
+
+#[test]
+fn a_still_hand_holds_the_cube_in_most_orientations() {
+    let task = task(&[]);
+    let mut env = Repose::new(&task);
+    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    let mut held = 0;
+    for episode in 0..20 {
+        env.reset(shadow_repose::rng::stream(0, "test", episode), &mut observation);
+        if (0..200).all(|_| env.step(&[0.0; 20], &mut observation).end.is_none()) {
+            held += 1;
+        }
+    }
+    assert!(held >= 17, "held {held} of 20");
+}
+
+#[test]
+fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
+    let task = task(&[]);
+    let (mut env, mut observation) = started(&task);
+    for _ in 0..40 {
+        // Until the cube lies in the hand: steps with contacts.
+        let _ = env.step(&[0.3; 20], &mut observation);
+    }
+    let mut bare = BareSimulation::new(task.scene());
+    bare.start(&env.simulation().state());
+    let simulation = env.simulation_mut();
+    for step in 0..50 {
+        let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();
+        simulation.ctrl_mut().copy_from_slice(&ctrl);
+        assert_eq!(simulation.step(1), Physics::Sound);
+        bare.step(&ctrl, 1);
+        assert_eq!(simulation.qpos(), bare.qpos(), "step {step}");
+    }
+}
+
+#[test]
+fn bodies_are_of_the_same_instant_as_joints() {
+    let task = task(&[]);
+    let (mut env, mut observation) = started(&task);
+    for _ in 0..25 {
+        let _ = env.step(&[0.5; 20], &mut observation);
+    }
+    // The same joints and velocities in another simulation, whose bodies are computed from them alone.
+    let tip = task.scene().body("rh_ffdistal").unwrap();
+    let mut other = task.scene().simulate();
+    other.qpos_mut().copy_from_slice(env.simulation().qpos());
+    other.qvel_mut().copy_from_slice(env.simulation().qvel());
+    other.refresh();
+    assert_eq!(other.pose(tip), env.simulation().pose(tip));
+    assert_eq!(other.velocity(tip), env.simulation().velocity(tip));
+    let position: Vec<f32> = other.pose(tip).0.iter().map(|&x| x as f32).collect();
+    assert_eq!(observation[72..75], position);
+    let linear: Vec<f32> = other.velocity(tip).0.iter().map(|&x| x as f32).collect();
+    assert_eq!(observation[79..82], linear);
+}
+
+#[test]
+fn an_own_scene_may_list_its_parts_in_any_order() {
+    // The actuators the other way round: controls are found by name, so the hand does the same.
+    let start = SCENE.find("    <position name=\"rh_A_WRJ2\"").unwrap();
+    let end = SCENE.find("  </actuator>").unwrap();
+    let reversed: Vec<&str> = SCENE[start..end].lines().rev().collect();
+    let text = format!("{}{}\n{}", &SCENE[..start], reversed.join("\n"), &SCENE[end..]);
+    let folder = tempfile::tempdir().unwrap();
+    let setting = format!("env.model={}", write(&folder, &text).display());
+    let run = |settings: &[&str]| {
+        let task = task(settings);
+        let (mut env, mut observation) = started(&task);
+        let action: Vec<f32> = (0..20).map(|i| (i as f32 - 10.0) / 12.0).collect();
+        let rewards: Vec<f32> = (0..20).map(|_| env.step(&action, &mut observation).reward).collect();
+        (rewards, observation, env.simulation().ctrl().to_vec())
+    };
+    let (builtin, own) = (run(&[]), run(&[&setting]));
+    // Summing forces in another order rounds differently.
+    let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-3);
+    assert!(close(&builtin.0, &own.0) && close(&builtin.1, &own.1));
+    assert_eq!(builtin.2, own.2.into_iter().rev().collect::<Vec<_>>());
+}
+
+#[test]
+fn what_is_missing_in_an_own_scene_is_named_with_its_file() {
+    for (from, to, named) in [
+        ("rh_LFJ5", "rh_other", "`rh_LFJ5`"),
+        ("name=\"rh_A_MFJ0\"", "name=\"other\"", "`rh_A_MFJ0`"),
+        ("rh_thdistal", "rh_thumbtip", "`rh_thdistal`"),
+        ("<body name=\"cube\"", "<body name=\"die\"", "`cube`"),
+        ("<body name=\"target\"", "<body name=\"aim\"", "`target`"),
+        ("name=\"rh_RFJ0\"", "name=\"other\"", "`rh_RFJ0`"),
+    ] {
+        let text = edited(from, to).replace(
+            "tendon=\"rh_RFJ0\"",
+            if named == "`rh_RFJ0`" { "tendon=\"other\"" } else { "tendon=\"rh_RFJ0\"" },
+        );
+        let message = refusal(&text);
+        assert!(message.contains(named) && message.contains("own_scene.xml"), "{message}");
+    }
+}
+
+#[test]
+fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
+    for (from, to, rule) in [
+        ("<joint name=\"rh_THJ3\"", "<joint name=\"rh_THJ3\" type=\"slide\"", "`rh_THJ3` must be a hinge"),
+        ("<freejoint name=\"cube\"/>", "<joint name=\"c\" type=\"ball\"/>", "`cube` must have a free joint"),
+        ("mocap=\"true\"", "", "`target` must have mocap"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive the joint `rh_FFJ3`"),
+        ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_MFJ0` must be the sum"),
+        ("ctrlrange=\"0 3.1415\"", "", "must have one control with a ctrlrange"),
+        ("  </actuator>", "<motor name=\"more\" joint=\"rh_WRJ1\"/></actuator>", "has 21 controls"),
+        ("integrator=\"implicitfast\"", "integrator=\"RK4\"", "RK4"),
+        ("</mujoco>", "", "MuJoCo refuses this scene"),
+    ] {
+        let message = refusal(&edited(from, to));
+        assert!(message.contains(rule) && message.contains("own_scene.xml"), "{rule} is not in: {message}");
+    }
+    let missing = Task::new(&env_config(&["env.model=nowhere.xml"])).err().unwrap().to_string();
+    assert!(missing.contains("nowhere.xml") && missing.contains("no such file"), "{missing}");
+}
+
+#[test]
+fn the_program_decides_the_timestep() {
+    let task = task(&["env.sim_dt=0.002"]);
+    let (mut env, mut observation) = started(&task);
+    let before = env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
+    let _ = env.step(&[0.0; 20], &mut observation);
+    let fallen = before - env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
+    // Five steps of 2 ms fall g · dt² · (1 + 2 + 3 + 4 + 5).
+    assert!((fallen - 9.81 * 0.002 * 0.002 * 15.0).abs() < 1e-6, "fell by {fallen}");
+}

@@ -1,0 +1,267 @@
+//! One environment: what it observes, pays, and when it ends.
+
+use std::f64::consts::FRAC_1_SQRT_2;
+
+use shadow_repose::env::{End, Env, Hand, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::quat::{self, Quat};
+use shadow_repose::rng;
+
+use crate::support::{started, task};
+
+const STILL: [f32; 20] = [0.0; 20];
+
+fn cube_at(task: &Task) -> usize {
+    task.scene().free_body("cube").unwrap().qpos
+}
+
+/// Puts the cube at the goal position, turned to `orientation`, at rest.
+fn put_cube(env: &mut Repose, task: &Task, orientation: Quat) {
+    let cube = task.scene().free_body("cube").unwrap();
+    let simulation = env.simulation_mut();
+    simulation.qpos_mut()[cube.qpos..cube.qpos + 3].copy_from_slice(&[0.33, 0.0, 0.295]);
+    simulation.qpos_mut()[cube.qpos + 3..cube.qpos + 7].copy_from_slice(&orientation);
+    simulation.qvel_mut()[cube.dof..cube.dof + 6].fill(0.0);
+    simulation.refresh();
+}
+
+#[track_caller]
+fn assert_close(found: &[f32], expected: &[f64]) {
+    assert_eq!(found.len(), expected.len());
+    let close = found.iter().zip(expected).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-6 * (1.0 + b.abs()));
+    assert!(close, "{found:?}\n{expected:?}");
+}
+
+#[test]
+fn observations_land_at_their_indices() {
+    let task = task(&[]);
+    let (mut env, mut observation) = started(&task);
+    let hand = Hand::bind(task.scene()).unwrap();
+    let cube = hand.cube;
+    // About z by a quarter turn, and with w < 0: the observation shows the other sign.
+    let orientation = [-FRAC_1_SQRT_2, 0.0, 0.0, -FRAC_1_SQRT_2];
+    put_cube(&mut env, &task, orientation);
+    for i in 0..24 {
+        let (low, high) = (hand.joints[i].range[0], hand.joints[i].range[1]);
+        env.simulation_mut().qpos_mut()[hand.joints[i].qpos] = low + (high - low) * (i as f64 + 1.0) / 30.0;
+        env.simulation_mut().qvel_mut()[hand.joints[i].dof] = 0.1 * i as f64;
+    }
+    env.simulation_mut().qvel_mut()[cube.dof..cube.dof + 6].copy_from_slice(&[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
+    env.simulation_mut().refresh();
+    env.observe(&mut observation);
+
+    let order = [
+        "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
+        "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
+    ];
+    for (i, name) in order.iter().enumerate() {
+        let joint = task.scene().hinge(&format!("rh_{name}")).unwrap();
+        assert_close(&observation[i..=i], &[env.simulation().qpos()[joint.qpos]]);
+        assert_close(&observation[24 + i..=24 + i], &[0.2 * env.simulation().qvel()[joint.dof]]);
+    }
+    assert_close(&observation[48..51], &[0.33, 0.0, 0.295]);
+    assert_close(&observation[51..55], &[FRAC_1_SQRT_2, 0.0, 0.0, FRAC_1_SQRT_2]);
+    assert_close(&observation[55..58], &[0.1, 0.2, 0.3]);
+    // Body frame (1, 2, 3), a quarter turn about z: (-2, 1, 3) in the world, times 0.2.
+    assert_close(&observation[58..61], &[-0.4, 0.2, 0.6]);
+    assert_close(&observation[61..64], &[0.33, 0.0, 0.295]);
+    assert_close(&observation[64..68], &quat::canonical(env.goal()));
+    let relative = quat::canonical(quat::mul(orientation, quat::conj(env.goal())));
+    assert_close(&observation[68..72], &relative);
+    for (i, name) in ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"].iter().enumerate() {
+        let body = task.scene().body(name).unwrap();
+        let (position, turned) = env.simulation().pose(body);
+        let (linear, angular) = env.simulation().velocity(body);
+        let expected: Vec<f64> = position.into_iter().chain(turned).chain(linear).chain(angular).collect();
+        assert_close(&observation[72 + 13 * i..85 + 13 * i], &expected);
+        assert!(linear.iter().any(|v| v.abs() > 1e-3), "{name} moves");
+    }
+    assert_close(&observation[137..], &[0.0; 20]);
+}
+
+#[test]
+fn fingertip_velocities_are_those_of_the_frames_origin() {
+    let task = task(&[]);
+    let (mut env, _) = started(&task);
+    let tip = task.scene().body("rh_mfdistal").unwrap();
+    let joint = task.scene().hinge("rh_MFJ3").unwrap();
+    let simulation = env.simulation_mut();
+    simulation.qvel_mut().fill(0.0);
+    simulation.qvel_mut()[joint.dof] = 2.0;
+    simulation.refresh();
+    let (linear, angular) = simulation.velocity(tip);
+    let before = simulation.pose(tip).0;
+    let step = 1e-6;
+    simulation.qpos_mut()[joint.qpos] += 2.0 * step;
+    simulation.refresh();
+    let after = simulation.pose(tip).0;
+    for axis in 0..3 {
+        assert!((linear[axis] - (after[axis] - before[axis]) / step).abs() < 1e-4);
+    }
+    assert!((angular.iter().map(|x| x * x).sum::<f64>().sqrt() - 2.0).abs() < 1e-9);
+}
+
+#[test]
+fn actions_are_clipped_and_scaled_to_the_control_ranges() {
+    let task = task(&[]);
+    let hand = Hand::bind(task.scene()).unwrap();
+    let (mut env, mut observation) = started(&task);
+    let mut action = [0.0f32; 20];
+    (action[0], action[7], action[19]) = (3.0, -1.5, 0.5);
+    let _ = env.step(&action, &mut observation);
+    let ctrl = |i: usize| env.simulation().ctrl()[hand.actuators[i].ctrl];
+    assert_eq!(ctrl(0), 1.0472);
+    assert_eq!(ctrl(7), 0.0);
+    let [low, high] = hand.actuators[19].range;
+    assert!((ctrl(19) - (low + 0.75 * (high - low))).abs() < 1e-12);
+    assert_close(&observation[137..], &{
+        let mut expected = [0.0; 20];
+        (expected[0], expected[7], expected[19]) = (1.0, -1.0, 0.5);
+        expected
+    });
+    // The penalty is that of the clipped action.
+    assert!((env.last_step().reward.action - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
+}
+
+#[test]
+fn smoothing_averages_targets_and_begins_at_the_reset_joints() {
+    let task = task(&["env.act_moving_average=0.25"]);
+    let hand = Hand::bind(task.scene()).unwrap();
+    let (mut env, mut observation) = started(&task);
+    let angle = |env: &Repose, name: &str| env.simulation().qpos()[task.scene().hinge(name).unwrap().qpos];
+    let (single, coupled) = (angle(&env, "rh_FFJ3"), angle(&env, "rh_FFJ2") + angle(&env, "rh_FFJ1"));
+    assert!(coupled > 0.0, "the noise has moved the coupled joints");
+    let _ = env.step(&[1.0; 20], &mut observation);
+    let ctrl = |env: &Repose, i: usize| env.simulation().ctrl()[hand.actuators[i].ctrl];
+    assert!((ctrl(&env, 6) - (0.25 * 1.5708 + 0.75 * single)).abs() < 1e-12);
+    let first = 0.25 * 3.1415 + 0.75 * coupled;
+    assert!((ctrl(&env, 7) - first).abs() < 1e-12);
+    let _ = env.step(&[-1.0; 20], &mut observation);
+    assert!((ctrl(&env, 7) - 0.75 * first).abs() < 1e-12);
+}
+
+#[test]
+fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on() {
+    let task = task(&["env.max_consecutive_successes=3"]);
+    let (mut env, mut observation) = started(&task);
+    let goal = env.goal();
+    for held in [1, 2, 0] {
+        put_cube(&mut env, &task, goal);
+        let transition = env.step(&STILL, &mut observation);
+        let details = *env.last_step();
+        assert_eq!((details.goal, details.reward.bonus, transition.end), (goal, 2.0, None));
+        assert!(details.rot_dist < 0.1);
+        // The reward is that against the goal in force.
+        let rotation = 1.0 / (details.rot_dist + 0.1);
+        assert!((details.reward.rotation - rotation).abs() < 1e-12);
+        assert!((f64::from(transition.reward) - details.reward.total()).abs() < 1e-5);
+        assert_eq!(env.held(), held);
+    }
+    assert_eq!((env.episode().goals, env.episode().in_tolerance), (1, 3));
+    assert_ne!(env.goal(), goal);
+    // The observation already shows the goal in force next.
+    assert_close(&observation[64..68], &quat::canonical(env.goal()));
+}
+
+#[test]
+fn steps_outside_the_tolerance_leave_a_cumulative_counter_alone_and_clear_a_consecutive_one() {
+    for (mode, held) in [("cumulative", 2), ("consecutive", 1)] {
+        let task = task(&[&format!("env.success_hold={mode}")]);
+        let (mut env, mut observation) = started(&task);
+        let goal = env.goal();
+        let away = quat::mul(goal, [FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0, 0.0]);
+        for orientation in [goal, away, goal] {
+            put_cube(&mut env, &task, orientation);
+            let _ = env.step(&STILL, &mut observation);
+        }
+        assert_eq!(env.held(), held, "{mode}");
+        assert_eq!(env.episode().in_tolerance, 2);
+    }
+}
+
+#[test]
+fn a_dropped_cube_terminates_and_pays_the_penalty() {
+    let task = task(&["env.fall_penalty=-5"]);
+    let (mut env, mut observation) = started(&task);
+    let height = cube_at(&task) + 2;
+    env.simulation_mut().qpos_mut()[height] = 0.295 - 0.241;
+    env.simulation_mut().refresh();
+    let transition = env.step(&STILL, &mut observation);
+    assert_eq!(transition.end, Some(End::Terminated));
+    assert!(env.episode().dropped && !env.episode().diverged);
+    assert_eq!(env.last_step().reward.fall, -5.0);
+    assert!((env.last_step().reward.distance + 10.0 * env.last_step().goal_dist).abs() < 1e-12);
+}
+
+#[test]
+fn time_running_out_truncates_and_is_no_drop() {
+    let task = task(&["env.max_episode_seconds=0.05"]);
+    let (mut env, mut observation) = started(&task);
+    for _ in 0..4 {
+        assert_eq!(env.step(&STILL, &mut observation).end, None);
+    }
+    assert_eq!(env.step(&STILL, &mut observation).end, Some(End::Truncated));
+    assert!(!env.episode().dropped);
+    assert_eq!(env.episode().length, 5);
+}
+
+#[test]
+fn a_diverged_state_terminates_pays_nothing_and_leaves_no_trace_in_the_next_episode() {
+    let task = task(&[]);
+    let (mut env, mut observation) = started(&task);
+    for (poison, name) in [(f64::NAN, "NaN"), (1e12, "a huge number")] {
+        let (mut fresh, mut expected) = started(&task);
+        env.simulation_mut().qpos_mut()[3] = poison;
+        let transition = env.step(&[0.5; 20], &mut observation);
+        assert_eq!(transition.end, Some(End::Terminated), "{name}");
+        assert_eq!(transition.reward, 0.0);
+        assert!(env.episode().diverged && env.last_step().diverged && !env.episode().dropped);
+        assert!(observation.iter().all(|x| x.is_finite()));
+        assert_eq!(env.take_recent().diverged, 1);
+        env.reset(rng::stream(7, "test", 0), &mut observation);
+        for _ in 0..10 {
+            let _ = env.step(&[0.2; 20], &mut observation);
+            let _ = fresh.step(&[0.2; 20], &mut expected);
+        }
+        assert_eq!(observation, expected, "after {name}");
+        assert!(!env.episode().diverged);
+    }
+}
+
+#[test]
+fn an_action_that_is_not_a_number_ends_the_episode_as_diverged() {
+    let task = task(&[]);
+    let (mut env, mut observation) = started(&task);
+    let mut action = STILL;
+    action[3] = f32::NAN;
+    assert_eq!(env.step(&action, &mut observation).end, Some(End::Terminated));
+    assert!(env.episode().diverged);
+}
+
+#[test]
+fn resets_stay_within_the_noise_and_the_joints_limits() {
+    let task = task(&["env.reset_dof_vel_noise=0.3"]);
+    let hand = Hand::bind(task.scene()).unwrap();
+    let mut env = Repose::new(&task);
+    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    let (mut angles, mut starts) = (Vec::new(), Vec::new());
+    for episode in 0..200 {
+        env.reset(rng::stream(1, "test", episode), &mut observation);
+        let (qpos, qvel) = (env.simulation().qpos(), env.simulation().qvel());
+        for joint in &hand.joints {
+            let angle = qpos[joint.qpos];
+            assert!(angle.abs() <= 0.2 && (joint.range[0]..=joint.range[1]).contains(&angle));
+            assert!(qvel[joint.dof].abs() <= 0.3);
+        }
+        let cube = &qpos[hand.cube.qpos..hand.cube.qpos + 7];
+        for (x, middle) in cube.iter().zip([0.33, 0.0, 0.295]) {
+            assert!((x - middle).abs() <= 0.01);
+        }
+        assert!(qvel[hand.cube.dof..hand.cube.dof + 6].iter().all(|&v| v == 0.0));
+        let orientation: Quat = cube[3..].try_into().unwrap();
+        angles.push(quat::angle_between(orientation, env.goal()));
+        starts.push(qpos[hand.joints[0].qpos]);
+    }
+    let mean = angles.iter().sum::<f64>() / angles.len() as f64;
+    assert!((mean - 2.21).abs() < 0.15, "cube and goal are independent and uniform: mean angle {mean}");
+    assert!(starts.iter().any(|&x| x > 0.15) && starts.iter().any(|&x| x < -0.15));
+}
