@@ -15,8 +15,8 @@
 //! | [`train`] | the training: the only place where environments and the learner meet |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
 //! | [`play`], [`trace`] | scores as table and JSON; episodes as JSON lines |
-//! | [`bench`] | what this machine can do |
-//! | [`env`] | the task, its reward, and many of them on worker threads |
+//! | [`mod@bench`] | what this machine can do |
+//! | [`mod@env`] | the task, its reward, and many of them on worker threads |
 //! | [`sim`] | the fence around MuJoCo |
 //! | [`ppo`] | the fence around candle: policy, losses, optimizer, checkpoint as bytes |
 //! | [`run`] | the outside: run folder, logs, terminal, signals |

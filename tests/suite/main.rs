@@ -1,5 +1,8 @@
 //! The behaviours of the whole: each test says one in a sentence.
 
+// The limits of the model are decimal numbers near multiples of π, and are meant so.
+#![allow(clippy::approx_constant)]
+
 mod architecture;
 mod bad_input;
 mod binary;

@@ -1,0 +1,102 @@
+//! Laying one table of settings over another: keys and types are those of the base, what does not fit is reported.
+
+use toml::{Table, Value};
+
+use super::{BASE, Override};
+
+impl Override {
+    /// The table with this one value; text that is no TOML value, and any text for a string key, is taken as a string.
+    pub(super) fn as_table(&self, base: &Table) -> Table {
+        let parsed = format!("value = {}", self.value).parse::<Table>();
+        let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
+        let wants_text = lookup(base, &self.key).is_some_and(Value::is_str);
+        let mut value = match parsed {
+            Some(value) if !wants_text || value.is_str() => value,
+            _ => Value::String(self.value.clone()),
+        };
+        for part in self.key.rsplit('.') {
+            value = Value::Table(Table::from_iter([(part.to_owned(), value)]));
+        }
+        match value {
+            Value::Table(table) => table,
+            _ => unreachable!("a key has at least one part"),
+        }
+    }
+}
+
+fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
+    let (first, rest) = key.split_once('.').unwrap_or((key, ""));
+    match (table.get(first)?, rest) {
+        (value, "") => Some(value),
+        (Value::Table(inner), rest) => lookup(inner, rest),
+        _ => None,
+    }
+}
+
+/// Lays `table` over `merged`, whose keys and types are those of `base`; what does not fit is left out and reported.
+pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
+    for (key, value) in table {
+        let name = format!("{prefix}{key}");
+        match (base.get(key), value) {
+            (None, _) => problems.push(unknown(&name)),
+            (Some(Value::Table(expected)), Value::Table(inner)) => {
+                let Some(Value::Table(target)) = merged.get_mut(key) else {
+                    unreachable!("the merged tables are those of the base")
+                };
+                overlay(target, inner, expected, &format!("{name}."), problems);
+            }
+            (Some(expected), value) => match typed(expected, value) {
+                Ok(value) => drop(merged.insert(key.clone(), value)),
+                Err(rule) => problems.push(format!("{name} = {value}: must be {rule}")),
+            },
+        }
+    }
+}
+
+/// `value` as the type that the base has, or what that type is called.
+fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
+    match (expected, value) {
+        (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
+        (Value::Float(_), Value::Float(_)) | (Value::String(_), Value::String(_)) => Ok(value.clone()),
+        (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(*i as f64)),
+        (Value::Integer(_), Value::Integer(i)) if *i >= 0 => Ok(value.clone()),
+        // 1e8 is how people write a large number of steps.
+        (Value::Integer(_), Value::Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => {
+            Ok(Value::Integer(*x as i64))
+        }
+        (Value::Array(expected), Value::Array(values)) => {
+            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&expected[0], v)).collect();
+            typed.map(Value::Array).map_err(|rule| format!("an array, each of it {rule}"))
+        }
+        (Value::Float(_), _) => Err("a number".into()),
+        (Value::Integer(_), _) => Err("a whole number, not negative".into()),
+        (Value::String(_), _) => Err("a string".into()),
+        (Value::Array(_), _) => Err("an array".into()),
+        (Value::Table(_), _) => Err("a section with keys".into()),
+        _ => Err("of another type".into()),
+    }
+}
+
+fn unknown(name: &str) -> String {
+    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
+    let mut known = Vec::new();
+    for (section, keys) in &base {
+        known.push(section.clone());
+        if let Value::Table(keys) = keys {
+            known.extend(keys.keys().map(|key| format!("{section}.{key}")));
+        }
+    }
+    let distance = |candidate: &String| {
+        let whole = strsim::damerau_levenshtein(name, candidate);
+        let last = |s: &str| s.rsplit('.').next().unwrap_or_default().to_owned();
+        // The right key in the wrong section is as near as one wrong letter.
+        whole.min(1 + strsim::damerau_levenshtein(&last(name), &last(candidate)))
+    };
+    let nearest = known.iter().min_by_key(|candidate| distance(candidate));
+    match nearest {
+        Some(nearest) if distance(nearest) <= 2 + name.len() / 4 => {
+            format!("{name}: unknown key; did you mean {nearest}?")
+        }
+        _ => format!("{name}: unknown key; configs/repose.toml lists all of them"),
+    }
+}

@@ -1,0 +1,123 @@
+//! Which values are allowed.
+
+use super::Config;
+
+impl Config {
+    /// Every rule that the values break, as "key = value: must …".
+    pub(super) fn violations(&self) -> Vec<String> {
+        let Self { env, ppo, run } = self;
+        let mut rules = Rules::default();
+        rules.at_least("env.num_envs", env.num_envs, 1);
+        rules.at_most("env.num_envs", env.num_envs, 1 << 20);
+        rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
+        rules.equal("env.num_hand_dofs", env.num_hand_dofs, 24);
+        rules.equal("env.num_actuators", env.num_actuators, 20);
+        rules.positive("env.sim_dt", env.sim_dt);
+        rules.positive("env.ctrl_dt", env.ctrl_dt);
+        let ratio = env.ctrl_dt / env.sim_dt;
+        rules.check(
+            !(ratio.is_finite() && ratio > 0.0) || (ratio.round() >= 1.0 && (ratio / ratio.round() - 1.0).abs() < 1e-6),
+            "env.ctrl_dt",
+            env.ctrl_dt,
+            &format!("be a whole multiple of env.sim_dt = {}", env.sim_dt),
+        );
+        rules.check(
+            (1.0..=1e9).contains(&(env.max_episode_seconds / env.ctrl_dt).round()),
+            "env.max_episode_seconds",
+            env.max_episode_seconds,
+            "last between one and 1e9 steps of env.ctrl_dt",
+        );
+        rules.between("env.act_moving_average", env.act_moving_average, 0.0, 1.0);
+        rules.check(
+            env.act_moving_average != 0.0,
+            "env.act_moving_average",
+            env.act_moving_average,
+            "be above 0 (at 0 no action would have an effect)",
+        );
+        rules.positive("env.rot_eps", env.rot_eps);
+        rules.positive("env.success_tolerance", env.success_tolerance);
+        rules.at_least("env.max_consecutive_successes", env.max_consecutive_successes as usize, 1);
+        rules.positive("env.fall_dist", env.fall_dist);
+        rules.not_negative("env.reset_position_noise", env.reset_position_noise);
+        rules.not_negative("env.reset_dof_pos_noise", env.reset_dof_pos_noise);
+        rules.not_negative("env.reset_dof_vel_noise", env.reset_dof_vel_noise);
+
+        rules.at_least("ppo.horizon", ppo.horizon, 1);
+        rules.at_least("ppo.epochs", ppo.epochs, 1);
+        let samples = env.num_envs.saturating_mul(ppo.horizon);
+        rules.check(
+            ppo.minibatches >= 1 && samples.is_multiple_of(ppo.minibatches),
+            "ppo.minibatches",
+            ppo.minibatches,
+            &format!("divide num_envs * horizon = {samples}"),
+        );
+        rules.check(
+            samples < 2 || samples / ppo.minibatches.max(1) >= 2,
+            "ppo.minibatches",
+            ppo.minibatches,
+            "leave at least two samples in a minibatch",
+        );
+        let sizes_fit = !ppo.hidden.is_empty() && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
+        let hidden = format!("{:?}", ppo.hidden);
+        rules.check(sizes_fit, "ppo.hidden", hidden, "hold one or more sizes from 1 to 16384");
+        rules.positive("ppo.learning_rate", ppo.learning_rate);
+        let [low, high] = ppo.learning_rate_range;
+        let range = format!("[{low}, {high}]");
+        rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "rise from above 0");
+        rules.not_negative("ppo.desired_kl", ppo.desired_kl);
+        rules.between("ppo.gamma", ppo.gamma, 0.0, 1.0);
+        rules.between("ppo.lambda", ppo.lambda, 0.0, 1.0);
+        rules.positive("ppo.clip", ppo.clip);
+        rules.not_negative("ppo.value_coef", ppo.value_coef);
+        rules.not_negative("ppo.entropy_coef", ppo.entropy_coef);
+        rules.positive("ppo.max_grad_norm", ppo.max_grad_norm);
+        rules.positive("ppo.reward_scale", ppo.reward_scale);
+        rules.positive("ppo.init_std", ppo.init_std);
+
+        rules.at_least("run.total_steps", run.total_steps as usize, 1);
+        rules.at_least("run.checkpoint_every", run.checkpoint_every as usize, 1);
+        rules.at_least("run.eval_every", run.eval_every as usize, 1);
+        rules.at_least("run.eval_episodes", run.eval_episodes, 1);
+        rules.at_most("run.eval_episodes", run.eval_episodes, 1 << 20);
+        rules.at_most("run.threads", run.threads, 4096);
+        rules.broken
+    }
+}
+
+/// Collects the rules that were broken.
+#[derive(Default)]
+struct Rules {
+    broken: Vec<String>,
+}
+
+impl Rules {
+    fn check(&mut self, holds: bool, key: &str, value: impl std::fmt::Display, rule: &str) {
+        if !holds {
+            self.broken.push(format!("{key} = {value}: must {rule}"));
+        }
+    }
+
+    fn at_least(&mut self, key: &str, value: usize, least: usize) {
+        self.check(value >= least, key, value, &format!("be at least {least}"));
+    }
+
+    fn at_most(&mut self, key: &str, value: usize, most: usize) {
+        self.check(value <= most, key, value, &format!("be at most {most}"));
+    }
+
+    fn equal(&mut self, key: &str, value: usize, only: usize) {
+        self.check(value == only, key, value, &format!("be {only}, the task is laid out for it"));
+    }
+
+    fn positive(&mut self, key: &str, value: f64) {
+        self.check(value > 0.0, key, value, "be above 0");
+    }
+
+    fn not_negative(&mut self, key: &str, value: f64) {
+        self.check(value >= 0.0, key, value, "not be negative");
+    }
+
+    fn between(&mut self, key: &str, value: f64, low: f64, high: f64) {
+        self.check((low..=high).contains(&value), key, value, &format!("lie in [{low}, {high}]"));
+    }
+}
