@@ -55,7 +55,7 @@ pub struct TrainArgs {
     /// Added to the name of the run folder
     #[arg(long)]
     pub name: Option<String>,
-    /// The run folder itself, instead of runs/shadow-hand-repose/<date-time>[-name]
+    /// The run folder itself, instead of runs/shadow-hand-repose/DATE-TIME[-NAME]
     #[arg(long, value_name = "DIR", conflicts_with = "name")]
     pub run_dir: Option<PathBuf>,
     /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints

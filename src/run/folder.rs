@@ -21,7 +21,7 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// A new run's folder: `path`, or runs/shadow-hand-repose/<date-time>[-name].
+    /// A new run's folder: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
     ///
     /// # Errors
     /// A folder that already holds a run, or cannot be written to.
