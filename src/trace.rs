@@ -9,7 +9,7 @@ use crate::evaluate::Moment;
 /// Episodes are written, whole and in order, until there are this many records.
 const ENOUGH: usize = 2000;
 
-/// The records of the episodes that may still be among the first.
+/// The records of the episodes that may still be needed.
 pub struct Trace {
     header: Value,
     /// Per episode its lines.
