@@ -83,6 +83,7 @@ pub struct PpoConfig {
     pub minibatches: usize,
     pub hidden: Vec<usize>,
     pub activation: Activation,
+    pub layers: Layers,
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
     pub desired_kl: f64,
@@ -105,6 +106,16 @@ pub enum Activation {
     Relu,
     Silu,
     Tanh,
+}
+
+/// What computes the layers of the nets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Layers {
+    /// Our own kernels, linear layer and activation in one.
+    Fused,
+    /// candle's own layers: slower, the reference for the other.
+    Candle,
 }
 
 /// The course of a training; `configs/repose.toml` says what each key means.

@@ -16,10 +16,12 @@ impl Config {
         rules.positive("env.ctrl_dt", env.ctrl_dt);
         let ratio = env.ctrl_dt / env.sim_dt;
         rules.check(
-            !(ratio.is_finite() && ratio > 0.0) || (ratio.round() >= 1.0 && (ratio / ratio.round() - 1.0).abs() < 1e-6),
+            ratio.is_nan()
+                || ratio <= 0.0
+                || ((1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6),
             "env.ctrl_dt",
             env.ctrl_dt,
-            &format!("be a whole multiple of env.sim_dt = {}", env.sim_dt),
+            &format!("be a whole multiple of env.sim_dt = {}, up to 10000 of them", env.sim_dt),
         );
         rules.check(
             (1.0..=1e9).contains(&(env.max_episode_seconds / env.ctrl_dt).round()),
@@ -45,17 +47,13 @@ impl Config {
         rules.at_least("ppo.horizon", ppo.horizon, 1);
         rules.at_least("ppo.epochs", ppo.epochs, 1);
         let samples = env.num_envs.saturating_mul(ppo.horizon);
+        let rule = "be at most 2^26 samples together with env.num_envs";
+        rules.check(samples <= 1 << 26, "ppo.horizon", ppo.horizon, rule);
         rules.check(
             ppo.minibatches >= 1 && samples.is_multiple_of(ppo.minibatches),
             "ppo.minibatches",
             ppo.minibatches,
             &format!("divide num_envs * horizon = {samples}"),
-        );
-        rules.check(
-            samples < 2 || samples / ppo.minibatches.max(1) >= 2,
-            "ppo.minibatches",
-            ppo.minibatches,
-            "leave at least two samples in a minibatch",
         );
         let sizes_fit = !ppo.hidden.is_empty() && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
         let hidden = format!("{:?}", ppo.hidden);

@@ -170,6 +170,12 @@ impl Repose {
             let target = (alpha * asked + (1.0 - alpha) * self.targets[i]).clamp(low, high);
             self.previous_action[i] = clipped;
             self.targets[i] = target;
+        }
+        self.send_targets();
+    }
+
+    fn send_targets(&mut self) {
+        for (actuator, target) in self.task.hand.actuators.iter().zip(self.targets) {
             self.sim.ctrl_mut()[actuator.ctrl] = target;
         }
     }
@@ -257,8 +263,8 @@ impl Env for Repose {
         for (i, actuator) in hand.actuators.iter().enumerate() {
             let angle: f64 = hand.driven[i].iter().map(|&joint| self.sim.qpos()[hand.joints[joint].qpos]).sum();
             self.targets[i] = angle.clamp(actuator.range[0], actuator.range[1]);
-            self.sim.ctrl_mut()[actuator.ctrl] = self.targets[i];
         }
+        self.send_targets();
         self.previous_action = [0.0; ACTION_SIZE];
         (self.age, self.held) = (0, 0);
         self.episode = EpisodeStats::default();
@@ -276,6 +282,10 @@ impl Env for Repose {
         let task = self.task.clone();
         let config = &task.config;
         let diverged = self.sim.step(config.substeps()) == Physics::Diverged;
+        if diverged {
+            // MuJoCo has cleared the controls too; whoever looks should find what was sent.
+            self.send_targets();
+        }
 
         let (position, orientation) = self.cube();
         let rot_dist = quat::angle_between(orientation, self.goal);

@@ -1,12 +1,13 @@
 //! What acts: two MLPs, actor and critic, a standard deviation that does not depend on the state, and the normaliser.
 
 use anyhow::Result;
-use candle_core::{DType, Device, Tensor, Var};
+use candle_core::{DType, Device, Module, Tensor, Var};
+use candle_nn::Linear;
 use rand::RngExt;
 
 use super::Normalizer;
 use super::layer::FusedLinear;
-use crate::config::{Activation, PpoConfig};
+use crate::config::{Activation, Layers, PpoConfig};
 use crate::rng::{self, Rng};
 
 /// The last layer of the actor starts this much smaller, so that the first actions are near the middle of their range.
@@ -17,8 +18,9 @@ pub struct Policy {
     parameters: Vec<(String, Var)>,
     /// Reads raw observations.
     pub normalizer: Normalizer,
-    layers: usize,
+    depth: usize,
     activation: Activation,
+    kind: Layers,
     sizes: [usize; 2],
 }
 
@@ -27,6 +29,7 @@ pub struct Mlp {
     /// Weight and bias of each layer.
     layers: Vec<[Tensor; 2]>,
     activation: Activation,
+    kind: Layers,
 }
 
 impl Mlp {
@@ -37,10 +40,30 @@ impl Mlp {
     pub fn forward(&self, inputs: &Tensor) -> candle_core::Result<Tensor> {
         let mut x = inputs.clone();
         for (i, [weight, bias]) in self.layers.iter().enumerate() {
-            let hidden = i + 1 < self.layers.len();
-            x = FusedLinear { activation: hidden.then_some(self.activation) }.forward(&x, weight, bias)?;
+            let activation = (i + 1 < self.layers.len()).then_some(self.activation);
+            x = match self.kind {
+                Layers::Fused => FusedLinear { activation }.forward(&x, weight, bias)?,
+                Layers::Candle => candle_layer(&x, weight, bias, activation)?,
+            };
         }
         Ok(x)
+    }
+}
+
+/// The same as [`FusedLinear`], of candle's own parts.
+fn candle_layer(
+    x: &Tensor,
+    weight: &Tensor,
+    bias: &Tensor,
+    activation: Option<Activation>,
+) -> candle_core::Result<Tensor> {
+    let z = Linear::new(weight.clone(), Some(bias.clone())).forward(x)?;
+    match activation {
+        None => Ok(z),
+        Some(Activation::Elu) => z.elu(1.0),
+        Some(Activation::Relu) => z.relu(),
+        Some(Activation::Silu) => z.silu(),
+        Some(Activation::Tanh) => z.tanh(),
     }
 }
 
@@ -70,8 +93,9 @@ impl Policy {
         Ok(Self {
             parameters,
             normalizer: Normalizer::new(observation_size),
-            layers: config.hidden.len() + 1,
+            depth: config.hidden.len() + 1,
             activation: config.activation,
+            kind: config.layers,
             sizes: [observation_size, action_size],
         })
     }
@@ -108,9 +132,10 @@ impl Policy {
 
     fn build(&self, tensor: impl Fn(&Var) -> Tensor) -> [Mlp; 2] {
         let pairs: Vec<&[(String, Var)]> = self.parameters.chunks_exact(2).collect();
-        [&pairs[..self.layers], &pairs[self.layers..]].map(|net| Mlp {
+        [&pairs[..self.depth], &pairs[self.depth..]].map(|net| Mlp {
             layers: net.iter().map(|pair| [tensor(&pair[0].1), tensor(&pair[1].1)]).collect(),
             activation: self.activation,
+            kind: self.kind,
         })
     }
 
@@ -166,4 +191,43 @@ pub(super) fn copy_out(tensor: &Tensor, out: &mut [f32]) -> Result<()> {
 fn uniform(rng: &mut Rng, bound: f32, shape: &[usize]) -> Result<Var> {
     let values: Vec<f32> = (0..shape.iter().product()).map(|_| bound * (2.0 * rng.random::<f32>() - 1.0)).collect();
     Ok(Var::from_vec(values, shape, &Device::Cpu)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    /// Largest difference relative to the largest number.
+    fn difference(a: &Tensor, b: &Tensor) -> f32 {
+        let numbers = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let largest = |t: Tensor| numbers(t).into_iter().fold(0.0f32, |most, x| most.max(x.abs()));
+        largest((a - b).unwrap()) / largest(b.clone())
+    }
+
+    #[test]
+    fn outputs_and_gradients_of_fused_layers_are_those_of_candles_layers() {
+        for activation in [Activation::Elu, Activation::Relu, Activation::Silu, Activation::Tanh] {
+            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            (config.activation, config.hidden) = (activation, vec![64, 33]);
+            let mut policy = Policy::new(&config, 157, 20, 3).unwrap();
+            let inputs = uniform(&mut rng::stream(0, "test", 0), 3.0, &[300, 157]).unwrap();
+            let [fused, candle] = [Layers::Fused, Layers::Candle].map(|kind| {
+                policy.kind = kind;
+                let [actor, critic] = policy.nets();
+                let outputs = [actor.forward(&inputs).unwrap(), critic.forward(&inputs).unwrap()];
+                let loss = outputs.iter().map(|y| (y - 0.3).unwrap().sqr().unwrap().mean_all().unwrap());
+                let grads = loss.reduce(|a, b| (a + b).unwrap()).unwrap().backward().unwrap();
+                (outputs, grads)
+            });
+            for (a, b) in fused.0.iter().zip(&candle.0) {
+                assert!(difference(a, b) < 1e-5, "{activation:?}: outputs");
+            }
+            let all = policy.parameters().iter().filter(|(name, _)| name != "log_std");
+            for (name, var) in all.map(|(name, var)| (name.as_str(), var)).chain([("inputs", &inputs)]) {
+                let error = difference(fused.1.get(var).unwrap(), candle.1.get(var).unwrap());
+                assert!(error < 1e-4, "{activation:?}: gradient of {name} off by {error}");
+            }
+        }
+    }
 }

@@ -217,6 +217,7 @@ fn a_diverged_state_terminates_pays_nothing_and_leaves_no_trace_in_the_next_epis
         assert!(env.episode().diverged && env.last_step().diverged && !env.episode().dropped);
         assert!(observation.iter().all(|x| x.is_finite()));
         assert_eq!(env.take_recent().diverged, 1);
+        assert!(env.simulation().ctrl().iter().any(|&c| c != 0.0), "the controls that were sent are still there");
         env.reset(rng::stream(7, "test", 0), &mut observation);
         for _ in 0..10 {
             let _ = env.step(&[0.2; 20], &mut observation);
