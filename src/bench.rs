@@ -10,22 +10,24 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use crate::cli::BenchArgs;
-use crate::config::{Config, Source};
+use crate::config::Config;
 use crate::env::{ACTION_SIZE, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition};
-use crate::ppo::{Ppo, matmul_gflops, time_gradient_steps};
+use crate::ppo::{Ppo, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng::{self, Rng};
 use crate::run;
 use crate::sim::{BareSimulation, SimulationState};
-use crate::train::{Scratch, collect};
+use crate::train::{Scratch, collect, user_file};
 
 /// Measurements of physics and pool, taken in turn.
 const ROUNDS: usize = 5;
 
-/// Control steps before the measured ones, so that most cubes have come to lie in the hand.
-const WARM_UP: usize = 64;
-
-/// Measured control steps over all environments, at least.
+/// Measured control steps of a round over all environments, at least.
 const STEPS: usize = 32_768;
+
+/// Control steps before the measured ones, so that most cubes have come to lie in the hand; fewer for many environments.
+fn warm_up(envs: usize) -> usize {
+    (2 * STEPS / envs).clamp(4, 64)
+}
 
 /// Gradient steps and matrix products that are measured.
 const REPEATS: usize = 11;
@@ -38,11 +40,7 @@ const END_TO_END: (f64, usize) = (8.0, 4);
 /// # Errors
 /// Settings or a scene that cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
-    let user = match &args.settings.config {
-        Some(path) => Some(Source { path: path.clone(), text: run::read_text(path)? }),
-        None => None,
-    };
-    let mut config = Config::resolve(user.as_ref(), &args.settings.set)?;
+    let mut config = Config::resolve(user_file(&args.settings)?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
@@ -81,18 +79,37 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     Ok(())
 }
 
-/// What an environment did: its state when the measurement begins, its controls at each step, and where it was reset.
+/// What an environment did in a round.
 struct Recording {
+    /// Its state at the beginning.
     start: SimulationState,
-    steps: Vec<Vec<f64>>,
-    /// Steps after which an episode began, with its state.
+    /// Its controls, step after step.
+    ctrl: Vec<f64>,
+    /// Steps made before an episode began, with its first state.
     resets: Vec<(usize, SimulationState)>,
+    steps: usize,
 }
 
-/// An environment that writes down what its physics is given.
+/// An environment that writes down what its physics is given; that is the only difference to the environment of a training.
 struct Recorder {
     env: Repose,
-    recording: Option<Recording>,
+    recording: Recording,
+}
+
+impl Recorder {
+    fn new(task: &Arc<Task>, steps: usize) -> Self {
+        let env = Repose::new(task);
+        let ctrl = Vec::with_capacity(steps * ACTION_SIZE);
+        let recording = Recording { start: env.simulation().state(), ctrl, resets: Vec::new(), steps: 0 };
+        Self { env, recording }
+    }
+
+    fn begin(&mut self) {
+        self.recording.start = self.env.simulation().state();
+        self.recording.ctrl.clear();
+        self.recording.resets.clear();
+        self.recording.steps = 0;
+    }
 }
 
 impl Env for Recorder {
@@ -108,9 +125,7 @@ impl Env for Recorder {
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
         self.env.reset(rng, observation);
-        if let Some(recording) = &mut self.recording {
-            recording.resets.push((recording.steps.len(), self.env.simulation().state()));
-        }
+        self.recording.resets.push((self.recording.steps, self.env.simulation().state()));
     }
 
     fn skip_ahead(&mut self, share: f64) {
@@ -119,9 +134,8 @@ impl Env for Recorder {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         let transition = self.env.step(action, observation);
-        if let Some(recording) = &mut self.recording {
-            recording.steps.push(self.env.simulation().ctrl().to_vec());
-        }
+        self.recording.ctrl.extend_from_slice(self.env.simulation().ctrl());
+        self.recording.steps += 1;
         transition
     }
 
@@ -135,33 +149,26 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let envs = config.env.num_envs;
     let steps = STEPS.div_ceil(envs);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let mut action = || -> f32 {
-        config.ppo.init_std as f32 * <StandardNormal as Distribution<f32>>::sample(&StandardNormal, &mut noise)
+    let mut actions = |steps: usize| -> Vec<Vec<f32>> {
+        let mut draw = || config.ppo.init_std as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
+        (0..steps).map(|_| (0..envs * ACTION_SIZE).map(|_| draw()).collect()).collect()
     };
-    let actions: Vec<Vec<f32>> =
-        (0..WARM_UP + steps).map(|_| (0..envs * ACTION_SIZE).map(|_| action()).collect()).collect();
-
-    let recorders = (0..envs).map(|_| Recorder { env: Repose::new(task), recording: None }).collect();
-    let mut recorders = EnvPool::new(config.run.seed, recorders);
-    play(&mut recorders, &actions[..WARM_UP], true);
-    for recorder in recorders.envs_mut() {
-        let start = recorder.env.simulation().state();
-        recorder.recording = Some(Recording { start, steps: Vec::new(), resets: Vec::new() });
-    }
-    play(&mut recorders, &actions[WARM_UP..], false);
-    let ends: Vec<Vec<f64>> = recorders.envs_mut().map(|r| r.env.simulation().qpos().to_vec()).collect();
-    let recordings: Vec<Recording> = recorders.envs_mut().filter_map(|r| r.recording.take()).collect();
-    drop(recorders);
-
-    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Repose::new(task)).collect());
+    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task, steps)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
+    let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
+    pool.reset(0, &mut observations);
+    play(&mut pool, &actions(warm_up(envs)), &mut observations);
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
-        play(&mut pool, &actions[..WARM_UP], true);
-        let pool_seconds = play(&mut pool, &actions[WARM_UP..], false);
+        let actions = actions(steps);
+        pool.envs_mut().for_each(Recorder::begin);
+        let pool_seconds = play(&mut pool, &actions, &mut observations);
+        let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
         let bare_seconds = replay(&mut bare, &recordings, config.env.substeps());
+        drop(recordings);
         // The replay did the same physics only if it ended in the same states.
-        ensure!(bare.iter().zip(&ends).all(|(bare, end)| bare.qpos() == end), "the replay has left the recorded path");
+        let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
+        ensure!(same, "the replay of the physics has not ended where the environments did");
         let done = (steps * envs) as f64;
         rates[0].push(done / bare_seconds);
         rates[1].push(done / pool_seconds);
@@ -171,21 +178,16 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     Ok((physics, pool, share))
 }
 
-/// Steps a pool with these actions, from the start if `reset`; the seconds that the steps took.
-fn play<E: Env>(pool: &mut EnvPool<E>, actions: &[Vec<f32>], reset: bool) -> f64 {
-    let envs = pool.len();
-    let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
-    let mut final_observations = observations.clone();
-    let (mut rewards, mut ends) = (vec![0.0; envs], vec![None; envs]);
-    if reset {
-        pool.reset(0, &mut observations);
-    }
+/// Steps a pool with these actions; the seconds that the steps took.
+fn play<E: Env>(pool: &mut EnvPool<E>, actions: &[Vec<f32>], observations: &mut [f32]) -> f64 {
+    let mut final_observations = observations.to_vec();
+    let (mut rewards, mut ends) = (vec![0.0; pool.len()], vec![None; pool.len()]);
     let start = Instant::now();
     for actions in actions {
         let buffers = StepBuffers {
             rewards: &mut rewards,
             ends: &mut ends,
-            observations: &mut observations,
+            observations,
             final_observations: &mut final_observations,
         };
         pool.step(actions, buffers);
@@ -194,13 +196,13 @@ fn play<E: Env>(pool: &mut EnvPool<E>, actions: &[Vec<f32>], reset: bool) -> f64
 }
 
 /// Replays the recordings; the seconds that it took. All environments take a step before any takes the next, as in the pool.
-fn replay(bare: &mut [BareSimulation], recordings: &[Recording], substeps: usize) -> f64 {
+fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], substeps: usize) -> f64 {
     bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| bare.start(&recording.start));
-    let steps = recordings[0].steps.len();
+    let steps = recordings[0].steps;
     let start = Instant::now();
     for step in 0..steps {
         bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| {
-            bare.step(&recording.steps[step], substeps);
+            bare.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
             if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, _)| after) {
                 bare.start(&recording.resets[i].1);
             }
@@ -217,7 +219,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     pool.reset(0, rollout.first_observations_mut());
     collect(&mut pool, &ppo, &mut rollout, 0, &mut scratch, &AtomicBool::new(false))?;
     let size = rollout.samples() / config.ppo.minibatches;
-    let flops = 6.0 * ppo.policy().parameter_count() as f64;
+    let flops = flops_per_sample(ppo.policy());
     time_gradient_steps(&mut ppo, &rollout, 2)?;
     let samples = size as f64 / median(time_gradient_steps(&mut ppo, &rollout, REPEATS)?);
     let matmul = median(matmul_gflops(ppo.policy(), size, REPEATS)?);

@@ -2,9 +2,18 @@
 
 use std::path::PathBuf;
 
+use clap::builder::RangedU64ValueParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::config::Override;
+
+/// The largest whole number of a TOML file.
+const LARGEST: u64 = i64::MAX as u64;
+
+/// Accepts a number of threads, within the rule of `run.threads`.
+fn threads() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(0..=4096)
+}
 
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any asked orientation, on a CPU.
 #[derive(Debug, Parser)]
@@ -44,13 +53,13 @@ pub struct TrainArgs {
     #[command(flatten)]
     pub settings: Settings,
     /// All randomness follows from it [default: run.seed]
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
     pub seed: Option<u64>,
     /// Worker threads, 0 for one per core [default: run.threads]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads())]
     pub threads: Option<usize>,
     /// Control steps over all hands, counted from the start of the run [default: run.total_steps]
-    #[arg(long, value_name = "STEPS")]
+    #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..=LARGEST))]
     pub total_steps: Option<u64>,
     /// Added to the name of the run folder
     #[arg(long)]
@@ -73,10 +82,10 @@ pub struct PlayArgs {
     #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub episodes: u64,
     /// Episode k is drawn from (seed, k)
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
     pub seed: u64,
     /// Worker threads, 0 for one per core
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads())]
     pub threads: usize,
     /// Draw actions from the policy's distribution instead of taking their mean
     #[arg(long, conflicts_with = "policy")]
@@ -114,7 +123,7 @@ pub struct BenchArgs {
     #[command(flatten)]
     pub settings: Settings,
     /// Worker threads, 0 for one per core [default: run.threads]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads())]
     pub threads: Option<usize>,
     /// Print one JSON object and nothing else
     #[arg(long)]

@@ -7,18 +7,15 @@ use shadow_repose::cli::{Cli, Command};
 use shadow_repose::train::{Outcome, train};
 use shadow_repose::{bench, play, run};
 
-/// The exit code of a training that was interrupted, after saving.
-const INTERRUPTED: u8 = 130;
-
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
-        Command::Train(args) => run::on_interrupt().and_then(|interrupted| train(&args, interrupted)),
+        Command::Train(args) => run::on_interrupt().and_then(|interrupted| train(&args, &interrupted)),
         Command::Play(args) => play::play(&args).map(|()| Outcome::Finished),
         Command::Bench(args) => bench::bench(&args).map(|()| Outcome::Finished),
     };
     match result {
         Ok(Outcome::Finished) => ExitCode::SUCCESS,
-        Ok(Outcome::Interrupted) => ExitCode::from(INTERRUPTED),
+        Ok(Outcome::Interrupted) => ExitCode::from(run::INTERRUPTED),
         Err(error) => {
             run::say(&format!("error: {error:#}"));
             ExitCode::FAILURE

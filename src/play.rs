@@ -36,10 +36,12 @@ pub fn play(args: &PlayArgs) -> Result<()> {
         (None, _) => Actor::Zero,
     };
     let checkpoint = loaded.as_ref().map(|loaded| loaded.path.display().to_string());
-    let mut trace = args.trace.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
+    // Opened before playing: a place that cannot be written to should not cost the score.
+    let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
+    let mut trace = output.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
     let score = score(&task, &actor, args, trace.as_mut())?;
-    if let (Some(path), Some(trace)) = (&args.trace, trace) {
-        run::write_whole(path, trace.finish().as_bytes())?;
+    if let (Some(output), Some(trace)) = (output, trace) {
+        output.finish(trace.finish().as_bytes())?;
     }
     if args.json {
         run::print(&format!("{}\n", json_score(&score, checkpoint.as_deref(), args.seed)));

@@ -1,14 +1,14 @@
 //! Training, from top to bottom: collect, learn, evaluate, report, checkpoint. The only place where environments and the
 //! learner meet.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
 
-use crate::cli::TrainArgs;
+use crate::cli::{Settings, TrainArgs};
 use crate::config::{Config, Override, Source};
 use crate::env::{End, Env, EnvPool, Recent, Repose, Score, StepBuffers, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
@@ -73,6 +73,10 @@ pub fn train(args: &TrainArgs, interrupted: &AtomicBool) -> Result<Outcome> {
     }
     run::say(&format!("run folder: {}", session.folder.path().display()));
     let mut report = session.open_report()?;
+    if session.progress.iteration == 0 {
+        // So that a run that dies before its first checkpoint can be resumed like any other.
+        session.checkpoint(&session.folder.latest())?;
+    }
     session.start_episodes();
 
     while !session.finished() {
@@ -90,7 +94,10 @@ pub fn train(args: &TrainArgs, interrupted: &AtomicBool) -> Result<Outcome> {
         session.progress.next_episode = session.pool.next_episode();
 
         let mut evaluation = None;
-        if iteration.is_multiple_of(session.config.run.eval_every) || session.finished() {
+        if session.finished() {
+            // The last evaluation cannot be made up for by resuming, so it is not broken off.
+            evaluation = session.evaluate(&AtomicBool::new(false), &report)?;
+        } else if iteration.is_multiple_of(session.config.run.eval_every) {
             evaluation = session.evaluate(interrupted, &report)?;
         }
         let seconds = [collected - started, updated - collected].map(|time| time.as_secs_f64());
@@ -164,13 +171,9 @@ struct Session {
 
 impl Session {
     fn begin(args: &TrainArgs) -> Result<Self> {
-        let user = match &args.settings.config {
-            Some(path) => Some(Source { path: path.clone(), text: run::read_text(path)? }),
-            None => None,
-        };
         let mut overrides = args.settings.set.clone();
         overrides.extend(asked(args));
-        let mut config = Config::resolve(user.as_ref(), &overrides)?;
+        let mut config = Config::resolve(user_file(&args.settings)?.as_ref(), &overrides)?;
         if let Some(model) = config.env.model_file() {
             // The run can be played from any folder.
             let model = model.canonicalize().with_context(|| format!("env.model: cannot find {}", model.display()))?;
@@ -178,7 +181,7 @@ impl Session {
         }
         run::start_threads(config.run.threads)?;
         let task = Task::new(&config.env)?;
-        let folder = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
+        let folder = || RunFolder::create(args.run_dir.as_deref(), args.name.as_deref());
         Self::new(config, folder, task, Progress::default())
     }
 
@@ -190,18 +193,36 @@ impl Session {
         let config = Config::from_text(&path, &checkpoint.config, &asked(args))?;
         run::start_threads(config.run.threads)?;
         let task = Task::new(&config.env)?;
-        let mut session = Self::new(config, folder, task, checkpoint.progress)?;
+        let mut session = Self::new(config, || Ok(folder), task, checkpoint.progress)?;
         session.ppo.restore(checkpoint).with_context(context)?;
+        session.remember_best();
         Ok(session)
     }
 
-    fn new(config: Config, folder: RunFolder, task: Arc<Task>, progress: Progress) -> Result<Self> {
+    /// The folder comes last: it is not touched by a training that cannot be set up.
+    fn new(
+        config: Config,
+        folder: impl FnOnce() -> Result<RunFolder>,
+        task: Arc<Task>,
+        progress: Progress,
+    ) -> Result<Self> {
         let envs = (0..config.env.num_envs).map(|_| Repose::new(&task)).collect();
         let pool = EnvPool::new(config.run.seed, envs);
         let ppo = Ppo::new(&config.ppo, pool.observation_size(), pool.action_size(), config.run.seed)?;
         let rollout = ppo.rollout(pool.len());
         let scratch = Scratch::new(&pool);
-        Ok(Self { config, folder, task, pool, ppo, rollout, scratch, progress })
+        Ok(Self { config, folder: folder()?, task, pool, ppo, rollout, scratch, progress })
+    }
+
+    /// The best policy of the folder may have been saved after the checkpoint that is resumed from; it is not given up for a
+    /// worse one.
+    fn remember_best(&mut self) {
+        let saved = run::read_bytes(&self.folder.best()).and_then(|bytes| Checkpoint::parse(&bytes));
+        if let Some(best) = saved.ok().and_then(|checkpoint| checkpoint.progress.best)
+            && is_better(best, self.progress.best)
+        {
+            self.progress.best = Some(best);
+        }
     }
 
     fn finished(&self) -> bool {
@@ -240,7 +261,7 @@ impl Session {
         run::write_whole(path, &self.ppo.save(&self.config.to_text(), &self.progress)?)
     }
 
-    /// Plays the evaluation episodes, and saves the policy if it is the best so far: more goals, then less rotation error.
+    /// Plays the evaluation episodes, and saves the policy if it is the best so far.
     fn evaluate(&mut self, interrupted: &AtomicBool, report: &Report) -> Result<Option<Score>> {
         let episodes =
             Episodes { seed: self.config.run.seed, purpose: "evaluation", count: self.config.run.eval_episodes };
@@ -255,9 +276,9 @@ impl Session {
             score.rot_dist,
             100.0 * score.drop_rate
         ));
-        let better = |[goals, rot_dist]: [f64; 2]| (score.goals, -score.rot_dist) > (goals, -rot_dist);
-        if self.progress.best.is_none_or(better) {
-            self.progress.best = Some([score.goals, score.rot_dist]);
+        let found = [score.goals, score.rot_dist];
+        if is_better(found, self.progress.best) {
+            self.progress.best = Some(found);
             self.checkpoint(&self.folder.best())?;
         }
         Ok(Some(score))
@@ -295,6 +316,22 @@ impl Session {
     }
 }
 
+/// Whether an evaluation (goals per episode, rotation error in rad) is the best so far: more goals, then less error.
+fn is_better(found: [f64; 2], best: Option<[f64; 2]>) -> bool {
+    let rank = |[goals, rot_dist]: [f64; 2]| (goals, -rot_dist);
+    // Where every episode diverged at once there is no rotation error to speak of.
+    found.iter().all(|x| x.is_finite()) && best.is_none_or(|best| rank(found) > rank(best))
+}
+
+/// The user's file of settings, if one was named.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn user_file(settings: &Settings) -> Result<Option<Source>> {
+    let read = |path: &PathBuf| Ok(Source { path: path.clone(), text: run::read_text(path)? });
+    settings.config.as_ref().map(read).transpose()
+}
+
 /// The settings that have options of their own.
 fn asked(args: &TrainArgs) -> Vec<Override> {
     let options = [
@@ -316,4 +353,19 @@ fn version() -> String {
         env!("SHADOW_REPOSE_RUSTC"),
         env!("SHADOW_REPOSE_TARGET"),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
+        assert!(is_better([0.0, 2.0], None));
+        assert!(is_better([1.0, 2.0], Some([0.5, 0.1])));
+        assert!(!is_better([0.5, 0.1], Some([1.0, 2.0])));
+        assert!(is_better([1.0, 1.9], Some([1.0, 2.0])));
+        assert!(!is_better([1.0, 2.0], Some([1.0, 2.0])));
+        assert!(!is_better([0.0, f64::NAN], None));
+    }
 }

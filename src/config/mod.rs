@@ -196,14 +196,22 @@ impl Config {
         for set in overrides {
             overlay(&mut merged, &set.as_table(&base), &base, "", &mut problems);
         }
-        match Self::deserialize(Value::Table(merged)) {
-            Ok(config) => {
-                problems.extend(config.violations());
-                if problems.is_empty() {
-                    return Ok(config);
+        // Words and sizes that no key of that type can have; with the default in their place the other rules can be checked.
+        for (section, keys) in &base {
+            for (key, default) in keys.as_table().into_iter().flatten() {
+                let mut alone = base.clone();
+                alone[section][key] = merged[section][key].clone();
+                if let Err(error) = Self::deserialize(Value::Table(alone)) {
+                    let reason = error.message().trim();
+                    problems.push(format!("{section}.{key} = {}: {reason}", merged[section][key]));
+                    merged[section][key] = default.clone();
                 }
             }
-            Err(error) => problems.push(error.to_string().trim().replace('\n', " ")),
+        }
+        let config = Self::deserialize(Value::Table(merged))?;
+        problems.extend(config.violations());
+        if problems.is_empty() {
+            return Ok(config);
         }
         let origin = user.map_or(String::new(), |s| format!(" ({})", s.path.display()));
         bail!("invalid configuration{origin}:\n  {}", problems.join("\n  "))

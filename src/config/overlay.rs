@@ -14,7 +14,8 @@ impl Override {
             Some(value) if !wants_text || value.is_str() => value,
             _ => Value::String(self.value.clone()),
         };
-        for part in self.key.rsplit('.') {
+        // Nothing lies deeper than a key in a section: what follows is part of an unknown name.
+        for part in self.key.splitn(3, '.').collect::<Vec<_>>().into_iter().rev() {
             value = Value::Table(Table::from_iter([(part.to_owned(), value)]));
         }
         match value {

@@ -8,7 +8,7 @@ impl Config {
         let Self { env, ppo, run } = self;
         let mut rules = Rules::default();
         rules.at_least("env.num_envs", env.num_envs, 1);
-        rules.at_most("env.num_envs", env.num_envs, 1 << 20);
+        rules.at_most("env.num_envs", env.num_envs, 1 << 16);
         rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
         rules.equal("env.num_hand_dofs", env.num_hand_dofs, 24);
         rules.equal("env.num_actuators", env.num_actuators, 20);
@@ -47,8 +47,8 @@ impl Config {
         rules.at_least("ppo.horizon", ppo.horizon, 1);
         rules.at_least("ppo.epochs", ppo.epochs, 1);
         let samples = env.num_envs.saturating_mul(ppo.horizon);
-        let rule = "be at most 2^26 samples together with env.num_envs";
-        rules.check(samples <= 1 << 26, "ppo.horizon", ppo.horizon, rule);
+        let rule = "be at most 2^24 samples together with env.num_envs";
+        rules.check(samples <= 1 << 24, "ppo.horizon", ppo.horizon, rule);
         rules.check(
             ppo.minibatches >= 1 && samples.is_multiple_of(ppo.minibatches),
             "ppo.minibatches",
@@ -62,6 +62,12 @@ impl Config {
         let [low, high] = ppo.learning_rate_range;
         let range = format!("[{low}, {high}]");
         rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "rise from above 0");
+        rules.check(
+            ppo.desired_kl == 0.0 || (low..=high).contains(&ppo.learning_rate),
+            "ppo.learning_rate",
+            ppo.learning_rate,
+            &format!("lie in ppo.learning_rate_range = [{low}, {high}] unless ppo.desired_kl = 0"),
+        );
         rules.not_negative("ppo.desired_kl", ppo.desired_kl);
         rules.between("ppo.gamma", ppo.gamma, 0.0, 1.0);
         rules.between("ppo.lambda", ppo.lambda, 0.0, 1.0);

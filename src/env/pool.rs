@@ -106,7 +106,7 @@ impl<E: Env> EnvPool<E> {
         std::mem::take(&mut self.finished)
     }
 
-    /// The number of the first episode that no environment has started or will start before its present one ends.
+    /// A number beyond those of all episodes that were begun; a pool that is reset with it repeats none of them.
     pub fn next_episode(&self) -> u64 {
         self.slots.iter().map(|slot| slot.next_episode).max().expect("a pool has at least one environment")
     }

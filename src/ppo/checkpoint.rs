@@ -267,13 +267,19 @@ mod tests {
         let (mut from, mut to) = (learner(&[8], 1), learner(&[8], 2));
         from.policy.normalizer.update(&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]);
         from.learning_rate = 0.123;
+        let loss = from.policy.parameters()[0].1.sqr().unwrap().sum_all().unwrap();
+        from.adam.step(from.policy.parameters(), &loss.backward().unwrap(), 0.01, 1.0).unwrap();
         let progress = Progress { iteration: 7, env_steps: 99, next_episode: 5, best: Some([1.5, 0.25]) };
         let bytes = from.save("[env]", &progress).unwrap();
         let checkpoint = Checkpoint::parse(&bytes).unwrap();
         assert_eq!((checkpoint.config.as_str(), checkpoint.progress), ("[env]", progress));
         to.restore(checkpoint).unwrap();
         assert_eq!(to.policy.normalizer, from.policy.normalizer);
-        assert_eq!(to.learning_rate, 0.123);
+        assert_eq!((to.learning_rate, to.adam.steps()), (0.123, 1));
+        let moments =
+            |ppo: &Ppo| ppo.adam.moments()[0].clone().map(|m| m.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        assert_eq!(moments(&from), moments(&to));
+        assert!(moments(&to).iter().all(|m| m.iter().any(|&x| x != 0.0)));
         let (mut a, mut b) = ([0.0; 2], [0.0; 2]);
         from.policy.means(&[0.1, 0.2, 0.3], &mut a).unwrap();
         to.policy.means(&[0.1, 0.2, 0.3], &mut b).unwrap();

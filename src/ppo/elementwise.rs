@@ -38,6 +38,12 @@ fn elu(x: f32) -> f32 {
     if x > 0.0 { x } else { exp_m1(x) }
 }
 
+/// Unlike `max`, keeps what is not a number.
+#[inline(always)]
+fn relu(x: f32) -> f32 {
+    if x < 0.0 { 0.0 } else { x }
+}
+
 #[inline(always)]
 fn tanh(x: f32) -> f32 {
     let m = exp_m1(2.0 * x.clamp(-40.0, 40.0));
@@ -67,7 +73,7 @@ pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Option<Activat
             match activation {
                 None => each(row, bias, |x, b| x + b),
                 Some(Activation::Elu) => each(row, bias, |x, b| elu(x + b)),
-                Some(Activation::Relu) => each(row, bias, |x, b| (x + b).max(0.0)),
+                Some(Activation::Relu) => each(row, bias, |x, b| relu(x + b)),
                 Some(Activation::Silu) => each(row, bias, |x, b| silu(x + b)),
                 Some(Activation::Tanh) => each(row, bias, |x, b| tanh(x + b)),
             }
@@ -167,7 +173,7 @@ mod tests {
 
     #[test]
     fn what_is_not_a_number_stays_so() {
-        for activation in [Activation::Elu, Activation::Silu, Activation::Tanh] {
+        for activation in ALL {
             let mut x = [f32::NAN];
             add_bias_activate(&mut x, &[0.0], Some(activation));
             assert!(x[0].is_nan(), "{activation:?}");

@@ -8,7 +8,11 @@ use candle_core::{Device, Tensor};
 
 use super::{Policy, Ppo, Rollout, UpdateStats};
 
-/// Times gradient steps (forward, backward and Adam, both nets) on minibatches of a collected rollout; seconds for each.
+/// Seconds after which, from the third on, no further gradient step is timed.
+const LIMIT: f64 = 5.0;
+
+/// Times gradient steps (forward, backward and Adam, both nets) on a minibatch of a collected rollout, up to `repeats` of them;
+/// seconds for each.
 ///
 /// # Errors
 /// A loss or gradient that is not finite.
@@ -19,12 +23,24 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &Rollout, repeats: usize) -> 
     let indices: Vec<u32> = (0..size as u32).collect();
     let minibatch = batch.select(&indices)?;
     let mut seconds = Vec::new();
-    for _ in 0..repeats {
+    while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {
         let start = Instant::now();
         ppo.minibatch_step(&minibatch, &old_std, false, &mut UpdateStats::default())?;
         seconds.push(start.elapsed().as_secs_f64());
     }
     Ok(seconds)
+}
+
+/// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the gradient of the
+/// inputs is needed, which it is not for observations.
+fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
+    let weights = policy.parameters().iter().filter(|(_, var)| var.rank() == 2);
+    weights.map(|(name, var)| (var.dims()[0], var.dims()[1], !name.contains(".0.")))
+}
+
+/// Floating-point operations of those products for one sample, both nets.
+pub fn flops_per_sample(policy: &Policy) -> f64 {
+    products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
 
 /// Times the matrix products of one forward and backward pass of `policy` on `samples` samples, as candle does them; for each
@@ -33,25 +49,23 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &Rollout, repeats: usize) -> 
 /// # Errors
 /// Only if candle cannot allocate.
 pub fn matmul_gflops(policy: &Policy, samples: usize, repeats: usize) -> Result<Vec<f64>> {
+    let constant = |value: f32, shape: (usize, usize)| Tensor::full(value, shape, &Device::Cpu)?.contiguous();
     let mut operands = Vec::new();
-    let mut flops = 0.0;
-    for (_, var) in policy.parameters().iter().filter(|(_, var)| var.rank() == 2) {
-        let (outputs, inputs) = var.dims2()?;
-        let weight = Tensor::full(0.01f32, (outputs, inputs), &Device::Cpu)?.contiguous()?;
-        let x = Tensor::full(0.5f32, (samples, inputs), &Device::Cpu)?.contiguous()?;
-        let grad = Tensor::full(0.1f32, (samples, outputs), &Device::Cpu)?.contiguous()?;
-        flops += 6.0 * (samples * inputs * outputs) as f64;
-        operands.push((weight, x, grad));
+    for (outputs, inputs, inner) in products(policy) {
+        let weight = constant(0.01, (outputs, inputs))?;
+        operands.push((weight, constant(0.5, (samples, inputs))?, constant(0.1, (samples, outputs))?, inner));
     }
     let mut rates = Vec::new();
     for _ in 0..repeats {
         let start = Instant::now();
-        for (weight, x, grad) in &operands {
+        for (weight, x, grad, inner) in &operands {
             black_box(x.matmul(&weight.t()?)?);
-            black_box(grad.matmul(weight)?);
             black_box(grad.t()?.matmul(x)?);
+            if *inner {
+                black_box(grad.matmul(weight)?);
+            }
         }
-        rates.push(1e-9 * flops / start.elapsed().as_secs_f64());
+        rates.push(1e-9 * flops_per_sample(policy) * samples as f64 / start.elapsed().as_secs_f64());
     }
     Ok(rates)
 }

@@ -15,14 +15,14 @@ mod normalizer;
 mod policy;
 mod rollout;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
 use rand::seq::SliceRandom;
 use rand_distr::{Distribution, StandardNormal};
 
 pub use checkpoint::{Checkpoint, Progress};
 pub use gae::gae;
-pub use measure::{matmul_gflops, time_gradient_steps};
+pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use policy::{Mlp, Policy};
 pub use rollout::{Rollout, RolloutStep};
@@ -149,7 +149,7 @@ impl Ppo {
     /// the same during collection and update: so the first minibatch still sees the very policy that acted.
     ///
     /// # Errors
-    /// A loss or gradient that is not finite; the policy must not be used or saved then.
+    /// A loss, gradient or weight that is not finite; the policy must not be used or saved then.
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
         let (last_observations, last_values) = rollout.after_last();
         self.policy.values(last_observations, last_values)?;
@@ -168,6 +168,7 @@ impl Ppo {
                     .with_context(|| format!("iteration {iteration}, epoch {epoch}, minibatch {part}"))?;
             }
         }
+        self.check_weights().with_context(|| format!("iteration {iteration}"))?;
         stats.average((self.config.epochs * self.config.minibatches) as f64);
         let std = self.policy.std()?;
         stats.std = std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64;
@@ -229,6 +230,14 @@ impl Ppo {
         let scale = (self.config.max_grad_norm / (norm + 1e-6)).min(1.0);
         self.adam.step(self.policy.parameters(), &grads, self.learning_rate, scale)?;
         stats.add(&self.config, &losses, kl, norm, first)
+    }
+
+    fn check_weights(&self) -> Result<()> {
+        for (name, var) in self.policy.parameters() {
+            let sound = var.flatten_all()?.to_vec1::<f32>()?.iter().all(|x| x.is_finite());
+            ensure!(sound, "the step has made `{name}` infinite or NaN: the training has failed and stops here");
+        }
+        Ok(())
     }
 
     /// Keeps the KL divergence of an update near the desired one, as the reference implementation does.
@@ -307,4 +316,38 @@ fn standardize(values: &mut [f32]) {
     let (mean, variance) = mean_and_variance(values);
     let scale = 1.0 / (variance.sqrt() + 1e-8);
     values.iter_mut().for_each(|x| *x = ((f64::from(*x) - mean) * scale) as f32);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn learner(desired_kl: f64) -> Ppo {
+        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        (config.desired_kl, config.learning_rate, config.learning_rate_range) = (desired_kl, 1e-3, [5e-4, 2e-3]);
+        Ppo::new(&config, 3, 2, 0).unwrap()
+    }
+
+    #[test]
+    fn the_learning_rate_follows_the_divergence_within_its_range() {
+        let mut ppo = learner(0.01);
+        // The divergence, and the factor that the rate is then changed by.
+        for (kl, factor) in [(0.021, 1.0 / 1.5), (0.019, 1.0), (0.006, 1.0), (0.004, 1.5), (0.0, 1.0)] {
+            ppo.learning_rate = 1e-3;
+            ppo.adapt_learning_rate(kl);
+            assert!((ppo.learning_rate / 1e-3 - factor).abs() < 1e-12, "KL {kl}: {}", ppo.learning_rate);
+        }
+        (0..9).for_each(|_| ppo.adapt_learning_rate(1.0));
+        assert_eq!(ppo.learning_rate, 5e-4);
+        (0..9).for_each(|_| ppo.adapt_learning_rate(1e-4));
+        assert_eq!(ppo.learning_rate, 2e-3);
+    }
+
+    #[test]
+    fn without_a_desired_divergence_the_learning_rate_is_fixed() {
+        let mut ppo = learner(0.0);
+        [1e-6, 1.0].into_iter().for_each(|kl| ppo.adapt_learning_rate(kl));
+        assert_eq!(ppo.learning_rate, 1e-3);
+    }
 }

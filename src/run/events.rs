@@ -68,3 +68,33 @@ impl EventFile {
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_event_file_holds_its_version_the_first_step_and_the_values_that_are_known() {
+        let place = tempfile::tempdir().unwrap();
+        let mut events = EventFile::create(place.path(), 7).unwrap();
+        events.scalars(9, &[("reward/fall", 0.25), ("eval/goals", f64::NAN)]).unwrap();
+        let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
+        let bytes = std::fs::read(path).unwrap();
+        let (mut rest, mut found) = (&bytes[..], Vec::new());
+        // A record: length, its checksum, the event, its checksum.
+        while !rest.is_empty() {
+            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            found.push(protobuf::parse_from_bytes::<Event>(&rest[12..12 + length]).unwrap());
+            rest = &rest[16 + length..];
+        }
+        assert_eq!(found.len(), 3);
+        assert_eq!(found[0].get_file_version(), "brain.Event:2");
+        assert_eq!(
+            (found[1].get_step(), found[1].get_session_log().get_status()),
+            (7, SessionLog_SessionStatus::START)
+        );
+        let values = found[2].get_summary().get_value();
+        assert_eq!((found[2].get_step(), values.len()), (9, 1));
+        assert_eq!((values[0].get_tag(), values[0].get_simple_value()), ("reward/fall", 0.25));
+    }
+}

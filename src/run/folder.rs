@@ -1,15 +1,20 @@
-//! The folder of a run and what lies in it; files are written whole or not at all.
+//! The folder of a run and what lies in it.
 
-use std::fs::{self, File};
-use std::io::Write;
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
+
+use super::file::write_whole;
 
 /// Where runs go when nothing else is said.
 const RUNS: &str = "runs/shadow-hand-repose";
 
 const CONFIG: &str = "config.toml";
+const VERSION: &str = "version.txt";
+pub(super) const METRICS: &str = "metrics.csv";
 const CHECKPOINTS: &str = "checkpoints";
 const LATEST: &str = "latest";
 const BEST: &str = "best";
@@ -28,15 +33,16 @@ impl RunFolder {
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<Self> {
         let path = match path {
             Some(path) => path.to_owned(),
-            None => unused_path(name)?,
+            None => create_unused(name)?,
         };
-        let holds_run = path.join(CONFIG).exists() || path.join(CHECKPOINTS).exists();
+        let checkpoints = path.join(CHECKPOINTS);
+        let begun = fs::read_dir(&checkpoints).is_ok_and(|mut entries| entries.next().is_some());
+        let written = [CONFIG, VERSION, METRICS].iter().any(|file| path.join(file).exists());
         ensure!(
-            !holds_run,
-            "{} already holds a run; go on with it by --resume {0}, or name another folder",
+            !begun && !written,
+            "{} already holds a run; go on with it by --resume, or name another folder",
             path.display()
         );
-        let checkpoints = path.join(CHECKPOINTS);
         fs::create_dir_all(&checkpoints)
             .with_context(|| format!("cannot create the run folder {}", checkpoints.display()))?;
         Ok(Self { path })
@@ -86,7 +92,7 @@ impl RunFolder {
     /// A folder that cannot be written to.
     pub fn describe(&self, config: &str, version: &str) -> Result<()> {
         write_whole(&self.path.join(CONFIG), config.as_bytes())?;
-        write_whole(&self.path.join("version.txt"), version.as_bytes())
+        write_whole(&self.path.join(VERSION), version.as_bytes())
     }
 }
 
@@ -109,61 +115,41 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
 /// # Errors
 /// There is none.
 pub fn newest_checkpoint() -> Result<PathBuf> {
-    let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| entry.path());
-    // By the time of the checkpoint, so that a run that was resumed counts as new.
+    let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
+    // By the time of the latest checkpoint, so that a run that was resumed counts as new.
     let newest = runs
-        .filter_map(|run| resolve_checkpoint(&run).ok())
-        .max_by_key(|path| fs::metadata(path).and_then(|facts| facts.modified()).ok());
+        .filter_map(|run| Some((modified(&run.latest())?, resolve_checkpoint(&run.path).ok()?)))
+        .max()
+        .map(|(_, checkpoint)| checkpoint);
     newest.with_context(|| {
         format!("there is no run with a checkpoint in {RUNS}; train one first, or name one with --ckpt")
     })
 }
 
-/// The text of a file.
-///
-/// # Errors
-/// A file that cannot be read or is not UTF-8.
-pub fn read_text(path: &Path) -> Result<String> {
-    fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+fn modified(path: &Path) -> Option<SystemTime> {
+    fs::metadata(path).and_then(|facts| facts.modified()).ok()
 }
 
-/// The bytes of a file.
-///
-/// # Errors
-/// A file that cannot be read.
-pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    fs::read(path).with_context(|| format!("cannot read {}", path.display()))
-}
-
-/// Writes a file under another name, and renames it when it is complete and on the disk: whoever looks finds the whole old
-/// file or the whole new one.
-///
-/// # Errors
-/// A place that cannot be written to.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    let write = || {
-        let mut file = File::create(&partial)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        fs::rename(&partial, path)
-    };
-    write().with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn unused_path(name: Option<&str>) -> Result<PathBuf> {
+/// Creates a folder for a run among the others, named by the time, that no other run has.
+fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     let plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     let name = name.unwrap_or_default();
     ensure!(name.chars().all(plain), "--name {name}: may hold letters, digits, `-`, `_` and `.` only");
+    fs::create_dir_all(RUNS).with_context(|| format!("cannot create the folder of runs {RUNS}"))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
     let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
-    let candidates = (1..).map(|attempt| match attempt {
-        1 => format!("{time}{suffix}"),
-        _ => format!("{time}{suffix}-{attempt}"),
-    });
-    let mut paths = candidates.map(|candidate| Path::new(RUNS).join(candidate));
-    Ok(paths.find(|path| !path.exists()).expect("the attempts do not end"))
+    for attempt in 1.. {
+        let again = if attempt == 1 { String::new() } else { format!("-{attempt}") };
+        let path = Path::new(RUNS).join(format!("{time}{suffix}{again}"));
+        match fs::create_dir(&path) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            result => {
+                result.with_context(|| format!("cannot create the run folder {}", path.display()))?;
+                return Ok(path);
+            }
+        }
+    }
+    unreachable!("the attempts do not end")
 }
 
 #[cfg(test)]
@@ -193,18 +179,8 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_written_leaves_nothing_else_behind() {
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("x.safetensors");
-        write_whole(&path, b"one").unwrap();
-        write_whole(&path, b"two").unwrap();
-        assert_eq!(fs::read(&path).unwrap(), b"two");
-        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
-    }
-
-    #[test]
     fn names_of_runs_cannot_leave_the_folder_of_runs() {
-        assert!(unused_path(Some("../elsewhere")).is_err());
-        assert!(unused_path(Some("good-name_1.0")).is_ok());
+        let refusal = create_unused(Some("../elsewhere")).unwrap_err().to_string();
+        assert!(refusal.contains("--name ../elsewhere"), "{refusal}");
     }
 }

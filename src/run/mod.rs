@@ -1,12 +1,14 @@
 //! The outside of a run: its folder, its logs, the terminal, signals. Knows neither environments nor learning.
 
 mod events;
+mod file;
 mod folder;
 mod interrupt;
 mod report;
 
-pub use folder::{RunFolder, newest_checkpoint, read_bytes, read_text, resolve_checkpoint, write_whole};
-pub use interrupt::on_interrupt;
+pub use file::{OutputFile, read_bytes, read_text, write_whole};
+pub use folder::{RunFolder, newest_checkpoint, resolve_checkpoint};
+pub use interrupt::{INTERRUPTED, on_interrupt};
 pub use report::{EpisodeBar, Report, Status};
 
 use anyhow::{Context, Result};

@@ -11,7 +11,8 @@ use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::events::EventFile;
-use super::folder::{read_text, write_whole};
+use super::file::{read_text, write_whole};
+use super::folder::METRICS;
 use super::say;
 
 /// Time between two plain lines.
@@ -29,6 +30,8 @@ pub struct Report {
     last_line: Option<Instant>,
     shown: Shown,
     total_steps: u64,
+    /// When this session began, and the steps made before it.
+    begun: (Instant, u64),
 }
 
 /// What is shown of an iteration; `NaN` where nothing is known.
@@ -65,14 +68,20 @@ impl Report {
             last_line: None,
             shown: Shown { steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
             total_steps,
+            begun: (Instant::now(), env_steps),
         };
         // Later steps of a session that did not come to its checkpoint are made again.
         match EventFile::create(folder, env_steps + u64::from(iterations > 0)) {
             Ok(events) => report.events = Some(events),
             Err(error) => report.warn(&format!("no event file is written: {error:#}")),
         }
-        match open_metrics(&folder.join("metrics.csv"), &report.columns, iterations) {
-            Ok(metrics) => report.metrics = Some(metrics),
+        match open_metrics(&folder.join(METRICS), &report.columns, iterations) {
+            Ok((metrics, dropped)) => {
+                report.metrics = Some(metrics);
+                if dropped > 0 {
+                    report.say(&format!("{dropped} rows of {METRICS} after iteration {iterations} are dropped"));
+                }
+            }
             Err(error) => report.warn(&format!("no metrics are written: {error:#}")),
         }
         report
@@ -94,7 +103,7 @@ impl Report {
             }
         }
         self.shown.take(status);
-        let text = self.shown.text(self.total_steps.saturating_sub(status.env_steps));
+        let text = self.shown.text(self.time_left(status.env_steps));
         if let Some(bar) = &self.bar {
             bar.set_position(status.env_steps);
             bar.set_message(text);
@@ -103,6 +112,13 @@ impl Report {
             self.last_line = Some(Instant::now());
             say(&format!("{} of {} steps  {text}", status.env_steps, self.total_steps));
         }
+    }
+
+    /// At the pace of this session, evaluations included.
+    fn time_left(&self, env_steps: u64) -> Duration {
+        let (start, before) = self.begun;
+        let pace = start.elapsed().as_secs_f64() / env_steps.saturating_sub(before).max(1) as f64;
+        Duration::from_secs_f64(pace * self.total_steps.saturating_sub(env_steps) as f64)
     }
 
     /// Prints a line above the progress bar.
@@ -141,13 +157,12 @@ impl Shown {
         }
     }
 
-    fn text(&self, steps_left: u64) -> String {
+    fn text(&self, left: Duration) -> String {
         let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
-        let eta = Duration::from_secs((steps_left as f64 / self.steps_per_s.max(1e-3)) as u64);
         format!(
             "{:.0} steps/s  ETA {}  goals {}/episode  drops {}",
             self.steps_per_s,
-            indicatif::FormattedDuration(eta),
+            indicatif::FormattedDuration(left),
             known(self.goals, format!("{:.2}", self.goals)),
             known(self.drop_rate, format!("{:.0} %", 100.0 * self.drop_rate)),
         )
@@ -187,24 +202,26 @@ fn progress_bar(done: u64, total: u64) -> ProgressBar {
     bar
 }
 
-/// Keeps the header and the rows of the first `iterations` of an existing file, drops the rest, and opens it for more.
-fn open_metrics(path: &Path, columns: &[String], iterations: u64) -> Result<File> {
+/// Keeps the header and the rows of the first `iterations` of an existing file, drops the rest, and opens it for more; the
+/// file and the number of rows dropped.
+fn open_metrics(path: &Path, columns: &[String], iterations: u64) -> Result<(File, usize)> {
     let header = columns.join(",");
-    let mut kept = format!("{header}\n");
-    if iterations > 0
-        && let Ok(text) = read_text(path)
-    {
+    let (mut kept, mut dropped) = (format!("{header}\n"), 0);
+    if let Ok(text) = read_text(path) {
         let done = |row: &&str| {
             let number = row.split(',').next().and_then(|cell| cell.parse::<u64>().ok());
             number.is_some_and(|number| number <= iterations) && row.matches(',').count() == columns.len() - 1
         };
-        for row in text.lines().filter(done) {
+        let rows: Vec<&str> = text.lines().skip(1).collect();
+        for row in rows.iter().copied().filter(done) {
             kept.push_str(row);
             kept.push('\n');
         }
+        dropped = rows.len() + 1 - kept.lines().count();
     }
     write_whole(path, kept.as_bytes())?;
-    OpenOptions::new().append(true).open(path).with_context(|| format!("cannot append to {}", path.display()))
+    let file = OpenOptions::new().append(true).open(path);
+    Ok((file.with_context(|| format!("cannot append to {}", path.display()))?, dropped))
 }
 
 #[cfg(test)]
@@ -231,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_vanishes_does_not_end_the_training() {
+    fn logs_that_cannot_be_opened_do_not_end_the_training() {
         let place = tempfile::tempdir().unwrap();
         let mut report = Report::open(&place.path().join("gone"), &["a"], 0, 0, 100);
         report.iteration(1, &[("a", 1.0)], &status(10));

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::{Arc, Once};
 
 use anyhow::{Result, anyhow, bail, ensure};
-use mujoco_rs::prelude::{MjModel, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
+use mujoco_rs::prelude::{MjModel, MjtBias, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
 use super::Simulation;
@@ -136,11 +136,11 @@ impl Scene {
         Ok(Mocap(id.ok_or_else(|| anyhow!("{}: body `{name}` must have mocap=\"true\"", self.origin))?))
     }
 
-    /// The actuator `name`, which must have one limited control and drive the joint `target`, or the fixed tendon `target`
-    /// that is the sum of the joints `summed`.
+    /// The actuator `name`, which must be a position servo with one limited control and drive the joint `target`, or the fixed
+    /// tendon `target` that is the sum of the joints `summed`.
     ///
     /// # Errors
-    /// No such actuator or target, or an actuator that drives something else.
+    /// No such actuator or target, or an actuator of another kind or that drives something else.
     pub fn actuator(&self, name: &str, target: &str, summed: &[String]) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
         let (kind, transmission) = match summed {
@@ -155,6 +155,11 @@ impl Scene {
         if !summed.is_empty() {
             self.check_sum(target, target_id, summed)?;
         }
+        ensure!(
+            self.is_position_servo(id),
+            "{}: actuator `{name}` must be a position servo (<position>): its control is an angle",
+            self.origin
+        );
         let single = self.model.actuator_ctrlnum()[id] == 1;
         let ctrl = self.model.actuator_ctrladr()[id] as usize;
         ensure!(
@@ -172,6 +177,15 @@ impl Scene {
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
         self.model.name_to_id(kind, name).ok_or_else(|| anyhow!("{}: there is no {what} `{name}` in it", self.origin))
+    }
+
+    /// Whether the force is kp · (control - length), with or without damping.
+    fn is_position_servo(&self, id: usize) -> bool {
+        let kp = self.model.actuator_gainprm()[id][0];
+        self.model.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
+            && self.model.actuator_biastype()[id] == MjtBias::mjBIAS_AFFINE
+            && kp > 0.0
+            && self.model.actuator_biasprm()[id][1] == -kp
     }
 
     fn check_sum(&self, tendon: &str, id: usize, joints: &[String]) -> Result<()> {

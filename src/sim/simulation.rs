@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtWarning};
+use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
 
 use super::{Body, Mocap, Scene};
 use crate::quat::Quat;
@@ -13,17 +13,16 @@ use crate::quat::Quat;
 pub enum Physics {
     /// It can.
     Sound,
-    /// The state or a control was not finite or far too large; MuJoCo has put the default state in its place.
+    /// The state or a control was not finite or far too large; MuJoCo has reset what it could not use.
     Diverged,
 }
 
-/// All that the next step depends on besides the controls.
+/// All that the next step depends on.
 #[derive(Clone, Debug, PartialEq)]
-pub struct SimulationState {
-    qpos: Vec<f64>,
-    qvel: Vec<f64>,
-    warm_start: Vec<f64>,
-}
+pub struct SimulationState(Box<[f64]>);
+
+/// MuJoCo's name for that.
+const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 
 /// The state of one world. Positions of bodies, velocities and joints are always those of the same instant.
 pub struct Simulation {
@@ -100,11 +99,7 @@ impl Simulation {
 
     /// A copy of the state.
     pub fn state(&self) -> SimulationState {
-        SimulationState {
-            qpos: self.data.qpos().to_vec(),
-            qvel: self.data.qvel().to_vec(),
-            warm_start: self.data.qacc_warmstart().to_vec(),
-        }
+        SimulationState(self.data.state(EVERYTHING))
     }
 
     /// Position (m) and orientation of a body's frame in the world.
@@ -138,11 +133,11 @@ impl BareSimulation {
     }
 
     /// Starts from a state of a simulation of the same scene.
+    ///
+    /// # Panics
+    /// A state of another scene.
     pub fn start(&mut self, state: &SimulationState) {
-        self.data.reset();
-        self.data.qpos_mut().copy_from_slice(&state.qpos);
-        self.data.qvel_mut().copy_from_slice(&state.qvel);
-        self.data.qacc_warmstart_mut().copy_from_slice(&state.warm_start);
+        self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
     }
 
     /// Takes `substeps` physics steps with these controls.

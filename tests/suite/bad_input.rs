@@ -40,6 +40,11 @@ fn settings_that_cannot_be_are_named_all_at_once() {
     );
     refused(folder.path(), &["train", "--set", "ppo.minibatches=7"], 1, &["must divide num_envs * horizon = 16384"]);
     refused(folder.path(), &["bench", "--set", "ppo.minibatches=7"], 1, &["must divide"]);
+    let words = ["train", "--set", "ppo.activation=gelu", "--set", "env.success_hold=x", "--set", "ppo.gamma=2"];
+    let parts = ["ppo.activation = \"gelu\": unknown variant", "`silu`", "env.success_hold = \"x\"", "ppo.gamma = 2"];
+    refused(folder.path(), &words, 1, &parts);
+    let deep = format!("{}=1", ["a"; 60_000].join("."));
+    refused(folder.path(), &["train", "--set", &deep], 1, &["unknown key"]);
     assert!(!folder.path().join("runs").exists(), "nothing is begun");
 }
 
@@ -75,6 +80,7 @@ fn checkpoints_that_are_damaged_or_of_something_else_are_refused() {
     write("wider.safetensors", &wider);
     refused(folder.path(), &["play", "--ckpt", "cut.safetensors"], 1, &["cannot play cut.safetensors", "cut off"]);
     refused(folder.path(), &["play", "--ckpt", "text.safetensors"], 1, &["text.safetensors"]);
+    refused(folder.path(), &["play", "--ckpt", "/dev/null"], 1, &["cannot play /dev/null"]);
     refused(
         folder.path(),
         &["play", "--ckpt", "wider.safetensors"],
@@ -97,6 +103,37 @@ fn a_folder_that_holds_a_run_is_neither_taken_nor_changed() {
     let before = fs::read(folder.path().join("run/metrics.csv")).unwrap();
     refused(folder.path(), &train(&["--run-dir", "run"]), 1, &["already holds a run"]);
     assert_eq!(before, fs::read(folder.path().join("run/metrics.csv")).unwrap());
+}
+
+#[test]
+fn files_of_something_else_are_not_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["metrics.csv", "version.txt", "config.toml"] {
+        let path = folder.path().join(name);
+        fs::write(&path, "mine").unwrap();
+        refused(folder.path(), &train(&["--run-dir", "."]), 1, &["already holds a run"]);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "mine");
+        fs::remove_file(path).unwrap();
+    }
+}
+
+#[test]
+fn a_training_that_fails_names_the_iteration_and_leaves_the_last_checkpoint_intact() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings = ["ppo.learning_rate=1e30", "ppo.desired_kl=0", "run.checkpoint_every=1"];
+    let mut args = train(&["--run-dir", "run"]);
+    settings.iter().for_each(|setting| args.extend(["--set", setting]));
+    refused(folder.path(), &args, 1, &["iteration 1", "the training has failed"]);
+    succeeded(program(folder.path(), &["play", "--ckpt", "run", "--episodes", "1"]));
+}
+
+#[test]
+fn a_trace_that_cannot_be_written_is_refused_before_playing_and_a_device_is_written_to() {
+    let folder = tempfile::tempdir().unwrap();
+    let play = |trace: &'static str| ["play", "--policy", "zero", "--episodes", "1", "--trace", trace];
+    refused(folder.path(), &play("absent/t.jsonl"), 1, &["cannot write absent/t.jsonl"]);
+    succeeded(program(folder.path(), &play("/dev/null")));
+    assert!(!fs::metadata("/dev/null").unwrap().is_file());
 }
 
 #[test]
@@ -127,6 +164,8 @@ fn usage_errors_exit_with_2() {
         &["play", "--policy", "clever"],
         &["play", "--policy", "zero", "--ckpt", "x"],
         &["play", "--episodes", "0"],
+        &["play", "--threads", "5000"],
+        &["train", "--seed", "18446744073709551615"],
     ] {
         refused(folder.path(), args, 2, &["--help"]);
     }

@@ -201,6 +201,39 @@ fn a_resumed_run_goes_on_in_its_folder_up_to_the_new_total() {
 }
 
 #[test]
+fn a_run_that_died_before_its_first_checkpoint_is_resumed_from_its_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
+    let mut child = command(folder.path(), &args).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    while !lines.next().unwrap().unwrap().contains("steps/s") {}
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let run = folder.path().join("run");
+    assert!(metrics(&run).len() > 1);
+    let resumed = succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "256"]));
+    assert!(stderr(&resumed).contains("after iteration 0 are dropped"), "{}", stderr(&resumed));
+    assert_eq!(metrics(&run).len(), 3);
+}
+
+#[test]
+fn the_best_policy_of_a_run_is_not_given_up_when_an_older_checkpoint_is_resumed() {
+    let folder = trained(&[]);
+    let run = folder.path().join("run");
+    // A best checkpoint that nothing can beat, with the progress of the run.
+    let best = run.join("checkpoints/best.safetensors");
+    let bytes = fs::read(&best).unwrap();
+    let text = String::from_utf8_lossy(&bytes);
+    let from = text.find("best\\\":[").expect("the progress lies in the metadata") + 8;
+    let to = from + text[from..].find(',').unwrap();
+    let mut unbeatable = bytes.clone();
+    unbeatable[from..to].copy_from_slice(format!("{:0>1$}", "9", to - from).replacen('0', "9", to - from).as_bytes());
+    fs::write(&best, &unbeatable).unwrap();
+    succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512"]));
+    assert!(fs::read(&best).unwrap() == unbeatable);
+}
+
+#[test]
 fn an_interrupted_training_saves_exits_with_130_and_can_be_resumed() {
     let folder = tempfile::tempdir().unwrap();
     let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1000000"]);

@@ -129,13 +129,30 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
 }
 
 #[test]
-fn truncation_bootstraps_from_the_final_observation() {
-    let ppo = Ppo::new(&settings(), 2, 2, 0).unwrap();
-    let final_observations = [0.1, 0.2, -0.3, 0.4, 9.0, 9.0];
-    let mut value = [0.0];
-    ppo.policy().values(&final_observations[2..4], &mut value).unwrap();
-    let mut rewards = [1.0, 2.0, 3.0];
-    ppo.settle(&mut rewards, [false, true, false].into_iter(), &final_observations).unwrap();
-    let expected = [0.2, 0.4 + 0.9 * value[0], 0.6];
-    assert!(rewards.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{rewards:?}, not {expected:?}");
+fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
+    let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
+    let mut rollout = ppo.rollout(pool.len());
+    let mut scratch = Scratch::new(&pool);
+    pool.reset(0, rollout.first_observations_mut());
+    // One point starts so far out that it is lost at once.
+    rollout.first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
+    pool.envs_mut().next().unwrap().position = [5.0, 5.0];
+    collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(false)).unwrap();
+    let (mut truncated, mut terminated) = (0, 0);
+    for i in 0..rollout.samples() {
+        let moved = [0, 1]
+            .map(|axis| rollout.observations[2 * i + axis] + 0.2 * rollout.actions[2 * i + axis].clamp(-1.0, 1.0));
+        let distance = moved[0].hypot(moved[1]);
+        let mut expected = -0.2 * distance;
+        if rollout.dones[i] && distance <= 3.0 {
+            let mut value = [0.0];
+            ppo.policy().values(&moved, &mut value).unwrap();
+            expected += 0.9 * value[0];
+            truncated += 1;
+        } else if rollout.dones[i] {
+            terminated += 1;
+        }
+        assert!((rollout.rewards[i] - expected).abs() < 1e-5, "sample {i}: {} not {expected}", rollout.rewards[i]);
+    }
+    assert!(truncated > 30 && terminated == 1, "{truncated} truncated, {terminated} terminated");
 }

@@ -24,6 +24,7 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str]) -> Played 
         pool.reset(0, &mut observations);
         let mut noise = rng::stream(0, "test", 0);
         let (mut rewards, mut ends) = (vec![0.0; envs], vec![None; envs]);
+        let mut truncated = 0;
         for _ in 0..steps {
             let actions: Vec<f32> = (0..envs * ACTION_SIZE).map(|_| 3.0 * noise.random::<f32>() - 1.5).collect();
             let buffers = StepBuffers {
@@ -41,10 +42,15 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str]) -> Played 
                 // A new episode has begun where one ended: it has no previous action, its predecessor's end has.
                 assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
                 if *end == Some(End::Truncated) {
-                    assert!(final_observations[rows][137..].iter().any(|&a| a != 0.0));
+                    // The final observation is that of this environment: it shows the action that was its last.
+                    let last: Vec<f32> =
+                        actions[i * ACTION_SIZE..][..ACTION_SIZE].iter().map(|a| a.clamp(-1.0, 1.0)).collect();
+                    assert_eq!(final_observations[rows][137..], last);
+                    truncated += 1;
                 }
             }
         }
+        assert!(truncated > 0 || steps < 30, "no episode was truncated");
         played.lengths = pool.take_finished().iter().map(|episode| episode.length).collect();
         played
     })

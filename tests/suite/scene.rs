@@ -165,6 +165,11 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
         ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive the joint `rh_FFJ3`"),
         ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_MFJ0` must be the sum"),
         ("ctrlrange=\"0 3.1415\"", "", "must have one control with a ctrlrange"),
+        (
+            "<position name=\"rh_A_THJ4\" class=\"hand\" joint=\"rh_THJ4\" forcerange=\"-2 2\"/>",
+            "<motor name=\"rh_A_THJ4\" joint=\"rh_THJ4\" ctrlrange=\"-1 1\"/>",
+            "`rh_A_THJ4` must be a position servo",
+        ),
         ("  </actuator>", "<motor name=\"more\" joint=\"rh_WRJ1\"/></actuator>", "has 21 controls"),
         ("integrator=\"implicitfast\"", "integrator=\"RK4\"", "RK4"),
         ("</mujoco>", "", "MuJoCo refuses this scene"),

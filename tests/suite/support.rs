@@ -20,7 +20,8 @@ pub const SMALL: &[&str] = &[
     "ppo.epochs=2",
     "env.max_episode_seconds=0.2",
     "run.eval_episodes=2",
-    "run.checkpoint_every=1",
+    "run.checkpoint_every=100",
+    "run.eval_every=1",
 ];
 
 /// The default configuration with these settings on top.
