@@ -84,7 +84,7 @@ mod tests {
         // A record: length, its checksum, the event, its checksum.
         while !rest.is_empty() {
             let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
-            found.push(protobuf::parse_from_bytes::<Event>(&rest[12..12 + length]).unwrap());
+            found.push(Event::parse_from_bytes(&rest[12..12 + length]).unwrap());
             rest = &rest[16 + length..];
         }
         assert_eq!(found.len(), 3);
