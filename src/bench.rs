@@ -24,6 +24,9 @@ const ROUNDS: usize = 5;
 /// Measured control steps of a round over all environments, at least.
 const STEPS: usize = 32_768;
 
+/// Control steps of all environments between two turns of a round: the speed of a machine drifts within a second.
+const TURN: usize = 4;
+
 /// Control steps before the measured ones, so that most cubes have come to lie in the hand; fewer for many environments.
 fn warm_up(envs: usize) -> usize {
     (2 * STEPS / envs).clamp(4, 64)
@@ -79,7 +82,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     Ok(())
 }
 
-/// What an environment did in a round.
+/// What an environment did in a turn.
 struct Recording {
     /// Its state at the beginning.
     start: SimulationState,
@@ -97,9 +100,9 @@ struct Recorder {
 }
 
 impl Recorder {
-    fn new(task: &Arc<Task>, steps: usize) -> Self {
+    fn new(task: &Arc<Task>) -> Self {
         let env = Repose::new(task);
-        let ctrl = Vec::with_capacity(steps * ACTION_SIZE);
+        let ctrl = Vec::with_capacity(TURN * ACTION_SIZE);
         let recording = Recording { start: env.simulation().state(), ctrl, resets: Vec::new(), steps: 0 };
         Self { env, recording }
     }
@@ -153,22 +156,24 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
         let mut draw = || config.ppo.init_std as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
         (0..steps).map(|_| (0..envs * ACTION_SIZE).map(|_| draw()).collect()).collect()
     };
-    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task, steps)).collect());
+    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
     let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
     pool.reset(0, &mut observations);
     play(&mut pool, &actions(warm_up(envs)), &mut observations);
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
-        let actions = actions(steps);
-        pool.envs_mut().for_each(Recorder::begin);
-        let pool_seconds = play(&mut pool, &actions, &mut observations);
-        let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
-        let bare_seconds = replay(&mut bare, &recordings, config.env.substeps());
-        drop(recordings);
-        // The replay did the same physics only if it ended in the same states.
-        let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
-        ensure!(same, "the replay of the physics has not ended where the environments did");
+        let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
+        for actions in actions(steps).chunks(TURN) {
+            pool.envs_mut().for_each(Recorder::begin);
+            pool_seconds += play(&mut pool, actions, &mut observations);
+            let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
+            bare_seconds += replay(&mut bare, &recordings, config.env.substeps());
+            drop(recordings);
+            // The replay did the same physics only if it ended in the same states.
+            let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
+            ensure!(same, "the replay of the physics has not ended where the environments did");
+        }
         let done = (steps * envs) as f64;
         rates[0].push(done / bare_seconds);
         rates[1].push(done / pool_seconds);
