@@ -245,7 +245,9 @@ impl Ppo {
         let desired = self.config.desired_kl;
         let [lowest, highest] = self.config.learning_rate_range;
         if desired == 0.0 {
-        } else if kl > 2.0 * desired {
+            return;
+        }
+        if kl > 2.0 * desired {
             self.learning_rate = (self.learning_rate / 1.5).max(lowest);
         } else if kl > 0.0 && kl < 0.5 * desired {
             self.learning_rate = (self.learning_rate * 1.5).min(highest);
