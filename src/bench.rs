@@ -10,13 +10,17 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use crate::cli::BenchArgs;
+use crate::collect::{Scratch, collect};
 use crate::config::Config;
-use crate::env::{ACTION_SIZE, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition};
+use crate::env::{
+    ACTION_SIZE, End, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
+};
 use crate::ppo::{Ppo, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng::{self, Rng};
 use crate::run;
+use crate::schedule::in_rounds;
 use crate::sim::{BareSimulation, SimulationState};
-use crate::train::{Scratch, collect, user_file};
+use crate::train::user_file;
 
 /// Measurements of physics and pool, taken in turn.
 const ROUNDS: usize = 5;
@@ -147,34 +151,60 @@ impl Env for Recorder {
     }
 }
 
+/// What a block of environments is given and gives in a turn.
+struct BlockRows {
+    /// Of all steps of the turn.
+    actions: Vec<f32>,
+    observations: Vec<f32>,
+    final_observations: Vec<f32>,
+    rewards: Vec<f32>,
+    ends: Vec<Option<End>>,
+}
+
+impl BlockRows {
+    fn new(envs: usize) -> Self {
+        Self {
+            actions: Vec::new(),
+            observations: vec![0.0; envs * OBSERVATION_SIZE],
+            final_observations: vec![0.0; envs * OBSERVATION_SIZE],
+            rewards: vec![0.0; envs],
+            ends: vec![None; envs],
+        }
+    }
+}
+
 /// Env steps per second of bare physics and of the pool, medians of rounds taken in turn, and the median of their ratios.
 fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let envs = config.env.num_envs;
-    let steps = STEPS.div_ceil(envs);
+    let turns = STEPS.div_ceil(envs * TURN);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let mut actions = |steps: usize| -> Vec<Vec<f32>> {
-        let mut draw = || config.ppo.init_std as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
-        (0..steps).map(|_| (0..envs * ACTION_SIZE).map(|_| draw()).collect()).collect()
-    };
+    let mut draw = || config.ppo.init_std as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
-    let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
-    pool.reset(0, &mut observations);
-    play(&mut pool, &actions(warm_up(envs)), &mut observations);
+    let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
+    pool.reset(0, rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
+    let mut turn = |pool: &mut EnvPool<Recorder>, steps: usize| {
+        for rows in &mut rows {
+            rows.actions = (0..steps * rows.rewards.len() * ACTION_SIZE).map(|_| draw()).collect();
+        }
+        pool.envs_mut().for_each(Recorder::begin);
+        play(pool, &mut rows, steps)
+    };
+    turn(&mut pool, warm_up(envs));
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
         let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
-        for actions in actions(steps).chunks(TURN) {
-            pool.envs_mut().for_each(Recorder::begin);
-            pool_seconds += play(&mut pool, actions, &mut observations);
+        for _ in 0..turns {
+            pool_seconds += turn(&mut pool, TURN);
+            let sizes = pool.block_sizes();
             let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
-            bare_seconds += replay(&mut bare, &recordings, config.env.substeps());
+            bare_seconds += replay(&mut bare, &recordings, &sizes, config.env.substeps());
             drop(recordings);
             // The replay did the same physics only if it ended in the same states.
             let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
             ensure!(same, "the replay of the physics has not ended where the environments did");
         }
-        let done = (steps * envs) as f64;
+        let done = (turns * TURN * envs) as f64;
         rates[0].push(done / bare_seconds);
         rates[1].push(done / pool_seconds);
         rates[2].push(bare_seconds / pool_seconds);
@@ -183,59 +213,61 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     Ok((physics, pool, share))
 }
 
-/// Steps a pool with these actions; the seconds that the steps took.
-fn play<E: Env>(pool: &mut EnvPool<E>, actions: &[Vec<f32>], observations: &mut [f32]) -> f64 {
-    let mut final_observations = observations.to_vec();
-    let (mut rewards, mut ends) = (vec![0.0; pool.len()], vec![None; pool.len()]);
+/// Steps a pool with these actions, as a training does; the seconds that the steps took.
+fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> f64 {
+    let blocks: Vec<_> = pool.blocks_mut().iter_mut().zip(rows).collect();
     let start = Instant::now();
-    for actions in actions {
+    in_rounds(blocks, steps, |(envs, rows), step| {
+        let size = envs.len() * ACTION_SIZE;
         let buffers = StepBuffers {
-            rewards: &mut rewards,
-            ends: &mut ends,
-            observations,
-            final_observations: &mut final_observations,
+            rewards: &mut rows.rewards,
+            ends: &mut rows.ends,
+            observations: &mut rows.observations,
+            final_observations: &mut rows.final_observations,
         };
-        pool.step(actions, buffers);
-    }
+        envs.step(&rows.actions[step * size..][..size], buffers);
+    });
     start.elapsed().as_secs_f64()
 }
 
-/// Replays the recordings; the seconds that it took. All environments take a step before any takes the next, as in the pool.
-fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], substeps: usize) -> f64 {
+/// Replays the recordings in the same blocks; the seconds that it took.
+fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], sizes: &[usize], substeps: usize) -> f64 {
     bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| bare.start(&recording.start));
     let steps = recordings[0].steps;
+    let mut all = bare.iter_mut().zip(recordings);
+    let blocks: Vec<Vec<_>> = sizes.iter().map(|&size| all.by_ref().take(size).collect()).collect();
     let start = Instant::now();
-    for step in 0..steps {
-        bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| {
+    in_rounds(blocks, steps, |block, step| {
+        for (bare, recording) in block {
             bare.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
             if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, _)| after) {
                 bare.start(&recording.resets[i].1);
             }
-        });
-    }
+        }
+    });
     start.elapsed().as_secs_f64()
 }
 
 /// Samples per second and GFLOP/s of gradient steps, and GFLOP/s of their matrix products alone.
 fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let (mut ppo, mut pool) = agent(task, config)?;
-    let mut rollout = ppo.rollout(pool.len());
-    let mut scratch = Scratch::new(&pool);
+    let mut rollout = ppo.rollout(&pool.block_sizes());
+    let mut scratch = Scratch::new(&pool, &ppo);
     pool.reset(0, rollout.first_observations_mut());
     collect(&mut pool, &ppo, &mut rollout, 0, &mut scratch, &AtomicBool::new(false))?;
     let size = rollout.samples() / config.ppo.minibatches;
     let flops = flops_per_sample(ppo.policy());
-    time_gradient_steps(&mut ppo, &rollout, 2)?;
-    let samples = size as f64 / median(time_gradient_steps(&mut ppo, &rollout, REPEATS)?);
-    let matmul = median(matmul_gflops(ppo.policy(), size, REPEATS)?);
+    time_gradient_steps(&mut ppo, &mut rollout, 2)?;
+    let samples = size as f64 / median(time_gradient_steps(&mut ppo, &mut rollout, REPEATS)?);
+    let matmul = median(matmul_gflops(ppo.policy(), size, REPEATS));
     Ok((samples, 1e-9 * flops * samples, matmul))
 }
 
 /// Env steps per second of whole iterations, the first one aside if it is short.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
     let (mut ppo, mut pool) = agent(task, config)?;
-    let mut rollout = ppo.rollout(pool.len());
-    let mut scratch = Scratch::new(&pool);
+    let mut rollout = ppo.rollout(&pool.block_sizes());
+    let mut scratch = Scratch::new(&pool, &ppo);
     pool.reset(0, rollout.first_observations_mut());
     let begun = Instant::now();
     let mut seconds = Vec::new();

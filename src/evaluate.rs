@@ -11,7 +11,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
-use crate::ppo::Policy;
+use crate::ppo::{FrozenPolicy, Workspace};
 use crate::rng::{self, Rng};
 
 /// Episodes that run together.
@@ -20,9 +20,9 @@ const LANES: usize = 64;
 /// What chooses the actions.
 pub enum Actor<'a> {
     /// The mean action of a policy.
-    Mean(&'a Policy),
+    Mean(FrozenPolicy<'a>),
     /// Actions drawn from the distribution of a policy.
-    Stochastic(&'a Policy),
+    Stochastic(FrozenPolicy<'a>),
     /// Always 0.
     Zero,
     /// Uniform in [-1, 1].
@@ -84,6 +84,7 @@ pub fn evaluate(
     let mut lanes: Vec<Lane> = (0..LANES.min(episodes.count)).map(|_| lane()).collect();
     let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
     let mut actions = vec![0.0; LANES * ACTION_SIZE];
+    let mut work = actor.policy().map(|policy| policy.workspace(LANES));
     let mut results = Vec::with_capacity(episodes.count);
     for first in (0..episodes.count).step_by(LANES) {
         let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE);
@@ -97,7 +98,7 @@ pub fn evaluate(
             if interrupted.load(Ordering::Relaxed) {
                 return Ok(None);
             }
-            choose(actor, &observations, &mut lanes, &mut actions)?;
+            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut())?;
             lanes
                 .par_iter_mut()
                 .zip(actions.par_chunks_exact(ACTION_SIZE))
@@ -118,26 +119,38 @@ pub fn evaluate(
     Ok(Some(results))
 }
 
-/// Writes the actions of all lanes; a lane that has ended gets one too, which is not used.
-fn choose(actor: &Actor, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32]) -> Result<()> {
-    match actor {
-        Actor::Zero => actions.fill(0.0),
-        Actor::Random => {
-            for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
-                row.iter_mut().for_each(|a| *a = rng::uniform(&mut lane.noise, -1.0, 1.0) as f32);
-            }
-        }
-        Actor::Mean(policy) => policy.means(observations, actions)?,
-        Actor::Stochastic(policy) => {
-            policy.means(observations, actions)?;
-            let std = policy.std()?;
-            for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
-                for (action, std) in row.iter_mut().zip(&std) {
-                    let drawn: f32 = StandardNormal.sample(&mut lane.noise);
-                    *action += std * drawn;
-                }
-            }
+impl Actor<'_> {
+    fn policy(&self) -> Option<&FrozenPolicy<'_>> {
+        match self {
+            Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
+            Actor::Zero | Actor::Random => None,
         }
     }
-    Ok(())
+
+    /// Writes the actions of all lanes; a lane that has ended gets one too, which is not used.
+    fn choose(
+        &self,
+        observations: &[f32],
+        lanes: &mut [Lane],
+        actions: &mut [f32],
+        work: Option<&mut Workspace>,
+    ) -> Result<()> {
+        if let (Some(policy), Some(work)) = (self.policy(), work) {
+            policy.forward(observations, [Some(actions), None], work)?;
+        }
+        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
+            match self {
+                Actor::Mean(_) => {}
+                Actor::Stochastic(policy) => {
+                    for (action, std) in row.iter_mut().zip(policy.std()) {
+                        let drawn: f32 = StandardNormal.sample(&mut lane.noise);
+                        *action += std * drawn;
+                    }
+                }
+                Actor::Zero => row.fill(0.0),
+                Actor::Random => row.fill_with(|| rng::uniform(&mut lane.noise, -1.0, 1.0) as f32),
+            }
+        }
+        Ok(())
+    }
 }

@@ -12,31 +12,39 @@
 //! |---|---|
 //! | [`cli`] | the shape of the command line |
 //! | [`config`] | all settings, their defaults and rules |
-//! | [`train`] | the training: the only place where environments and the learner meet |
+//! | [`train`] | the training, from top to bottom |
+//! | [`mod@collect`] | environments stepping under the policy: the only place where the two meet |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
 //! | [`play`], [`trace`] | scores as table and JSON; episodes as JSON lines |
 //! | [`mod@bench`] | what this machine can do |
-//! | [`mod@env`] | the task, its reward, and many of them on worker threads |
+//! | [`mod@env`] | the task, its reward, and many of them in blocks |
+//! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
 //! | [`sim`] | the fence around MuJoCo |
-//! | [`ppo`] | the fence around candle: policy, losses, optimizer, checkpoint as bytes |
+//! | [`ppo`] | the fence around candle: policy, kernels and their reference, checkpoint as bytes |
 //! | [`run`] | the outside: run folder, logs, terminal, signals |
 //! | [`quat`], [`rng`] | rotations; generators named by (seed, purpose, index) |
 //!
-//! Direction of knowledge: `main → {train, play, bench} → evaluate → {env → sim, ppo, run} → {config, rng, quat}`. `env` and
-//! `ppo` do not know each other, `run` knows neither; a test holds the fences up.
+//! Direction of knowledge: `main → {train, play, bench} → {collect, evaluate} → {env → sim, ppo, run} → {config, rng, quat,
+//! schedule}`. `env` and `ppo` do not know each other, `run` knows neither; a test holds the fences up.
 //!
 //! # Data path of an iteration
-//! N environments, T steps, O and A numbers in an observation and an action; all arrays time-major and allocated once:
+//! N environments in blocks of n, T steps, O and A numbers in an observation and an action; a block's arrays are time-major
+//! and allocated once. Each block goes through this by itself, on whichever thread is free:
 //! ```text
-//! rollout.observations[t] --ppo.act--> actions[t], log_probs[t], values[t]
-//! actions[t] --pool.step--> rewards[t], ends, observations[t + 1] (of the new episode where one ended), final observations
-//! rewards[t] --ppo.settle--> scaled; + γ V(final observation) where the episode was truncated
+//! observations[t] --acting.act--> actions[t], log_probs[t], values[t]
+//! actions[t] --envs.step--> rewards[t], ends, observations[t + 1] (of the new episode where one ended), final observations
+//! rewards[t] --acting.settle--> scaled; + γ V(final observation) where the episode was truncated
+//! ```
+//! Then the learner takes all blocks together:
+//! ```text
 //! rollout --ppo.update--> advantages, epochs × minibatches of loss, gradient, Adam; then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
+//! How a minibatch is computed is described in `ppo::fused`; `ppo::reference` is the same in candle's tensors.
 
 pub mod bench;
 pub mod cli;
+pub mod collect;
 pub mod config;
 pub mod env;
 pub mod evaluate;
@@ -45,6 +53,7 @@ pub mod ppo;
 pub mod quat;
 pub mod rng;
 pub mod run;
+pub mod schedule;
 pub mod sim;
 pub mod trace;
 pub mod train;

@@ -30,8 +30,8 @@ pub fn play(args: &PlayArgs) -> Result<()> {
     run::start_threads(args.threads)?;
     let task = Task::new(&config.env)?;
     let actor = match (&loaded, args.policy) {
-        (Some(loaded), _) if args.stochastic => Actor::Stochastic(&loaded.policy),
-        (Some(loaded), _) => Actor::Mean(&loaded.policy),
+        (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()?),
+        (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()?),
         (None, Some(Baseline::Random)) => Actor::Random,
         (None, _) => Actor::Zero,
     };

@@ -1,16 +1,16 @@
-//! Training, from top to bottom: collect, learn, evaluate, report, checkpoint. The only place where environments and the
-//! learner meet.
+//! Training, from top to bottom: collect, learn, evaluate, report, checkpoint.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
 
 use crate::cli::{Settings, TrainArgs};
+use crate::collect::{Scratch, collect};
 use crate::config::{Config, Override, Source};
-use crate::env::{End, Env, EnvPool, Recent, Repose, Score, StepBuffers, Task};
+use crate::env::{EnvPool, Recent, Repose, Score, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::ppo::{Checkpoint, Ppo, Progress, Rollout, UpdateStats};
 use crate::run::{self, Report, RunFolder, Status};
@@ -111,52 +111,6 @@ pub fn train(args: &TrainArgs, interrupted: &AtomicBool) -> Result<Outcome> {
     Ok(Outcome::Finished)
 }
 
-/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile.
-///
-/// # Errors
-/// Only if candle cannot allocate.
-pub fn collect<E: Env>(
-    pool: &mut EnvPool<E>,
-    ppo: &Ppo,
-    rollout: &mut Rollout,
-    iteration: u64,
-    scratch: &mut Scratch,
-    interrupted: &AtomicBool,
-) -> Result<bool> {
-    let mut noise = ppo.noise(iteration);
-    for t in 0..rollout.horizon() {
-        if interrupted.load(Ordering::Relaxed) {
-            return Ok(false);
-        }
-        let mut step = rollout.step_mut(t);
-        ppo.act(&mut step, &mut noise)?;
-        let buffers = StepBuffers {
-            rewards: step.rewards,
-            ends: &mut scratch.ends,
-            observations: step.next_observations,
-            final_observations: &mut scratch.final_observations,
-        };
-        pool.step(step.actions, buffers);
-        step.dones.iter_mut().zip(&scratch.ends).for_each(|(done, end)| *done = end.is_some());
-        let truncated = scratch.ends.iter().map(|&end| end == Some(End::Truncated));
-        ppo.settle(step.rewards, truncated, &scratch.final_observations)?;
-    }
-    Ok(true)
-}
-
-/// Arrays that a collection needs besides the rollout.
-pub struct Scratch {
-    ends: Vec<Option<End>>,
-    final_observations: Vec<f32>,
-}
-
-impl Scratch {
-    /// For the environments of `pool`.
-    pub fn new<E: Env>(pool: &EnvPool<E>) -> Self {
-        Self { ends: vec![None; pool.len()], final_observations: vec![0.0; pool.len() * pool.observation_size()] }
-    }
-}
-
 /// All that a training owns.
 struct Session {
     config: Config,
@@ -209,8 +163,8 @@ impl Session {
         let envs = (0..config.env.num_envs).map(|_| Repose::new(&task)).collect();
         let pool = EnvPool::new(config.run.seed, envs);
         let ppo = Ppo::new(&config.ppo, pool.observation_size(), pool.action_size(), config.run.seed)?;
-        let rollout = ppo.rollout(pool.len());
-        let scratch = Scratch::new(&pool);
+        let rollout = ppo.rollout(&pool.block_sizes());
+        let scratch = Scratch::new(&pool, &ppo);
         Ok(Self { config, folder: folder()?, task, pool, ppo, rollout, scratch, progress })
     }
 
@@ -265,7 +219,7 @@ impl Session {
     fn evaluate(&mut self, interrupted: &AtomicBool, report: &Report) -> Result<Option<Score>> {
         let episodes =
             Episodes { seed: self.config.run.seed, purpose: "evaluation", count: self.config.run.eval_episodes };
-        let actor = Actor::Mean(self.ppo.policy());
+        let actor = Actor::Mean(self.ppo.policy().freeze()?);
         let Some(played) = evaluate(&self.task, &actor, episodes, interrupted, &mut |_| {})? else { return Ok(None) };
         let score = Score::of(&played);
         report.say(&format!(

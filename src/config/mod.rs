@@ -83,7 +83,7 @@ pub struct PpoConfig {
     pub minibatches: usize,
     pub hidden: Vec<usize>,
     pub activation: Activation,
-    pub layers: Layers,
+    pub backend: Backend,
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
     pub desired_kl: f64,
@@ -108,13 +108,13 @@ pub enum Activation {
     Tanh,
 }
 
-/// What computes the layers of the nets.
+/// What computes the nets, their gradients and the steps of the optimizer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Layers {
-    /// Our own kernels, linear layer and activation in one.
+pub enum Backend {
+    /// Our own kernels.
     Fused,
-    /// candle's own layers: slower, the reference for the other.
+    /// candle's tensors and automatic gradients: slower, the reference for the other.
     Candle,
 }
 

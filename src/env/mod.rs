@@ -10,7 +10,7 @@ mod reward;
 
 pub use episode::{EpisodeStats, Score};
 pub use hand::{ACTION_SIZE, Hand, OBSERVATION_SIZE};
-pub use pool::{EnvPool, StepBuffers};
+pub use pool::{EnvBlock, EnvPool, StepBuffers};
 pub use repose::{Recent, Repose, StepDetails, Task};
 pub use reward::RewardTerms;
 

@@ -10,6 +10,7 @@ use candle_core::{Device, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
+use super::backend::Moments;
 use super::{Normalizer, Policy, Ppo};
 
 /// The value of the metadata key `format`.
@@ -134,7 +135,8 @@ impl Ppo {
     /// Weights that are not finite.
     pub fn save(&self, config: &str, progress: &Progress) -> Result<Vec<u8>> {
         let mut tensors = Vec::new();
-        for ((name, var), [mean, square]) in self.policy.parameters().iter().zip(self.adam.moments()) {
+        let moments = self.backend.moments(&self.policy)?;
+        for ((name, var), [mean, square]) in self.policy.parameters().iter().zip(&moments.tensors) {
             tensors.push((name.clone(), Stored::of(var.as_tensor())?));
             tensors.push((format!("adam.mean.{name}"), Stored::of(mean)?));
             tensors.push((format!("adam.square.{name}"), Stored::of(square)?));
@@ -148,7 +150,7 @@ impl Ppo {
         for (name, stored) in &tensors {
             ensure!(stored.is_finite(), "`{name}` is not finite and is not saved");
         }
-        let learner = Learner { learning_rate: self.learning_rate, adam_steps: self.adam.steps() };
+        let learner = Learner { learning_rate: self.learning_rate, adam_steps: moments.steps };
         let metadata = HashMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
             ("config".to_owned(), config.to_owned()),
@@ -170,16 +172,16 @@ impl Ppo {
     /// As [`Policy::restore`].
     pub fn restore(&mut self, mut checkpoint: Checkpoint) -> Result<()> {
         checkpoint.take_policy(&mut self.policy)?;
-        let mut moments = Vec::new();
+        let mut tensors = Vec::new();
         for (name, var) in self.policy.parameters() {
             let mean = checkpoint.take_tensor(&format!("adam.mean.{name}"), var.dims())?;
             let square = checkpoint.take_tensor(&format!("adam.square.{name}"), var.dims())?;
-            moments.push([mean, square]);
+            tensors.push([mean, square]);
         }
         let Learner { learning_rate, adam_steps } = checkpoint.learner;
         ensure!(learning_rate.is_finite() && learning_rate > 0.0, "its learning rate is {learning_rate}");
         checkpoint.finish()?;
-        self.adam.restore(moments, adam_steps);
+        self.backend.restore(Moments { tensors, steps: adam_steps })?;
         self.learning_rate = learning_rate;
         Ok(())
     }
@@ -247,12 +249,17 @@ impl Stored {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use crate::config::{Backend, Config};
+    use crate::ppo::Rollout;
+
+    fn learner_with(backend: Backend, hidden: &[usize], seed: u64) -> Ppo {
+        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        (config.backend, config.hidden) = (backend, hidden.to_vec());
+        Ppo::new(&config, 3, 2, seed).unwrap()
+    }
 
     fn learner(hidden: &[usize], seed: u64) -> Ppo {
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
-        config.hidden = hidden.to_vec();
-        Ppo::new(&config, 3, 2, seed).unwrap()
+        learner_with(Backend::Fused, hidden, seed)
     }
 
     fn refusal(bytes: &[u8], into: &mut Ppo) -> String {
@@ -262,28 +269,42 @@ mod tests {
         }
     }
 
+    /// A learner that has taken a step of its optimizer.
+    fn learnt(backend: Backend, seed: u64) -> Ppo {
+        let mut ppo = learner_with(backend, &[8], seed);
+        ppo.policy.normalizer.update(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]);
+        ppo.learning_rate = 0.123;
+        let rollout = Rollout::new(4, &[8], 3, 2);
+        let samples: Vec<u32> = (0..32).collect();
+        ppo.backend.begin(&ppo.policy, &rollout).unwrap();
+        ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap();
+        ppo.backend.step(&ppo.policy, 0.01, 1.0).unwrap();
+        ppo
+    }
+
     #[test]
-    fn what_is_saved_is_what_is_restored() {
-        let (mut from, mut to) = (learner(&[8], 1), learner(&[8], 2));
-        from.policy.normalizer.update(&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]);
-        from.learning_rate = 0.123;
-        let loss = from.policy.parameters()[0].1.sqr().unwrap().sum_all().unwrap();
-        from.adam.step(from.policy.parameters(), &loss.backward().unwrap(), 0.01, 1.0).unwrap();
-        let progress = Progress { iteration: 7, env_steps: 99, next_episode: 5, best: Some([1.5, 0.25]) };
-        let bytes = from.save("[env]", &progress).unwrap();
-        let checkpoint = Checkpoint::parse(&bytes).unwrap();
-        assert_eq!((checkpoint.config.as_str(), checkpoint.progress), ("[env]", progress));
-        to.restore(checkpoint).unwrap();
-        assert_eq!(to.policy.normalizer, from.policy.normalizer);
-        assert_eq!((to.learning_rate, to.adam.steps()), (0.123, 1));
-        let moments =
-            |ppo: &Ppo| ppo.adam.moments()[0].clone().map(|m| m.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-        assert_eq!(moments(&from), moments(&to));
-        assert!(moments(&to).iter().all(|m| m.iter().any(|&x| x != 0.0)));
-        let (mut a, mut b) = ([0.0; 2], [0.0; 2]);
-        from.policy.means(&[0.1, 0.2, 0.3], &mut a).unwrap();
-        to.policy.means(&[0.1, 0.2, 0.3], &mut b).unwrap();
-        assert_eq!(a, b);
+    fn what_is_saved_is_what_is_restored_by_either_backend() {
+        for [backend, other] in [[Backend::Fused, Backend::Candle], [Backend::Candle, Backend::Fused]] {
+            let from = learnt(backend, 1);
+            let progress = Progress { iteration: 7, env_steps: 99, next_episode: 5, best: Some([1.5, 0.25]) };
+            let bytes = from.save("[env]", &progress).unwrap();
+            for mut to in [learnt(backend, 2), learnt(other, 3)] {
+                let checkpoint = Checkpoint::parse(&bytes).unwrap();
+                assert_eq!((checkpoint.config.as_str(), checkpoint.progress), ("[env]", progress));
+                to.restore(checkpoint).unwrap();
+                assert_eq!(to.policy.normalizer, from.policy.normalizer);
+                assert_eq!(to.learning_rate, 0.123);
+                assert!(from.backend.moments(&from.policy).unwrap().tensors.iter().flatten().any(|moment| {
+                    moment.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().any(|&x| x != 0.0)
+                }));
+                // The order of the metadata is not fixed.
+                let saved = to.save("[env]", &progress).unwrap();
+                let tensors = |bytes| SafeTensors::deserialize(bytes).unwrap();
+                for (name, tensor) in tensors(&bytes).iter() {
+                    assert!(tensors(&saved).tensor(name).unwrap().data() == tensor.data(), "{name} differs");
+                }
+            }
+        }
     }
 
     #[test]

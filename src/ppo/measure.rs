@@ -1,31 +1,31 @@
 //! What learning costs on this machine, and what its bare matrix products cost: the limit it is measured against.
 
-use std::hint::black_box;
 use std::time::Instant;
 
 use anyhow::Result;
-use candle_core::{Device, Tensor};
+use rayon::prelude::*;
 
-use super::{Policy, Ppo, Rollout, UpdateStats};
+use super::fused::{Matrix, ROWS, product};
+use super::{Policy, Ppo, Rollout};
 
 /// Seconds after which, from the third on, no further gradient step is timed.
 const LIMIT: f64 = 5.0;
 
-/// Times gradient steps (forward, backward and Adam, both nets) on a minibatch of a collected rollout, up to `repeats` of them;
-/// seconds for each.
+/// Times gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a collected rollout, up to
+/// `repeats` of them; seconds for each.
 ///
 /// # Errors
 /// A loss or gradient that is not finite.
-pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &Rollout, repeats: usize) -> Result<Vec<f64>> {
-    let (batch, _) = ppo.batch(rollout)?;
-    let old_std = ppo.policy.log_std().as_detached_tensor().exp()?;
-    let size = rollout.samples() / ppo.config.minibatches;
-    let indices: Vec<u32> = (0..size as u32).collect();
-    let minibatch = batch.select(&indices)?;
+pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<f64>> {
+    ppo.prepare(rollout);
+    ppo.backend.begin(&ppo.policy, rollout)?;
+    // Samples from all over the rollout, as a shuffled minibatch has them.
+    let (samples, step) = (rollout.samples(), ppo.config.minibatches);
+    let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
     while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {
         let start = Instant::now();
-        ppo.minibatch_step(&minibatch, &old_std, false, &mut UpdateStats::default())?;
+        ppo.minibatch_step(rollout, &minibatch)?;
         seconds.push(start.elapsed().as_secs_f64());
     }
     Ok(seconds)
@@ -43,29 +43,31 @@ pub fn flops_per_sample(policy: &Policy) -> f64 {
     products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
 
-/// Times the matrix products of one forward and backward pass of `policy` on `samples` samples, as candle does them; for each
-/// repeat 10⁹ floating-point operations per second.
-///
-/// # Errors
-/// Only if candle cannot allocate.
-pub fn matmul_gflops(policy: &Policy, samples: usize, repeats: usize) -> Result<Vec<f64>> {
-    let constant = |value: f32, shape: (usize, usize)| Tensor::full(value, shape, &Device::Cpu)?.contiguous();
-    let mut operands = Vec::new();
-    for (outputs, inputs, inner) in products(policy) {
-        let weight = constant(0.01, (outputs, inputs))?;
-        operands.push((weight, constant(0.5, (samples, inputs))?, constant(0.1, (samples, outputs))?, inner));
-    }
-    let mut rates = Vec::new();
-    for _ in 0..repeats {
+/// Times the matrix products of one forward and backward pass of `policy` on `samples` samples, on all threads, on numbers that
+/// lie in the caches as far as they fit; for each repeat 10⁹ floating-point operations per second.
+pub fn matmul_gflops(policy: &Policy, samples: usize, repeats: usize) -> Vec<f64> {
+    let blocks = samples.div_ceil(ROWS);
+    let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");
+    let pass = |_: usize| {
+        let (x, dz) = (vec![0.5f32; ROWS * widest], vec![0.1f32; ROWS * widest]);
+        let (mut out, weights) = (vec![0.0; (ROWS * widest).max(widest * widest)], vec![0.01f32; widest * widest]);
         let start = Instant::now();
-        for (weight, x, grad, inner) in &operands {
-            black_box(x.matmul(&weight.t()?)?);
-            black_box(grad.t()?.matmul(x)?);
-            if *inner {
-                black_box(grad.matmul(weight)?);
+        for (o, i, inner) in products(policy) {
+            let weight = Matrix::new(&weights[..o * i], o, i);
+            let (x, dz) = (Matrix::new(&x[..ROWS * i], ROWS, i), Matrix::new(&dz[..ROWS * o], ROWS, o));
+            product(&mut out[..ROWS * o], x, weight.transposed(), false);
+            product(&mut out[..o * i], dz.transposed(), x, true);
+            if inner {
+                product(&mut out[..ROWS * i], dz, weight, false);
             }
         }
-        rates.push(1e-9 * flops_per_sample(policy) * samples as f64 / start.elapsed().as_secs_f64());
-    }
-    Ok(rates)
+        start.elapsed().as_secs_f64()
+    };
+    let threads = rayon::current_num_threads() as f64;
+    (0..repeats)
+        .map(|_| {
+            let seconds: f64 = (0..blocks).into_par_iter().with_max_len(1).map(pass).sum();
+            1e-9 * flops_per_sample(policy) * (blocks * ROWS) as f64 * threads / seconds
+        })
+        .collect()
 }

@@ -4,40 +4,42 @@
 //! In comments: T steps of N environments (the rollout), B = T × N samples, M samples in a minibatch, O and A numbers in an
 //! observation and an action.
 
-mod adam;
+mod acting;
+mod backend;
 mod checkpoint;
-mod elementwise;
+mod fused;
 mod gae;
-mod layer;
-mod loss;
 mod measure;
 mod normalizer;
 mod policy;
+mod reference;
 mod rollout;
 
-use anyhow::{Context, Result, bail, ensure};
-use candle_core::{Device, Tensor};
-use rand::seq::SliceRandom;
-use rand_distr::{Distribution, StandardNormal};
+use std::f64::consts::{E, TAU};
 
+use anyhow::{Context, Result, bail, ensure};
+use rand::seq::SliceRandom;
+use rayon::prelude::*;
+
+pub use acting::Acting;
 pub use checkpoint::{Checkpoint, Progress};
+pub use fused::Workspace;
 pub use gae::gae;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
-pub use policy::{Mlp, Policy};
-pub use rollout::{Rollout, RolloutStep};
+pub use policy::{FrozenPolicy, Policy};
+pub use rollout::{Rollout, RolloutBlock, RolloutStep};
 
 use crate::config::PpoConfig;
 use crate::rng::{self, Rng};
-use adam::Adam;
-use loss::{Losses, Minibatch};
+use backend::{Backend, Losses};
 
 /// The policy and what improves it.
 pub struct Ppo {
     config: PpoConfig,
     seed: u64,
     policy: Policy,
-    adam: Adam,
+    backend: Box<dyn Backend>,
     learning_rate: f64,
 }
 
@@ -75,8 +77,8 @@ impl Ppo {
     /// Only if candle cannot allocate.
     pub fn new(config: &PpoConfig, observation_size: usize, action_size: usize, seed: u64) -> Result<Self> {
         let policy = Policy::new(config, observation_size, action_size, seed)?;
-        let adam = Adam::new(policy.parameters())?;
-        Ok(Self { config: config.clone(), seed, policy, adam, learning_rate: config.learning_rate })
+        let backend = backend::new(config, &policy)?;
+        Ok(Self { config: config.clone(), seed, policy, backend, learning_rate: config.learning_rate })
     }
 
     /// The policy as it is now.
@@ -84,65 +86,28 @@ impl Ppo {
         &self.policy
     }
 
-    /// A rollout of the configured horizon for `envs` environments.
-    pub fn rollout(&self, envs: usize) -> Rollout {
-        Rollout::new(self.config.horizon, envs, self.policy.observation_size(), self.policy.action_size())
+    /// A rollout of the configured horizon for blocks of so many environments.
+    pub fn rollout(&self, block_sizes: &[usize]) -> Rollout {
+        Rollout::new(self.config.horizon, block_sizes, self.policy.observation_size(), self.policy.action_size())
     }
 
-    /// The generator of the action noise of an iteration.
-    pub fn noise(&self, iteration: u64) -> Rng {
-        rng::stream(self.seed, "action noise", iteration)
+    /// What acting for blocks of up to `rows` environments needs, to be used again and again.
+    pub fn workspace(&self, rows: usize) -> Workspace {
+        self.policy.workspace(rows, false)
     }
 
-    /// Draws actions for the observations of a step; writes actions, means, log-probabilities and values.
+    /// The policy of this iteration, to collect a rollout with.
     ///
     /// # Errors
     /// Only if candle cannot allocate.
-    pub fn act(&self, step: &mut RolloutStep, noise: &mut Rng) -> Result<()> {
-        let observations = self.policy.normalized(step.observations)?;
-        let [actor, critic] = self.policy.frozen_nets();
-        policy::copy_out(&actor.forward(&observations)?, step.means)?;
-        policy::copy_out(&critic.forward(&observations)?, step.values)?;
-        let std = self.policy.std()?;
-        let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
-        let rows = step.actions.chunks_exact_mut(std.len()).zip(step.means.chunks_exact(std.len()));
-        for ((actions, means), log_prob) in rows.zip(step.log_probs.iter_mut()) {
-            let mut squares = 0.0;
-            for ((action, mean), std) in actions.iter_mut().zip(means).zip(&std) {
-                let drawn: f32 = StandardNormal.sample(noise);
-                *action = mean + std * drawn;
-                squares += ((*action - mean) / std).powi(2);
-            }
-            *log_prob = -0.5 * squares - constant;
-        }
-        Ok(())
+    pub fn acting(&self) -> Result<Acting<'_>> {
+        let (gamma, reward_scale) = (self.config.gamma as f32, self.config.reward_scale as f32);
+        Ok(Acting { policy: self.policy.freeze()?, gamma, reward_scale })
     }
 
-    /// Scales the rewards of a step and, for each truncated environment, adds the discounted value of its final observation,
-    /// so that the advantages need one array of ends only. `truncated` `[N]`, `final_observations` `[N, O]`.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn settle(
-        &self,
-        rewards: &mut [f32],
-        truncated: impl Iterator<Item = bool>,
-        final_observations: &[f32],
-    ) -> Result<()> {
-        rewards.iter_mut().for_each(|reward| *reward *= self.config.reward_scale as f32);
-        let rows: Vec<usize> = truncated.enumerate().filter_map(|(row, cut)| cut.then_some(row)).collect();
-        if rows.is_empty() {
-            return Ok(());
-        }
-        let size = self.policy.observation_size();
-        let observations: Vec<f32> =
-            rows.iter().flat_map(|row| &final_observations[row * size..(row + 1) * size]).copied().collect();
-        let mut values = vec![0.0; rows.len()];
-        self.policy.values(&observations, &mut values)?;
-        for (row, value) in rows.into_iter().zip(values) {
-            rewards[row] += self.config.gamma as f32 * value;
-        }
-        Ok(())
+    /// The generator of the action noise of a block of environments in an iteration.
+    pub fn noise(&self, iteration: u64, block: usize) -> Rng {
+        rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
     }
 
     /// Learns from a rollout that this policy has collected, then takes its observations into the normaliser, which stays
@@ -151,21 +116,22 @@ impl Ppo {
     /// # Errors
     /// A loss, gradient or weight that is not finite; the policy must not be used or saved then.
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
-        let (last_observations, last_values) = rollout.after_last();
-        self.policy.values(last_observations, last_values)?;
-        let (batch, explained_variance) = self.batch(rollout)?;
-        let old_std = self.policy.log_std().as_detached_tensor().exp()?;
+        let explained_variance = self.prepare(rollout);
+        self.backend.begin(&self.policy, rollout)?;
         let size = rollout.samples() / self.config.minibatches;
         let mut shuffle = rng::stream(self.seed, "shuffle", iteration);
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
         let mut stats = UpdateStats::default();
         for epoch in 0..self.config.epochs {
             order.shuffle(&mut shuffle);
-            for (part, indices) in order.chunks_exact(size).enumerate() {
-                let minibatch = batch.select(indices)?;
-                let first = (epoch, part) == (0, 0);
-                self.minibatch_step(&minibatch, &old_std, first, &mut stats)
+            for (part, samples) in order.chunks_exact(size).enumerate() {
+                let losses = self
+                    .minibatch_step(rollout, samples)
                     .with_context(|| format!("iteration {iteration}, epoch {epoch}, minibatch {part}"))?;
+                if (epoch, part) == (0, 0) {
+                    (stats.first_kl, stats.first_ratio_error) = (losses.kl, losses.ratio_error);
+                }
+                stats.add(&losses);
             }
         }
         self.check_weights().with_context(|| format!("iteration {iteration}"))?;
@@ -173,63 +139,42 @@ impl Ppo {
         let std = self.policy.std()?;
         stats.std = std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64;
         (stats.explained_variance, stats.learning_rate) = (explained_variance, self.learning_rate);
-        let collected = rollout.samples() * self.policy.observation_size();
-        self.policy.normalizer.update(&rollout.observations[..collected]);
+        let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
+        self.policy.normalizer.update(&seen);
         Ok(stats)
     }
 
-    /// The whole rollout as tensors, with normalised observations and advantages, and the explained variance.
-    fn batch(&self, rollout: &Rollout) -> Result<(Minibatch, f64)> {
-        let samples = rollout.samples();
-        let (mut advantages, mut returns) = (vec![0.0; samples], vec![0.0; samples]);
+    /// Sets the returns and the advantages, which get mean 0 and standard deviation 1; returns the explained variance.
+    fn prepare(&self, rollout: &mut Rollout) -> f64 {
         let factors = [self.config.gamma as f32, self.config.lambda as f32];
-        gae(factors, &rollout.rewards, &rollout.values, &rollout.dones, &mut advantages, &mut returns);
-        let (_, residual) = mean_and_variance(&advantages);
-        let (_, spread) = mean_and_variance(&returns);
-        standardize(&mut advantages);
-
-        let rows = |values: &[f32], width: usize| Tensor::from_slice(values, (samples, width), &Device::Cpu);
-        let column = |values: &[f32]| Tensor::from_slice(values, samples, &Device::Cpu);
-        let actions = self.policy.action_size();
-        let batch = Minibatch {
-            observations: self.policy.normalized(&rollout.observations[..samples * self.policy.observation_size()])?,
-            actions: rows(&rollout.actions, actions)?,
-            old_means: rows(&rollout.means, actions)?,
-            old_log_probs: column(&rollout.log_probs)?,
-            old_values: column(&rollout.values[..samples])?,
-            advantages: column(&advantages)?,
-            returns: column(&returns)?,
-        };
-        Ok((batch, if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }))
+        rollout.blocks.par_iter_mut().for_each(|block| {
+            gae(factors, &block.rewards, &block.values, &block.dones, &mut block.advantages, &mut block.returns);
+        });
+        let all = |of: fn(&RolloutBlock) -> &[f32]| rollout.blocks.iter().flat_map(of);
+        let (_, spread) = mean_and_variance(all(|block| &block.returns));
+        let (mean, residual) = mean_and_variance(all(|block| &block.advantages));
+        let scale = 1.0 / (residual.sqrt() + 1e-8);
+        for x in rollout.blocks.iter_mut().flat_map(|block| &mut block.advantages) {
+            *x = ((f64::from(*x) - mean) * scale) as f32;
+        }
+        if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
     }
 
-    /// One gradient step; adds its figures to `stats`.
-    fn minibatch_step(
-        &mut self,
-        batch: &Minibatch,
-        old_std: &Tensor,
-        first: bool,
-        stats: &mut UpdateStats,
-    ) -> Result<()> {
-        let [actor, critic] = self.policy.nets();
-        let means = actor.forward(&batch.observations)?;
-        let values = critic.forward(&batch.observations)?.squeeze(1)?;
-        let log_std = self.policy.log_std().as_tensor();
-        let losses = loss::losses(&self.config, batch, [&means, &values], [log_std, old_std])?;
-        let [total, kl] = [scalar(&losses.total)?, scalar(&losses.kl)?];
+    /// One gradient step on these samples.
+    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32]) -> Result<Losses> {
+        let losses = self.backend.gradient(&self.policy, rollout, samples)?;
+        let Losses { total, grad_norm, .. } = losses;
         if !total.is_finite() {
             bail!("the loss is {total}: the training has failed and stops here");
         }
-        let grads = losses.total.backward()?;
-        let norm = adam::global_norm(self.policy.parameters(), &grads)?;
-        if !norm.is_finite() {
-            bail!("the norm of the gradient is {norm}: the training has failed and stops here");
+        if !grad_norm.is_finite() {
+            bail!("the norm of the gradient is {grad_norm}: the training has failed and stops here");
         }
-        self.adapt_learning_rate(kl);
+        self.adapt_learning_rate(losses.kl);
         // As in PyTorch's clip_grad_norm_, with its constant against a division by zero.
-        let scale = (self.config.max_grad_norm / (norm + 1e-6)).min(1.0);
-        self.adam.step(self.policy.parameters(), &grads, self.learning_rate, scale)?;
-        stats.add(&self.config, &losses, kl, norm, first)
+        let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
+        self.backend.step(&self.policy, self.learning_rate, scale)?;
+        Ok(losses)
     }
 
     fn check_weights(&self) -> Result<()> {
@@ -256,20 +201,13 @@ impl Ppo {
 }
 
 impl UpdateStats {
-    fn add(&mut self, config: &PpoConfig, losses: &Losses, kl: f64, grad_norm: f64, first: bool) -> Result<()> {
-        let ratios = losses.ratios.to_vec1::<f32>()?;
-        let error = |ratio: &f32| f64::from((ratio - 1.0).abs());
-        if first {
-            (self.first_kl, self.first_ratio_error) = (kl, ratios.iter().map(error).fold(0.0, f64::max));
-        }
-        let clipped = ratios.iter().filter(|ratio| error(ratio) > config.clip).count();
-        self.policy_loss += scalar(&losses.policy)?;
-        self.value_loss += scalar(&losses.value)?;
-        self.entropy += scalar(&losses.entropy)?;
-        self.kl += kl;
-        self.clip_fraction += clipped as f64 / ratios.len() as f64;
-        self.grad_norm += grad_norm;
-        Ok(())
+    fn add(&mut self, losses: &Losses) {
+        self.policy_loss += losses.policy;
+        self.value_loss += losses.value;
+        self.entropy += losses.entropy;
+        self.kl += losses.kl;
+        self.clip_fraction += losses.clip_fraction;
+        self.grad_norm += losses.grad_norm;
     }
 
     fn average(&mut self, count: f64) {
@@ -286,38 +224,15 @@ impl UpdateStats {
     }
 }
 
-impl Minibatch {
-    /// The samples with these indices.
-    fn select(&self, indices: &[u32]) -> Result<Self> {
-        let indices = Tensor::from_slice(indices, indices.len(), &Device::Cpu)?;
-        let pick = |tensor: &Tensor| tensor.index_select(&indices, 0);
-        Ok(Self {
-            observations: pick(&self.observations)?,
-            actions: pick(&self.actions)?,
-            old_means: pick(&self.old_means)?,
-            old_log_probs: pick(&self.old_log_probs)?,
-            old_values: pick(&self.old_values)?,
-            advantages: pick(&self.advantages)?,
-            returns: pick(&self.returns)?,
-        })
-    }
+fn mean_and_variance<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> (f64, f64) {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().map(|&x| f64::from(x)).sum::<f64>() / count;
+    (mean, values.map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / count)
 }
 
-fn scalar(tensor: &Tensor) -> Result<f64> {
-    Ok(f64::from(tensor.to_scalar::<f32>()?))
-}
-
-fn mean_and_variance(values: &[f32]) -> (f64, f64) {
-    let count = values.len() as f64;
-    let mean = values.iter().copied().map(f64::from).sum::<f64>() / count;
-    (mean, values.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / count)
-}
-
-/// Gives the values mean 0 and standard deviation 1.
-fn standardize(values: &mut [f32]) {
-    let (mean, variance) = mean_and_variance(values);
-    let scale = 1.0 / (variance.sqrt() + 1e-8);
-    values.iter_mut().for_each(|x| *x = ((f64::from(*x) - mean) * scale) as f32);
+/// The entropy, nats, of a Gaussian with these logarithms of its standard deviations.
+fn entropy(log_std: &[f32]) -> f64 {
+    log_std.iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum()
 }
 
 #[cfg(test)]

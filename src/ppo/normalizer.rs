@@ -1,5 +1,6 @@
 //! Running mean and variance of the observations, saved with the policy that has learnt on them.
 
+use pulp::Arch;
 use rayon::prelude::*;
 
 /// Added to the variance, so that a constant input does not divide by zero.
@@ -28,26 +29,21 @@ impl Normalizer {
         Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
     }
 
-    /// Writes the normalised rows of `raw` `[B, O]` into `out` `[B, O]`.
-    pub fn apply(&self, raw: &[f32], out: &mut [f32]) {
-        let size = self.mean.len();
-        let mean: Vec<f32> = self.mean.iter().map(|&m| m as f32).collect();
-        let scale: Vec<f32> = self.variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect();
-        let rows = raw.par_chunks_exact(size).zip_eq(out.par_chunks_exact_mut(size)).with_min_len(64);
-        rows.for_each(|(raw, out)| {
-            for (((out, raw), mean), scale) in out.iter_mut().zip(raw).zip(&mean).zip(&scale) {
-                *out = ((raw - mean) * scale).clamp(-CLIP, CLIP);
-            }
-        });
+    /// What it does to an observation, in floats.
+    pub fn scaling(&self) -> Scaling {
+        Scaling {
+            mean: self.mean.iter().map(|&m| m as f32).collect(),
+            factor: self.variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect(),
+        }
     }
 
-    /// Takes the rows of `raw` `[B, O]` into the statistics.
+    /// Takes the rows of these arrays `[B, O]` into the statistics.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances"
     /// (1979), eq. 2.1.
-    pub fn update(&mut self, raw: &[f32]) {
+    pub fn update(&mut self, raw: &[&[f32]]) {
         let size = self.mean.len();
-        let rows = (raw.len() / size) as f64;
+        let rows = raw.iter().map(|part| part.len() / size).sum::<usize>() as f64;
         let mean = column_means(raw, size, |x, _| x);
         let variance = column_means(raw, size, |x, column| (x - mean[column]).powi(2));
         let total = self.count + rows;
@@ -62,9 +58,10 @@ impl Normalizer {
 }
 
 /// The mean of `f(value, column)` over the rows, for each column.
-fn column_means(raw: &[f32], size: usize, f: impl Fn(f64, usize) -> f64 + Sync) -> Vec<f64> {
-    let partial: Vec<Vec<f64>> = raw
-        .par_chunks(ROWS_PER_TASK * size)
+fn column_means(raw: &[&[f32]], size: usize, f: impl Fn(f64, usize) -> f64 + Sync) -> Vec<f64> {
+    let tasks: Vec<&[f32]> = raw.iter().flat_map(|part| part.chunks(ROWS_PER_TASK * size)).collect();
+    let partial: Vec<Vec<f64>> = tasks
+        .into_par_iter()
         .map(|rows| {
             let mut sums = vec![0.0; size];
             for row in rows.chunks_exact(size) {
@@ -75,8 +72,39 @@ fn column_means(raw: &[f32], size: usize, f: impl Fn(f64, usize) -> f64 + Sync) 
             sums
         })
         .collect();
-    let rows = (raw.len() / size) as f64;
+    let rows = raw.iter().map(|part| part.len() / size).sum::<usize>() as f64;
     (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum::<f64>() / rows).collect()
+}
+
+/// `(x - mean) · factor`, clipped.
+#[derive(Clone, Debug)]
+pub struct Scaling {
+    /// `[O]`
+    mean: Vec<f32>,
+    /// `[O]`
+    factor: Vec<f32>,
+}
+
+impl Scaling {
+    /// Numbers in an observation.
+    pub fn size(&self) -> usize {
+        self.mean.len()
+    }
+
+    /// Writes the normalised rows of `raw` `[B, O]` into `out` `[B, O]`.
+    pub fn apply(&self, raw: &[f32], out: &mut [f32]) {
+        assert_eq!(raw.len(), out.len());
+        Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for (raw, out) in raw.chunks_exact(self.size()).zip(out.chunks_exact_mut(self.size())) {
+                    for (((out, raw), mean), factor) in out.iter_mut().zip(raw).zip(&self.mean).zip(&self.factor) {
+                        *out = ((raw - mean) * factor).clamp(-CLIP, CLIP);
+                    }
+                }
+            },
+        );
+    }
 }
 
 #[cfg(test)]
@@ -92,7 +120,7 @@ mod tests {
             .flat_map(|_| [rng::uniform(&mut rng, -1.0, 3.0) as f32, rng::uniform(&mut rng, 4000.0, 4001.0) as f32])
             .collect();
         let mut normalizer = Normalizer::new(2);
-        for batch in [&rows[..14], &rows[14..3000], &rows[3000..]] {
+        for batch in [&[&rows[..14]][..], &[&rows[14..3000], &rows[3000..3004]], &[&rows[3004..]]] {
             normalizer.update(batch);
         }
         for column in 0..2 {
@@ -109,7 +137,7 @@ mod tests {
     fn normalised_values_are_in_standard_deviations_and_clipped() {
         let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
         let mut out = [0.0; 3];
-        normalizer.apply(&[4.0, 2.0, 400.0], &mut out);
+        normalizer.scaling().apply(&[4.0, 2.0, 400.0], &mut out);
         assert!((out[0] - 1.0).abs() < 1e-5, "{out:?}");
         assert_eq!(out[1..], [0.0, CLIP]);
     }

@@ -1,13 +1,14 @@
 //! What acts: two MLPs, actor and critic, a standard deviation that does not depend on the state, and the normaliser.
 
 use anyhow::Result;
-use candle_core::{DType, Device, Module, Tensor, Var};
-use candle_nn::Linear;
+use candle_core::{Device, Tensor, Var};
 use rand::RngExt;
 
 use super::Normalizer;
-use super::layer::FusedLinear;
-use crate::config::{Activation, Layers, PpoConfig};
+use super::fused::{Net, Workspace};
+use super::normalizer::Scaling;
+use super::reference::Mlp;
+use crate::config::{Activation, Backend, PpoConfig};
 use crate::rng::{self, Rng};
 
 /// The last layer of the actor starts this much smaller, so that the first actions are near the middle of their range.
@@ -18,53 +19,26 @@ pub struct Policy {
     parameters: Vec<(String, Var)>,
     /// Reads raw observations.
     pub normalizer: Normalizer,
-    depth: usize,
+    hidden: Vec<usize>,
     activation: Activation,
-    kind: Layers,
+    backend: Backend,
     sizes: [usize; 2],
 }
 
-/// One network on the present parameters.
-pub struct Mlp {
-    /// Weight and bias of each layer.
-    layers: Vec<[Tensor; 2]>,
-    activation: Activation,
-    kind: Layers,
+/// A policy to act with, as it is at one moment: no graph, and nothing is allocated with our own kernels. While it lives,
+/// the parameters cannot be written to.
+pub struct FrozenPolicy<'a> {
+    policy: &'a Policy,
+    nets: Nets<'a>,
+    scaling: Scaling,
+    /// `[A]`
+    std: Vec<f32>,
 }
 
-impl Mlp {
-    /// `[B, I]` → `[B, outputs]`, with the activation after every layer but the last.
-    ///
-    /// # Errors
-    /// Inputs of another width than the first layer's.
-    pub fn forward(&self, inputs: &Tensor) -> candle_core::Result<Tensor> {
-        let mut x = inputs.clone();
-        for (i, [weight, bias]) in self.layers.iter().enumerate() {
-            let activation = (i + 1 < self.layers.len()).then_some(self.activation);
-            x = match self.kind {
-                Layers::Fused => FusedLinear { activation }.forward(&x, weight, bias)?,
-                Layers::Candle => candle_layer(&x, weight, bias, activation)?,
-            };
-        }
-        Ok(x)
-    }
-}
-
-/// The same as [`FusedLinear`], of candle's own parts.
-fn candle_layer(
-    x: &Tensor,
-    weight: &Tensor,
-    bias: &Tensor,
-    activation: Option<Activation>,
-) -> candle_core::Result<Tensor> {
-    let z = Linear::new(weight.clone(), Some(bias.clone())).forward(x)?;
-    match activation {
-        None => Ok(z),
-        Some(Activation::Elu) => z.elu(1.0),
-        Some(Activation::Relu) => z.relu(),
-        Some(Activation::Silu) => z.silu(),
-        Some(Activation::Tanh) => z.tanh(),
-    }
+/// Actor and critic.
+enum Nets<'a> {
+    Fused([Net<'a>; 2]),
+    Candle([Mlp; 2]),
 }
 
 impl Policy {
@@ -93,9 +67,9 @@ impl Policy {
         Ok(Self {
             parameters,
             normalizer: Normalizer::new(observation_size),
-            depth: config.hidden.len() + 1,
+            hidden: config.hidden.clone(),
             activation: config.activation,
-            kind: config.layers,
+            backend: config.backend,
             sizes: [observation_size, action_size],
         })
     }
@@ -120,23 +94,39 @@ impl Policy {
         self.sizes[1]
     }
 
-    /// Actor and critic with gradients.
-    pub fn nets(&self) -> [Mlp; 2] {
-        self.build(|var| var.as_tensor().clone())
+    /// The parameters of actor and critic.
+    fn net_parameters(&self) -> [&[(String, Var)]; 2] {
+        let depth = 2 * (self.hidden.len() + 1);
+        [&self.parameters[..depth], &self.parameters[depth..2 * depth]]
     }
 
-    /// Actor and critic without gradients: a forward pass builds no graph. They follow later updates of the parameters.
-    pub fn frozen_nets(&self) -> [Mlp; 2] {
-        self.build(|var| var.as_tensor().detach())
+    /// Actor and critic for our own kernels.
+    pub(super) fn fused_nets(&self) -> [Net<'_>; 2] {
+        self.net_parameters().map(|parameters| Net::new(parameters, self.activation))
     }
 
-    fn build(&self, tensor: impl Fn(&Var) -> Tensor) -> [Mlp; 2] {
-        let pairs: Vec<&[(String, Var)]> = self.parameters.chunks_exact(2).collect();
-        [&pairs[..self.depth], &pairs[self.depth..]].map(|net| Mlp {
-            layers: net.iter().map(|pair| [tensor(&pair[0].1), tensor(&pair[1].1)]).collect(),
-            activation: self.activation,
-            kind: self.kind,
-        })
+    /// Actor and critic for candle.
+    pub(super) fn candle_nets(&self, frozen: bool) -> [Mlp; 2] {
+        self.net_parameters().map(|parameters| Mlp::new(parameters, self.activation, frozen))
+    }
+
+    /// What both nets need for blocks of up to `rows` rows.
+    pub(super) fn workspace(&self, rows: usize, learning: bool) -> Workspace {
+        let [observation, action] = self.sizes;
+        let sizes: Vec<usize> = [observation].iter().chain(&self.hidden).chain([&action]).copied().collect();
+        Workspace::new(&sizes, self.activation, rows, learning)
+    }
+
+    /// The policy of this moment.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn freeze(&self) -> Result<FrozenPolicy<'_>> {
+        let nets = match self.backend {
+            Backend::Fused => Nets::Fused(self.fused_nets()),
+            Backend::Candle => Nets::Candle(self.candle_nets(true)),
+        };
+        Ok(FrozenPolicy { policy: self, nets, scaling: self.normalizer.scaling(), std: self.std()? })
     }
 
     /// The logarithm of the standard deviations, `[A]`.
@@ -151,83 +141,52 @@ impl Policy {
     pub fn std(&self) -> Result<Vec<f32>> {
         Ok(self.log_std().as_detached_tensor().exp()?.to_vec1()?)
     }
-
-    /// Raw observations `[B, O]`, normalised, as a tensor.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn normalized(&self, raw: &[f32]) -> Result<Tensor> {
-        let mut normalized = vec![0.0; raw.len()];
-        self.normalizer.apply(raw, &mut normalized);
-        let [size, _] = self.sizes;
-        Ok(Tensor::from_vec(normalized, (raw.len() / size, size), &Device::Cpu)?)
-    }
-
-    /// Writes the mean actions `[B, A]` for raw observations `[B, O]`.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn means(&self, observations: &[f32], out: &mut [f32]) -> Result<()> {
-        let [actor, _] = self.frozen_nets();
-        copy_out(&actor.forward(&self.normalized(observations)?)?, out)
-    }
-
-    /// Writes the values `[B]` of raw observations `[B, O]`.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn values(&self, observations: &[f32], out: &mut [f32]) -> Result<()> {
-        let [_, critic] = self.frozen_nets();
-        copy_out(&critic.forward(&self.normalized(observations)?)?, out)
-    }
 }
 
-/// Copies a whole tensor into a slice of the same number of elements.
-pub(super) fn copy_out(tensor: &Tensor, out: &mut [f32]) -> Result<()> {
-    out.copy_from_slice(&tensor.flatten_all()?.to_dtype(DType::F32)?.to_vec1::<f32>()?);
-    Ok(())
+impl FrozenPolicy<'_> {
+    /// What [`FrozenPolicy::forward`] needs, to be used again and again; `rows` rows are computed at a time.
+    pub fn workspace(&self, rows: usize) -> Workspace {
+        self.policy.workspace(rows, false)
+    }
+
+    /// The standard deviations of the actions `[A]`.
+    pub fn std(&self) -> &[f32] {
+        &self.std
+    }
+
+    /// Writes the mean actions `[B, A]` and the values `[B]`, each if asked for, of raw observations `[B, O]`.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn forward(
+        &self,
+        observations: &[f32],
+        [mut means, mut values]: [Option<&mut [f32]>; 2],
+        work: &mut Workspace,
+    ) -> Result<()> {
+        let [size, actions] = self.policy.sizes;
+        let mut done = 0;
+        for raw in observations.chunks(work.rows() * size) {
+            let rows = raw.len() / size;
+            self.scaling.apply(raw, &mut work.inputs[..raw.len()]);
+            for (net, (width, out)) in [(actions, &mut means), (1, &mut values)].into_iter().enumerate() {
+                let Some(out) = out.as_deref_mut() else { continue };
+                let out = &mut out[done * width..][..rows * width];
+                match &self.nets {
+                    Nets::Fused(nets) => out.copy_from_slice(nets[net].forward(rows, work)),
+                    Nets::Candle(nets) => {
+                        let inputs = Tensor::from_slice(&work.inputs[..raw.len()], (rows, size), &Device::Cpu)?;
+                        out.copy_from_slice(&nets[net].forward(&inputs)?.flatten_all()?.to_vec1::<f32>()?);
+                    }
+                }
+            }
+            done += rows;
+        }
+        Ok(())
+    }
 }
 
 fn uniform(rng: &mut Rng, bound: f32, shape: &[usize]) -> Result<Var> {
     let values: Vec<f32> = (0..shape.iter().product()).map(|_| bound * (2.0 * rng.random::<f32>() - 1.0)).collect();
     Ok(Var::from_vec(values, shape, &Device::Cpu)?)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::Config;
-
-    /// Largest difference relative to the largest number.
-    fn difference(a: &Tensor, b: &Tensor) -> f32 {
-        let numbers = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        let largest = |t: Tensor| numbers(t).into_iter().fold(0.0f32, |most, x| most.max(x.abs()));
-        largest((a - b).unwrap()) / largest(b.clone())
-    }
-
-    #[test]
-    fn outputs_and_gradients_of_fused_layers_are_those_of_candles_layers() {
-        for activation in [Activation::Elu, Activation::Relu, Activation::Silu, Activation::Tanh] {
-            let mut config = Config::resolve(None, &[]).unwrap().ppo;
-            (config.activation, config.hidden) = (activation, vec![64, 33]);
-            let mut policy = Policy::new(&config, 157, 20, 3).unwrap();
-            let inputs = uniform(&mut rng::stream(0, "test", 0), 3.0, &[300, 157]).unwrap();
-            let [fused, candle] = [Layers::Fused, Layers::Candle].map(|kind| {
-                policy.kind = kind;
-                let [actor, critic] = policy.nets();
-                let outputs = [actor.forward(&inputs).unwrap(), critic.forward(&inputs).unwrap()];
-                let loss = outputs.iter().map(|y| (y - 0.3).unwrap().sqr().unwrap().mean_all().unwrap());
-                let grads = loss.reduce(|a, b| (a + b).unwrap()).unwrap().backward().unwrap();
-                (outputs, grads)
-            });
-            for (a, b) in fused.0.iter().zip(&candle.0) {
-                assert!(difference(a, b) < 1e-5, "{activation:?}: outputs");
-            }
-            let all = policy.parameters().iter().filter(|(name, _)| name != "log_std");
-            for (name, var) in all.map(|(name, var)| (name.as_str(), var)).chain([("inputs", &inputs)]) {
-                let error = difference(fused.1.get(var).unwrap(), candle.1.get(var).unwrap());
-                assert!(error < 1e-4, "{activation:?}: gradient of {name} off by {error}");
-            }
-        }
-    }
 }

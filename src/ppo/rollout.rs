@@ -1,47 +1,95 @@
 //! The steps of one iteration: allocated once, written row by row, read once.
+//!
+//! It lies in memory as the environments are stepped, block by block, so that each block is written by one thread at a time
+//! and needs nothing of the others.
 
-/// T steps of N environments, time-major; O numbers in an observation, A in an action.
+use std::ops::Range;
+
+/// T steps of N environments; O numbers in an observation, A in an action.
 pub struct Rollout {
-    /// `[T + 1, N, O]`, raw
+    /// In the order of the environments.
+    pub blocks: Vec<RolloutBlock>,
+}
+
+/// T steps of the n environments of a block; all arrays are time-major.
+pub struct RolloutBlock {
+    /// `[T + 1, n, O]`, raw
     pub observations: Vec<f32>,
-    /// `[T, N, A]`
+    /// `[T, n, A]`
     pub actions: Vec<f32>,
-    /// `[T, N, A]`, of the distribution that the actions were drawn from
+    /// `[T, n, A]`, of the distribution that the actions were drawn from
     pub means: Vec<f32>,
-    /// `[T, N]`, of the actions
+    /// `[T, n]`, of the actions
     pub log_probs: Vec<f32>,
-    /// `[T + 1, N]`
+    /// `[T + 1, n]`
     pub values: Vec<f32>,
-    /// `[T, N]`, scaled, and bootstrapped where truncated
+    /// `[T, n]`, scaled, and bootstrapped where truncated
     pub rewards: Vec<f32>,
-    /// `[T, N]`
+    /// `[T, n]`
     pub dones: Vec<bool>,
+    /// `[T, n]`, set by the update
+    pub advantages: Vec<f32>,
+    /// `[T, n]`, set by the update
+    pub returns: Vec<f32>,
     sizes: [usize; 4],
 }
 
-/// Row t of a rollout, and the observations that follow it.
+/// Row t of a block, and the observations that follow it.
 pub struct RolloutStep<'a> {
-    /// `[N, O]`
+    /// `[n, O]`
     pub observations: &'a [f32],
-    /// `[N, O]`
+    /// `[n, O]`
     pub next_observations: &'a mut [f32],
-    /// `[N, A]`
+    /// `[n, A]`
     pub actions: &'a mut [f32],
-    /// `[N, A]`
+    /// `[n, A]`
     pub means: &'a mut [f32],
-    /// `[N]`
+    /// `[n]`
     pub log_probs: &'a mut [f32],
-    /// `[N]`
+    /// `[n]`
     pub values: &'a mut [f32],
-    /// `[N]`
+    /// `[n]`
     pub rewards: &'a mut [f32],
-    /// `[N]`
+    /// `[n]`
     pub dones: &'a mut [bool],
 }
 
 impl Rollout {
-    /// An empty rollout of `horizon` steps of `envs` environments.
-    pub fn new(horizon: usize, envs: usize, observation_size: usize, action_size: usize) -> Self {
+    /// An empty rollout of `horizon` steps of blocks of so many environments, all blocks but the last of one size.
+    pub fn new(horizon: usize, block_sizes: &[usize], observation_size: usize, action_size: usize) -> Self {
+        let block = |&envs: &usize| RolloutBlock::new([horizon, envs, observation_size, action_size]);
+        Self { blocks: block_sizes.iter().map(block).collect() }
+    }
+
+    /// The number of steps T.
+    pub fn horizon(&self) -> usize {
+        self.blocks[0].sizes[0]
+    }
+
+    /// Samples in it: T × N.
+    pub fn samples(&self) -> usize {
+        self.blocks.iter().map(RolloutBlock::samples).sum()
+    }
+
+    /// The block that holds a sample, and the sample's row in the block's arrays.
+    pub fn locate(&self, sample: u32) -> (&RolloutBlock, usize) {
+        let in_block = self.blocks[0].samples();
+        (&self.blocks[sample as usize / in_block], sample as usize % in_block)
+    }
+
+    /// Makes the observations after the last step those of the next iteration's first.
+    pub fn carry_over(&mut self) {
+        self.blocks.iter_mut().for_each(RolloutBlock::carry_over);
+    }
+
+    /// The observations `[n, O]` of each block that the first step acts on.
+    pub fn first_observations_mut(&mut self) -> Vec<&mut [f32]> {
+        self.blocks.iter_mut().map(RolloutBlock::first_observations_mut).collect()
+    }
+}
+
+impl RolloutBlock {
+    fn new(sizes @ [horizon, envs, observation_size, action_size]: [usize; 4]) -> Self {
         let steps = horizon * envs;
         Self {
             observations: vec![0.0; (steps + envs) * observation_size],
@@ -51,27 +99,35 @@ impl Rollout {
             values: vec![0.0; steps + envs],
             rewards: vec![0.0; steps],
             dones: vec![false; steps],
-            sizes: [horizon, envs, observation_size, action_size],
+            advantages: vec![0.0; steps],
+            returns: vec![0.0; steps],
+            sizes,
         }
     }
 
-    /// The number of steps T.
-    pub fn horizon(&self) -> usize {
-        self.sizes[0]
-    }
-
-    /// Samples in it: T × N.
+    /// Samples in it: T × n.
     pub fn samples(&self) -> usize {
         self.rewards.len()
     }
 
-    /// The observations `[N, O]` that the first step acts on.
+    /// The observations `[T, n, O]` that were acted on.
+    pub fn acted_on(&self) -> &[f32] {
+        let [_, _, size, _] = self.sizes;
+        &self.observations[..self.samples() * size]
+    }
+
+    /// The row of a sample in an array `[T, n, width]`.
+    pub fn row(width: usize, sample: usize) -> Range<usize> {
+        sample * width..(sample + 1) * width
+    }
+
+    /// The observations `[n, O]` that the first step acts on.
     pub fn first_observations_mut(&mut self) -> &mut [f32] {
         let [_, envs, size, _] = self.sizes;
         &mut self.observations[..envs * size]
     }
 
-    /// The observations `[N, O]` after the last step, and where their values `[N]` go.
+    /// The observations `[n, O]` after the last step, and where their values `[n]` go.
     pub fn after_last(&mut self) -> (&[f32], &mut [f32]) {
         let [horizon, envs, size, _] = self.sizes;
         (&self.observations[horizon * envs * size..], &mut self.values[horizon * envs..])
@@ -93,8 +149,7 @@ impl Rollout {
         }
     }
 
-    /// Makes the observations after the last step those of the next iteration's first.
-    pub fn carry_over(&mut self) {
+    fn carry_over(&mut self) {
         let [horizon, envs, size, _] = self.sizes;
         self.observations.copy_within(horizon * envs * size.., 0);
     }
@@ -106,11 +161,22 @@ mod tests {
 
     #[test]
     fn what_follows_the_last_step_is_what_the_next_iteration_starts_from() {
-        let mut rollout = Rollout::new(2, 3, 4, 1);
-        rollout.step_mut(1).next_observations.fill(7.0);
-        assert!(rollout.first_observations_mut().iter().all(|&x| x == 0.0));
-        rollout.carry_over();
-        assert_eq!(rollout.first_observations_mut(), [7.0; 12]);
-        assert_eq!(rollout.step_mut(0).observations, [7.0; 12]);
+        let mut block = RolloutBlock::new([2, 3, 4, 1]);
+        block.step_mut(1).next_observations.fill(7.0);
+        assert!(block.first_observations_mut().iter().all(|&x| x == 0.0));
+        block.carry_over();
+        assert_eq!(block.first_observations_mut(), [7.0; 12]);
+        assert_eq!(block.step_mut(0).observations, [7.0; 12]);
+    }
+
+    #[test]
+    fn every_sample_is_found_in_its_block() {
+        let rollout = Rollout::new(2, &[8, 8, 3], 4, 1);
+        assert_eq!(rollout.samples(), 38);
+        let found = |sample| {
+            let (block, row) = rollout.locate(sample);
+            (rollout.blocks.iter().position(|other| std::ptr::eq(other, block)).unwrap(), row)
+        };
+        assert_eq!([0, 15, 16, 31, 32, 37].map(found), [(0, 0), (0, 15), (1, 0), (1, 15), (2, 0), (2, 5)]);
     }
 }

@@ -2,10 +2,10 @@
 
 use std::sync::atomic::AtomicBool;
 
+use shadow_repose::collect::{Scratch, collect};
 use shadow_repose::env::{End, Env, EnvPool, Transition};
 use shadow_repose::ppo::Ppo;
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::train::{Scratch, collect};
 
 use crate::support::config;
 
@@ -78,7 +78,7 @@ fn settings() -> shadow_repose::config::PpoConfig {
 fn ppo_learns_to_bring_the_point_home_on_three_seeds() {
     for seed in 0..3 {
         let (mut pool, mut ppo) = (pool(seed), Ppo::new(&settings(), 2, 2, seed).unwrap());
-        let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+        let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
         pool.reset(0, rollout.first_observations_mut());
         let mut distances = Vec::new();
         for iteration in 1..=60 {
@@ -98,7 +98,7 @@ fn ppo_learns_to_bring_the_point_home_on_three_seeds() {
 #[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings(), 2, 2, 3).unwrap());
-    let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
     pool.reset(0, rollout.first_observations_mut());
     for iteration in 1..=5 {
         collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
@@ -113,13 +113,13 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
 #[test]
 fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
     let (mut pool, mut ppo) = (pool(0), Ppo::new(&settings(), 2, 2, 0).unwrap());
-    let (mut rollout, mut scratch) = (ppo.rollout(pool.len()), Scratch::new(&pool));
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
     pool.reset(0, rollout.first_observations_mut());
     collect(&mut pool, &ppo, &mut rollout, 17, &mut scratch, &AtomicBool::new(false)).unwrap();
-    rollout.rewards[5] = f32::NAN;
+    rollout.blocks[2].rewards[5] = f32::NAN;
     let answer = |ppo: &Ppo| {
-        let mut means = [0.0; 2];
-        ppo.policy().means(&[0.3, -0.4], &mut means).unwrap();
+        let (policy, mut means) = (ppo.policy().freeze().unwrap(), [0.0; 2]);
+        policy.forward(&[0.3, -0.4], [Some(&mut means), None], &mut policy.workspace(1)).unwrap();
         means
     };
     let before = answer(&ppo);
@@ -131,28 +131,40 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
 #[test]
 fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
     let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
-    let mut rollout = ppo.rollout(pool.len());
-    let mut scratch = Scratch::new(&pool);
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
     pool.reset(0, rollout.first_observations_mut());
     // One point starts so far out that it is lost at once.
-    rollout.first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
+    rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
     pool.envs_mut().next().unwrap().position = [5.0, 5.0];
     collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(false)).unwrap();
+    let policy = ppo.policy().freeze().unwrap();
+    let mut work = policy.workspace(1);
     let (mut truncated, mut terminated) = (0, 0);
-    for i in 0..rollout.samples() {
-        let moved = [0, 1]
-            .map(|axis| rollout.observations[2 * i + axis] + 0.2 * rollout.actions[2 * i + axis].clamp(-1.0, 1.0));
+    for (block, i) in rollout.blocks.iter().flat_map(|block| (0..block.samples()).map(move |i| (block, i))) {
+        let moved =
+            [0, 1].map(|axis| block.observations[2 * i + axis] + 0.2 * block.actions[2 * i + axis].clamp(-1.0, 1.0));
         let distance = moved[0].hypot(moved[1]);
         let mut expected = -0.2 * distance;
-        if rollout.dones[i] && distance <= 3.0 {
+        if block.dones[i] && distance <= 3.0 {
             let mut value = [0.0];
-            ppo.policy().values(&moved, &mut value).unwrap();
+            policy.forward(&moved, [None, Some(&mut value)], &mut work).unwrap();
             expected += 0.9 * value[0];
             truncated += 1;
-        } else if rollout.dones[i] {
+        } else if block.dones[i] {
             terminated += 1;
         }
-        assert!((rollout.rewards[i] - expected).abs() < 1e-5, "sample {i}: {} not {expected}", rollout.rewards[i]);
+        assert!((block.rewards[i] - expected).abs() < 1e-5, "sample {i}: {} not {expected}", block.rewards[i]);
     }
     assert!(truncated > 30 && terminated == 1, "{truncated} truncated, {terminated} terminated");
+}
+
+#[test]
+fn an_interrupted_collection_says_so() {
+    let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+    pool.reset(0, rollout.first_observations_mut());
+    let mut collected =
+        |interrupted| collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(interrupted)).unwrap();
+    assert!(!collected(true));
+    assert!(collected(false));
 }

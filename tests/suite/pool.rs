@@ -1,68 +1,112 @@
 //! Many environments at once.
 
 use rand::RngExt;
-use shadow_repose::env::{ACTION_SIZE, End, EnvPool, OBSERVATION_SIZE, Repose, StepBuffers};
+use shadow_repose::env::{ACTION_SIZE, End, EnvBlock, EnvPool, OBSERVATION_SIZE, Repose, StepBuffers};
 use shadow_repose::rng;
+use shadow_repose::schedule::in_rounds;
 
 use crate::support::task;
 
 struct Played {
+    /// After each step, of all environments.
     observations: Vec<f32>,
     rewards: Vec<f32>,
     lengths: Vec<u32>,
 }
 
-/// Steps a new pool with random actions on `threads` threads.
-fn play(threads: usize, envs: usize, steps: usize, settings: &[&str]) -> Played {
-    let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    let task = task(settings);
-    threads.install(|| {
-        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect());
-        let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
-        let mut final_observations = observations.clone();
-        let mut played = Played { observations: Vec::new(), rewards: Vec::new(), lengths: Vec::new() };
-        pool.reset(0, &mut observations);
-        let mut noise = rng::stream(0, "test", 0);
-        let (mut rewards, mut ends) = (vec![0.0; envs], vec![None; envs]);
-        let mut truncated = 0;
-        for _ in 0..steps {
-            let actions: Vec<f32> = (0..envs * ACTION_SIZE).map(|_| 3.0 * noise.random::<f32>() - 1.5).collect();
-            let buffers = StepBuffers {
-                rewards: &mut rewards,
-                ends: &mut ends,
-                observations: &mut observations,
-                final_observations: &mut final_observations,
-            };
-            pool.step(&actions, buffers);
-            played.observations.extend(&observations);
-            played.rewards.extend(&rewards);
-            for (i, end) in ends.iter().enumerate() {
-                let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
-                let previous_action = &observations[rows.clone()][137..];
-                // A new episode has begun where one ended: it has no previous action, its predecessor's end has.
-                assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
-                if *end == Some(End::Truncated) {
-                    // The final observation is that of this environment: it shows the action that was its last.
-                    let last: Vec<f32> =
-                        actions[i * ACTION_SIZE..][..ACTION_SIZE].iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-                    assert_eq!(final_observations[rows][137..], last);
-                    truncated += 1;
-                }
+/// A block of environments and all that it reads and writes.
+struct Block<'a> {
+    envs: &'a mut EnvBlock<Repose>,
+    first: usize,
+    observations: Vec<f32>,
+    final_observations: Vec<f32>,
+    rewards: Vec<f32>,
+    ends: Vec<Option<End>>,
+    seen: Vec<(Vec<f32>, Vec<f32>)>,
+    truncated: usize,
+}
+
+impl Block<'_> {
+    /// Steps with these actions of all environments.
+    fn step(&mut self, actions: &[f32]) {
+        let actions = &actions[self.first * ACTION_SIZE..][..self.envs.len() * ACTION_SIZE];
+        let buffers = StepBuffers {
+            rewards: &mut self.rewards,
+            ends: &mut self.ends,
+            observations: &mut self.observations,
+            final_observations: &mut self.final_observations,
+        };
+        self.envs.step(actions, buffers);
+        self.seen.push((self.observations.clone(), self.rewards.clone()));
+        for (i, end) in self.ends.iter().enumerate() {
+            let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
+            let previous_action = &self.observations[rows.clone()][137..];
+            // A new episode has begun where one ended: it has no previous action, its predecessor's end has.
+            assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
+            if *end == Some(End::Truncated) {
+                // The final observation is that of this environment: it shows the action that was its last.
+                let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
+                let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
+                assert_eq!(self.final_observations[rows][137..], last);
+                self.truncated += 1;
             }
         }
+    }
+}
+
+/// Steps a new pool with these actions on `threads` threads.
+fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: impl Fn(usize, usize) -> f32) -> Played {
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let task = task(settings);
+    let actions: Vec<Vec<f32>> =
+        (0..steps).map(|step| (0..envs * ACTION_SIZE).map(|i| action(step, i)).collect()).collect();
+    threads.install(|| {
+        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect());
+        let sizes = pool.block_sizes();
+        let mut observations: Vec<Vec<f32>> = sizes.iter().map(|n| vec![0.0; n * OBSERVATION_SIZE]).collect();
+        pool.reset(0, observations.iter_mut().map(|rows| &mut rows[..]).collect());
+        let mut first = 0;
+        let blocks = pool.blocks_mut().iter_mut().zip(observations).map(|(envs, observations)| {
+            let n = envs.len();
+            first += n;
+            Block {
+                envs,
+                first: first - n,
+                final_observations: observations.clone(),
+                observations,
+                rewards: vec![0.0; n],
+                ends: vec![None; n],
+                seen: Vec::new(),
+                truncated: 0,
+            }
+        });
+        let blocks: Vec<Block> = blocks.collect();
+        let blocks = in_rounds(blocks, steps, |block, step| block.step(&actions[step]));
+        let truncated: usize = blocks.iter().map(|block| block.truncated).sum();
         assert!(truncated > 0 || steps < 30, "no episode was truncated");
-        played.lengths = pool.take_finished().iter().map(|episode| episode.length).collect();
-        played
+        let seen = |step: usize| blocks.iter().map(move |block| &block.seen[step]);
+        let observations = (0..steps).flat_map(seen).flat_map(|(observations, _)| observations).copied().collect();
+        let rewards = (0..steps).flat_map(seen).flat_map(|(_, rewards)| rewards).copied().collect();
+        drop(blocks);
+        let lengths = pool.take_finished().iter().map(|episode| episode.length).collect();
+        Played { observations, rewards, lengths }
     })
+}
+
+/// Random actions, always the same.
+fn noise() -> impl Fn(usize, usize) -> f32 {
+    let mut noise = rng::stream(0, "test", 0);
+    let numbers: Vec<f32> = (0..10_007).map(|_| 3.0 * noise.random::<f32>() - 1.5).collect();
+    move |step, i| numbers[(step * 1311 + i) % numbers.len()]
 }
 
 #[test]
 fn results_are_the_same_bits_for_any_number_of_threads() {
     let settings = ["env.max_episode_seconds=0.3"];
-    let one = play(1, 48, 60, &settings);
+    let one = play(1, 48, 60, &settings, noise());
     assert!(one.lengths.len() > 48, "episodes must end and begin during the test: {}", one.lengths.len());
     for threads in [2, 8] {
-        let more = play(threads, 48, 60, &settings);
+        let more = play(threads, 48, 60, &settings, noise());
         assert!(one.observations == more.observations && one.rewards == more.rewards, "{threads} threads differ");
         assert_eq!(one.lengths, more.lengths);
     }
@@ -70,7 +114,7 @@ fn results_are_the_same_bits_for_any_number_of_threads() {
 
 #[test]
 fn the_first_episodes_start_at_random_ages() {
-    let played = play(2, 64, 30, &["env.max_episode_seconds=0.3", "env.fall_dist=10"]);
+    let played = play(2, 64, 30, &["env.max_episode_seconds=0.3", "env.fall_dist=10"], noise());
     let mut lengths = played.lengths[..64].to_vec();
     lengths.sort_unstable();
     lengths.dedup();
@@ -79,24 +123,12 @@ fn the_first_episodes_start_at_random_ages() {
 
 #[test]
 fn an_environment_does_the_same_alone_as_among_others() {
-    let task = task(&["env.fall_dist=10"]);
+    let action = |step: usize, i: usize| if i < ACTION_SIZE { 0.01 * (step + 1) as f32 } else { 1.0 };
     let first_row = |envs: usize| {
-        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect());
-        let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
-        pool.reset(0, &mut observations);
-        let (mut rewards, mut ends) = (vec![0.0; envs], vec![None; envs]);
-        for step in 0..20 {
-            let actions: Vec<f32> =
-                (0..envs * ACTION_SIZE).map(|i| if i < ACTION_SIZE { 0.01 * step as f32 } else { 1.0 }).collect();
-            let buffers = StepBuffers {
-                rewards: &mut rewards,
-                ends: &mut ends,
-                observations: &mut observations,
-                final_observations: &mut vec![0.0; envs * OBSERVATION_SIZE],
-            };
-            pool.step(&actions, buffers);
-        }
-        (observations[..OBSERVATION_SIZE].to_vec(), rewards[0])
+        let played = play(2, envs, 20, &["env.fall_dist=10"], action);
+        let last = played.observations.len() - envs * OBSERVATION_SIZE;
+        (played.observations[last..][..OBSERVATION_SIZE].to_vec(), played.rewards[19 * envs])
     };
     assert_eq!(first_row(1), first_row(3));
+    assert_eq!(first_row(1), first_row(20));
 }

@@ -1,15 +1,11 @@
-//! The loops over activations: threaded, in the widest vectors the processor has, and the same for any number of threads.
+//! The activations and their slopes, on the calling thread, in the widest vectors the processor has.
 //!
-//! candle runs these functions one element at a time on one thread, in several passes, which costs more than the matrix
-//! products between them.
+//! candle runs these functions one element at a time, in several passes, which costs more than the matrix products between
+//! them.
 
 use pulp::Arch;
-use rayon::prelude::*;
 
 use crate::config::Activation;
-
-/// Rows that one task takes; fixed, so that sums over rows do not depend on the number of threads.
-const ROWS_PER_TASK: usize = 128;
 
 /// e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); e^x beyond 88 is cut off there.
 ///
@@ -66,55 +62,73 @@ pub fn slope_from_output(activation: Activation) -> bool {
     activation != Activation::Silu
 }
 
-/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, in place.
-pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
-    x.par_chunks_mut(ROWS_PER_TASK * bias.len()).for_each(|rows| {
-        for row in rows.chunks_exact_mut(bias.len()) {
-            match activation {
-                None => each(row, bias, |x, b| x + b),
-                Some(Activation::Elu) => each(row, bias, |x, b| elu(x + b)),
-                Some(Activation::Relu) => each(row, bias, |x, b| relu(x + b)),
-                Some(Activation::Silu) => each(row, bias, |x, b| silu(x + b)),
-                Some(Activation::Tanh) => each(row, bias, |x, b| tanh(x + b)),
-            }
-        }
-    });
+/// Adds `bias` `[C]` to each row of `x` `[B, C]`.
+pub fn add_bias(x: &mut [f32], bias: &[f32]) {
+    each_row(x, bias, |x, b| x + b);
 }
 
-/// Multiplies `grad` `[B, C]` by the slope of the activation, in place, and returns the sums over the rows `[C]`.
+/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, in place.
+pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
+    match activation {
+        Activation::Elu => each_row(x, bias, |x, b| elu(x + b)),
+        Activation::Relu => each_row(x, bias, |x, b| relu(x + b)),
+        Activation::Silu => each_row(x, bias, |x, b| silu(x + b)),
+        Activation::Tanh => each_row(x, bias, |x, b| tanh(x + b)),
+    }
+}
+
+/// Writes the activations of the numbers `z`.
+pub fn activate(out: &mut [f32], z: &[f32], activation: Activation) {
+    match activation {
+        Activation::Elu => each(out, z, |_, z| elu(z)),
+        Activation::Relu => each(out, z, |_, z| relu(z)),
+        Activation::Silu => each(out, z, |_, z| silu(z)),
+        Activation::Tanh => each(out, z, |_, z| tanh(z)),
+    }
+}
+
+/// Multiplies `grad` by the slopes of the activation, in place.
 ///
-/// `known` `[B, C]` is the output of the activation, or its input where [`slope_from_output`] is false.
-pub fn backward_activate(grad: &mut [f32], known: &[f32], columns: usize, activation: Option<Activation>) -> Vec<f32> {
-    let tasks = grad.par_chunks_mut(ROWS_PER_TASK * columns).zip(known.par_chunks(ROWS_PER_TASK * columns));
-    let partial: Vec<Vec<f32>> = tasks
-        .map(|(grad, known)| {
-            let mut sums = vec![0.0; columns];
-            for (grad, known) in grad.chunks_exact_mut(columns).zip(known.chunks_exact(columns)) {
-                match activation {
-                    None => {}
-                    Some(Activation::Elu) => each(grad, known, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
-                    Some(Activation::Relu) => each(grad, known, |g, y| if y > 0.0 { g } else { 0.0 }),
-                    Some(Activation::Silu) => each(grad, known, |g, x| g * silu_slope(x)),
-                    Some(Activation::Tanh) => each(grad, known, |g, y| g * (1.0 - y * y)),
-                }
-                each(&mut sums, grad, |sum, g| sum + g);
+/// `known` has the outputs of the activation, or its inputs where [`slope_from_output`] is false.
+pub fn multiply_slopes(grad: &mut [f32], known: &[f32], activation: Activation) {
+    match activation {
+        Activation::Elu => each(grad, known, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
+        Activation::Relu => each(grad, known, |g, y| if y > 0.0 { g } else { 0.0 }),
+        Activation::Silu => each(grad, known, |g, x| g * silu_slope(x)),
+        Activation::Tanh => each(grad, known, |g, y| g * (1.0 - y * y)),
+    }
+}
+
+/// Adds the sums of the columns of `rows` `[B, C]` to `sums` `[C]`.
+pub fn add_column_sums(sums: &mut [f32], rows: &[f32]) {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            for row in rows.chunks_exact(sums.len()) {
+                sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
             }
-            sums
-        })
-        .collect();
-    let mut sums = vec![0.0; columns];
-    partial.iter().for_each(|part| each(&mut sums, part, |sum, x| sum + x));
-    sums
+        },
+    );
 }
 
 /// `x[i] = f(x[i], y[i])`, compiled for the processor it runs on.
 #[inline(always)]
 fn each(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
+    assert_eq!(x.len(), y.len());
+    Arch::new().dispatch(
+        #[inline(always)]
+        || x.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y)),
+    );
+}
+
+/// The same for each row of `x` `[B, C]` with `y` `[C]`.
+#[inline(always)]
+fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
     Arch::new().dispatch(
         #[inline(always)]
         || {
-            for (x, &y) in x.iter_mut().zip(y) {
-                *x = f(*x, y);
+            for row in x.chunks_exact_mut(y.len()) {
+                row.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y));
             }
         },
     );
@@ -149,7 +163,7 @@ mod tests {
     fn activations_are_accurate_to_three_parts_in_ten_million() {
         for activation in ALL {
             let mut found = inputs();
-            add_bias_activate(&mut found, &[0.0], Some(activation));
+            add_bias_activate(&mut found, &[0.0], activation);
             for (x, y) in inputs().into_iter().zip(found) {
                 let expected = exact(activation, f64::from(x));
                 let error = (f64::from(y) - expected).abs();
@@ -175,7 +189,7 @@ mod tests {
     fn what_is_not_a_number_stays_so() {
         for activation in ALL {
             let mut x = [f32::NAN];
-            add_bias_activate(&mut x, &[0.0], Some(activation));
+            add_bias_activate(&mut x, &[0.0], activation);
             assert!(x[0].is_nan(), "{activation:?}");
         }
     }
@@ -185,24 +199,22 @@ mod tests {
         for activation in ALL {
             for x in [-3.0f32, -0.7, -0.01, 0.02, 0.9, 4.0] {
                 let mut output = [x];
-                add_bias_activate(&mut output, &[0.0], Some(activation));
+                add_bias_activate(&mut output, &[0.0], activation);
                 let known = if slope_from_output(activation) { output } else { [x] };
                 let mut grad = [2.0];
-                let sums = backward_activate(&mut grad, &known, 1, Some(activation));
+                multiply_slopes(&mut grad, &known, activation);
                 let step = 1e-6;
                 let x = f64::from(x);
                 let slope = (exact(activation, x + step) - exact(activation, x - step)) / (2.0 * step);
                 assert!((f64::from(grad[0]) - 2.0 * slope).abs() < 1e-5, "{activation:?} at {x}");
-                assert_eq!(sums, grad);
             }
         }
     }
 
     #[test]
-    fn bias_gradients_are_the_sums_of_the_columns() {
-        let mut grad: Vec<f32> = (0..3000).map(|i| (i % 7) as f32).collect();
-        let expected: Vec<f32> = (0..3).map(|c| grad.iter().skip(c).step_by(3).sum()).collect();
-        let known = vec![1.0; 3000];
-        assert_eq!(backward_activate(&mut grad, &known, 3, None), expected);
+    fn sums_of_columns_are_added_to_what_is_there() {
+        let mut sums = [10.0, 20.0, 30.0];
+        add_column_sums(&mut sums, &[1.0, 2.0, 3.0, 0.5, -2.0, 4.0]);
+        assert_eq!(sums, [11.5, 20.0, 37.0]);
     }
 }

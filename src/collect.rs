@@ -1,0 +1,87 @@
+//! Collecting a rollout: the policy acts and the environments step, block by block, on all threads.
+//!
+//! A block of environments goes through its steps by itself, with the policy that all share: no thread waits for the
+//! others before the rollout is whole.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Result;
+
+use crate::env::{End, Env, EnvBlock, EnvPool, StepBuffers};
+use crate::ppo::{Acting, Ppo, Rollout, RolloutBlock, Workspace};
+use crate::rng::Rng;
+use crate::schedule::in_rounds;
+
+/// Arrays that a collection needs besides the rollout, for each block.
+pub struct Scratch {
+    blocks: Vec<BlockScratch>,
+}
+
+struct BlockScratch {
+    ends: Vec<Option<End>>,
+    final_observations: Vec<f32>,
+    work: Workspace,
+}
+
+impl Scratch {
+    /// For the environments of `pool` and the policy of `ppo`.
+    pub fn new<E: Env>(pool: &EnvPool<E>, ppo: &Ppo) -> Self {
+        let block = |envs| BlockScratch {
+            ends: vec![None; envs],
+            final_observations: vec![0.0; envs * pool.observation_size()],
+            work: ppo.workspace(envs),
+        };
+        Self { blocks: pool.block_sizes().into_iter().map(block).collect() }
+    }
+}
+
+/// A block on its way through a rollout.
+struct Collecting<'a, E: Env> {
+    envs: &'a mut EnvBlock<E>,
+    rollout: &'a mut RolloutBlock,
+    scratch: &'a mut BlockScratch,
+    noise: Rng,
+    result: Result<()>,
+}
+
+/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile.
+///
+/// # Errors
+/// Only if candle cannot allocate.
+pub fn collect<E: Env>(
+    pool: &mut EnvPool<E>,
+    ppo: &Ppo,
+    rollout: &mut Rollout,
+    iteration: u64,
+    scratch: &mut Scratch,
+    interrupted: &AtomicBool,
+) -> Result<bool> {
+    let (acting, horizon) = (ppo.acting()?, rollout.horizon());
+    let parts = pool.blocks_mut().iter_mut().zip(&mut rollout.blocks).zip(&mut scratch.blocks).enumerate();
+    let blocks = parts.map(|(i, ((envs, rollout), scratch))| {
+        let noise = ppo.noise(iteration, i);
+        Collecting { envs, rollout, scratch, noise, result: Ok(()) }
+    });
+    let collected = in_rounds(blocks, horizon, |block, t| {
+        if block.result.is_ok() && !interrupted.load(Ordering::Relaxed) {
+            block.result = block.step(&acting, t, t + 1 == horizon);
+        }
+    });
+    collected.into_iter().try_for_each(|block| block.result)?;
+    Ok(!interrupted.load(Ordering::Relaxed))
+}
+
+impl<E: Env> Collecting<'_, E> {
+    fn step(&mut self, acting: &Acting, t: usize, last: bool) -> Result<()> {
+        let BlockScratch { ends, final_observations, work } = &mut *self.scratch;
+        let mut step = self.rollout.step_mut(t);
+        acting.act(&mut step, &mut self.noise, work)?;
+        let buffers =
+            StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };
+        self.envs.step(step.actions, buffers);
+        step.dones.iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
+        let truncated = ends.iter().map(|&end| end == Some(End::Truncated));
+        acting.settle(step.rewards, truncated, final_observations, work)?;
+        if last { acting.finish(self.rollout, work) } else { Ok(()) }
+    }
+}

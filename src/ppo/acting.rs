@@ -1,0 +1,74 @@
+//! Acting during a rollout: actions drawn from the policy of the iteration, and what rewards and values need of it.
+
+use anyhow::Result;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::fused::Workspace;
+use super::policy::FrozenPolicy;
+use super::rollout::{RolloutBlock, RolloutStep};
+use crate::rng::Rng;
+
+/// The policy that collects a rollout, shared by all threads.
+pub struct Acting<'a> {
+    pub(super) policy: FrozenPolicy<'a>,
+    pub(super) gamma: f32,
+    pub(super) reward_scale: f32,
+}
+
+impl Acting<'_> {
+    /// Draws actions for the observations of a step; writes actions, means, log-probabilities and values.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn act(&self, step: &mut RolloutStep, noise: &mut Rng, work: &mut Workspace) -> Result<()> {
+        self.policy.forward(step.observations, [Some(step.means), Some(step.values)], work)?;
+        let std = self.policy.std();
+        let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
+        let rows = step.actions.chunks_exact_mut(std.len()).zip(step.means.chunks_exact(std.len()));
+        for ((actions, means), log_prob) in rows.zip(step.log_probs.iter_mut()) {
+            let mut squares = 0.0;
+            for ((action, mean), std) in actions.iter_mut().zip(means).zip(std) {
+                let drawn: f32 = StandardNormal.sample(noise);
+                *action = mean + std * drawn;
+                squares += ((*action - mean) / std).powi(2);
+            }
+            *log_prob = -0.5 * squares - constant;
+        }
+        Ok(())
+    }
+
+    /// Scales the rewards of a step and, for each truncated environment, adds the discounted value of its final observation,
+    /// so that the advantages need one array of ends only. `truncated` `[n]`, `final_observations` `[n, O]`.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn settle(
+        &self,
+        rewards: &mut [f32],
+        truncated: impl Iterator<Item = bool>,
+        final_observations: &[f32],
+        work: &mut Workspace,
+    ) -> Result<()> {
+        let size = final_observations.len() / rewards.len();
+        for ((reward, truncated), observation) in
+            rewards.iter_mut().zip(truncated).zip(final_observations.chunks_exact(size))
+        {
+            *reward *= self.reward_scale;
+            if truncated {
+                let mut value = [0.0];
+                self.policy.forward(observation, [None, Some(&mut value)], work)?;
+                *reward += self.gamma * value[0];
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the values of the observations after the last step.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn finish(&self, block: &mut RolloutBlock, work: &mut Workspace) -> Result<()> {
+        let (observations, values) = block.after_last();
+        self.policy.forward(observations, [None, Some(values)], work)
+    }
+}

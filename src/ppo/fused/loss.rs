@@ -1,0 +1,180 @@
+//! The losses of PPO with their gradients with respect to what the nets gave, sample by sample.
+//!
+//! J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
+
+use pulp::Arch;
+
+use super::super::rollout::{Rollout, RolloutBlock};
+
+/// What the losses of a minibatch need besides the samples. A numbers in an action.
+pub struct Loss<'a> {
+    rollout: &'a Rollout,
+    clip: f32,
+    value_coef: f32,
+    /// Of one sample in the means over the minibatch.
+    share: f32,
+    /// `[A]`: reciprocals of the standard deviations.
+    precision: Vec<f32>,
+    /// What the logarithm of the density has at the mean, negated.
+    log_scale: f32,
+}
+
+/// Sums over samples.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Sums {
+    /// The clipped surrogate.
+    pub surrogate: f64,
+    /// The clipped squared error of the values.
+    pub value_error: f64,
+    /// Samples whose ratio was clipped.
+    pub clipped: usize,
+    /// The largest |ratio - 1|.
+    pub ratio_error: f32,
+    /// `[A]`, squared differences of the means from those that acted.
+    pub moved: Vec<f32>,
+    /// `[A]`, the gradient with respect to the logarithm of the standard deviations.
+    pub log_std_grad: Vec<f32>,
+}
+
+impl Sums {
+    /// Of no samples.
+    pub fn clear(&mut self, action_size: usize) {
+        (self.surrogate, self.value_error, self.clipped, self.ratio_error) = (0.0, 0.0, 0, 0.0);
+        for sums in [&mut self.moved, &mut self.log_std_grad] {
+            sums.clear();
+            sums.resize(action_size, 0.0);
+        }
+    }
+}
+
+impl<'a> Loss<'a> {
+    /// For a minibatch of so many samples of `rollout`; logarithms of the standard deviations `[A]`.
+    pub fn new(rollout: &'a Rollout, samples: usize, clip: f64, value_coef: f64, log_std: &[f32]) -> Self {
+        Self {
+            rollout,
+            clip: clip as f32,
+            value_coef: value_coef as f32,
+            share: 1.0 / samples as f32,
+            precision: log_std.iter().map(|s| (-s).exp()).collect(),
+            log_scale: log_std.iter().map(|s| s + 0.5 * std::f32::consts::TAU.ln()).sum(),
+        }
+    }
+
+    /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
+    pub fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        let width = self.precision.len();
+        Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
+                for (&sample, (mean, grad)) in samples.iter().zip(rows) {
+                    let (block, i) = self.rollout.locate(sample);
+                    self.actor_sample(block, i, mean, grad, sums);
+                }
+            },
+        );
+    }
+
+    #[inline(always)]
+    fn actor_sample(&self, block: &RolloutBlock, i: usize, mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        let row = RolloutBlock::row(mean.len(), i);
+        let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
+        // First the distance from the mean in standard deviations, then the gradient in its place.
+        for (((z, action), mean), precision) in grad.iter_mut().zip(action).zip(mean).zip(&self.precision) {
+            *z = (action - mean) * precision;
+        }
+        let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
+        let ratio = (log_prob - block.log_probs[i]).exp();
+        let advantage = block.advantages[i];
+        let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage);
+        // A ratio that is not a number takes the second way, and the sum shows it.
+        let (surrogate, slope) = if free <= bounded { (free, -self.share * free) } else { (bounded, 0.0) };
+        let error = (ratio - 1.0).abs();
+        sums.surrogate += f64::from(surrogate);
+        sums.clipped += usize::from(error > self.clip);
+        sums.ratio_error = sums.ratio_error.max(error);
+        for (sum, z) in sums.log_std_grad.iter_mut().zip(&*grad) {
+            *sum += slope * (z * z - 1.0);
+        }
+        for ((sum, mean), old_mean) in sums.moved.iter_mut().zip(mean).zip(old_mean) {
+            *sum += (mean - old_mean) * (mean - old_mean);
+        }
+        for (z, precision) in grad.iter_mut().zip(&self.precision) {
+            *z *= slope * precision;
+        }
+    }
+
+    /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
+    pub fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
+            let (block, i) = self.rollout.locate(sample);
+            let (old, target) = (block.values[i], block.returns[i]);
+            let step = (value - old).clamp(-self.clip, self.clip);
+            let (free, bounded) = (value - target, old + step - target);
+            let inside = (value - old).abs() <= self.clip;
+            // Where the step is clipped and that makes the error larger, the value has no influence on it.
+            let (error, slope) =
+                if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
+            sums.value_error += f64::from(error * error);
+            *grad = self.value_coef * self.share * slope;
+        }
+    }
+}
+
+/// Mean over `samples` samples of the KL divergence KL(old ‖ new) of diagonal Gaussians, of the sums of squared differences of
+/// their means `[A]`, and the logarithms of their standard deviations `[A]`.
+pub fn kl(moved: &[f64], samples: usize, old_log_std: &[f32], log_std: &[f32]) -> f64 {
+    let terms = moved.iter().zip(old_log_std).zip(log_std).map(|((&moved, &old), &new)| {
+        let (old, new) = (f64::from(old), f64::from(new));
+        let spread = ((2.0 * old).exp() + moved / samples as f64) / (2.0 * new).exp();
+        new - old + 0.5 * spread - 0.5
+    });
+    terms.sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn assert_close(found: &[f32], expected: &[f32]) {
+        let close = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
+        assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
+    }
+
+    /// The numbers are those of the PyTorch program at `losses_and_gradients_match_pytorch` in `reference/loss.rs`.
+    #[test]
+    fn losses_and_gradients_match_pytorch() {
+        let mut rollout = Rollout::new(1, &[3], 1, 2);
+        let block = &mut rollout.blocks[0];
+        block.actions = vec![0.5, -1.0, -0.3, 0.9, 0.2, 1.5];
+        block.means = vec![0.0, -0.1, 0.4, 0.5, -0.5, 0.5];
+        block.advantages = vec![1.0, 0.5, -2.0];
+        block.values[..3].copy_from_slice(&[0.2, -0.1, 1.0]);
+        block.returns = vec![0.5, 0.1, 0.9];
+        let old_log_std = [0.7f32.ln(), 1.1f32.ln()];
+        for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
+            let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / old_log_std[j].exp());
+            *log_prob =
+                -0.5 * (z[0] * z[0] + z[1] * z[1]) - old_log_std[0] - old_log_std[1] - std::f32::consts::TAU.ln();
+        }
+        let log_std = [-0.5, 0.2];
+        let loss = Loss::new(&rollout, 3, 0.2, 2.0, &log_std);
+        let mut sums = Sums::default();
+        sums.clear(2);
+        let mut grad = [0.0; 6];
+        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums);
+        assert_close(&grad, &[0.0, 0.0, 0.246_434_33, -0.045_577_466, 1.465_282_9, 0.421_556_7]);
+        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.385_089_8]);
+        // The entropy's share, with its coefficient of 0.01, is added once for the minibatch.
+        let log_std_grad: Vec<f32> = sums.log_std_grad.iter().map(|x| x - 0.01).collect();
+        assert_close(&log_std_grad, &[-0.113_067_5, -0.527_346_6]);
+        assert_close(&[sums.ratio_error], &[0.347_618_7]);
+        assert_eq!(sums.clipped, 3);
+        let moved: Vec<f64> = sums.moved.iter().map(|&x| f64::from(x)).collect();
+        assert_close(&[kl(&moved, 3, &old_log_std, &log_std) as f32], &[0.062_119_63]);
+        let mut grad = [0.0; 3];
+        loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
+        assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
+        assert_close(&[sums.value_error as f32 / 3.0], &[0.26]);
+    }
+}

@@ -1,0 +1,169 @@
+//! A network on a block of rows: forward and backward, layer by layer, in the cache of one core.
+
+use candle_core::{CpuStorage, Storage, StorageRef, Var};
+
+use super::activation::{activate, add_bias, add_bias_activate, add_column_sums, multiply_slopes, slope_from_output};
+use super::product::{Matrix, product};
+use crate::config::Activation;
+
+/// One network on the present parameters. While it lives, they cannot be written to.
+pub struct Net<'a> {
+    layers: Vec<Layer<'a>>,
+    activation: Activation,
+}
+
+/// `[outputs, inputs]` and `[outputs]`
+struct Layer<'a> {
+    weight: Numbers<'a>,
+    bias: Numbers<'a>,
+    inputs: usize,
+    outputs: usize,
+}
+
+/// The elements of a parameter.
+struct Numbers<'a> {
+    storage: StorageRef<'a>,
+    range: std::ops::Range<usize>,
+}
+
+impl<'a> Numbers<'a> {
+    fn of(var: &'a Var) -> Self {
+        let (storage, layout) = var.storage_and_layout();
+        let (start, end) = layout.contiguous_offsets().expect("parameters are contiguous");
+        Self { storage, range: start..end }
+    }
+}
+
+impl std::ops::Deref for Numbers<'_> {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        match &*self.storage {
+            Storage::Cpu(CpuStorage::F32(numbers)) => &numbers[self.range.clone()],
+            _ => panic!("parameters are floats on the CPU"),
+        }
+    }
+}
+
+/// What a block of up to `rows` rows needs on its way through nets of the same hidden layers.
+pub struct Workspace {
+    /// `[rows, I]`: what the nets read.
+    pub inputs: Vec<f32>,
+    /// `[rows, outputs]` of each layer.
+    outputs: Vec<Vec<f32>>,
+    /// The same before the activation; empty where its slope does not need that.
+    inner: Vec<Vec<f32>>,
+    /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the one below it.
+    grads: [Vec<f32>; 2],
+    rows: usize,
+}
+
+impl Workspace {
+    /// For nets with these sizes of inputs, hidden layers and (the most) outputs. Only a `learning` one can go backward.
+    pub fn new(sizes: &[usize], activation: Activation, rows: usize, learning: bool) -> Self {
+        let (inputs, layers) = sizes.split_first().expect("a net has inputs");
+        let arrays = || layers.iter().map(|size| vec![0.0; rows * size]).collect();
+        let widest = layers.iter().max().expect("a net has layers");
+        Self {
+            inputs: vec![0.0; rows * inputs],
+            outputs: arrays(),
+            inner: if learning && !slope_from_output(activation) { arrays() } else { Vec::new() },
+            grads: [0, 1].map(|_| vec![0.0; if learning { rows * widest } else { 0 }]),
+            rows,
+        }
+    }
+
+    /// The most rows it holds.
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// What a net of `outputs` outputs gave for `rows` rows, and where the gradient with respect to that goes.
+    pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
+        let last = self.outputs.last().expect("a net has layers");
+        (&last[..rows * outputs], &mut self.grads[0][..rows * outputs])
+    }
+}
+
+impl<'a> Net<'a> {
+    /// The net of these parameters: weight and bias of each layer.
+    pub fn new(parameters: &'a [(String, Var)], activation: Activation) -> Self {
+        let layer = |pair: &'a [(String, Var)]| {
+            let (weight, bias) = (&pair[0].1, &pair[1].1);
+            let &[outputs, inputs] = weight.dims() else { panic!("a weight is a matrix") };
+            Layer { weight: Numbers::of(weight), bias: Numbers::of(bias), inputs, outputs }
+        };
+        Self { layers: parameters.chunks_exact(2).map(layer).collect(), activation }
+    }
+
+    /// Numbers in an output.
+    pub fn outputs(&self) -> usize {
+        self.layers.last().expect("a net has layers").outputs
+    }
+
+    /// Numbers in all weights and biases.
+    pub fn parameter_count(&self) -> usize {
+        self.layers.iter().map(|layer| layer.outputs * (layer.inputs + 1)).sum()
+    }
+
+    /// Takes the first `rows` rows of the inputs through the net, and returns its outputs `[rows, outputs]`.
+    pub fn forward<'w>(&self, rows: usize, work: &'w mut Workspace) -> &'w [f32] {
+        for (l, layer) in self.layers.iter().enumerate() {
+            let (below, outputs) = work.outputs.split_at_mut(l);
+            let x = below.last().unwrap_or(&work.inputs);
+            let y = &mut outputs[0][..rows * layer.outputs];
+            product(y, layer.x(x, rows), layer.weight().transposed(), false);
+            if l + 1 == self.layers.len() {
+                add_bias(y, &layer.bias);
+            } else if let Some(inner) = work.inner.get_mut(l) {
+                let inner = &mut inner[..y.len()];
+                add_bias(y, &layer.bias);
+                inner.copy_from_slice(y);
+                activate(y, inner, self.activation);
+            } else {
+                add_bias_activate(y, &layer.bias, self.activation);
+            }
+        }
+        &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
+    }
+
+    /// Takes the gradient with respect to the outputs of the last forward pass, which lies in `work`, back through the net.
+    /// Writes the gradient of the parameters, in their order, into `gradient`, or adds it to what is there.
+    pub fn backward(&self, rows: usize, work: &mut Workspace, gradient: &mut [f32], add: bool) {
+        let mut rest = gradient;
+        let [above, below] = &mut work.grads;
+        for (l, layer) in self.layers.iter().enumerate().rev() {
+            let at = rest.len() - layer.outputs * (layer.inputs + 1);
+            let (first, own) = rest.split_at_mut(at);
+            let (weight_grad, bias_grad) = own.split_at_mut(layer.outputs * layer.inputs);
+            rest = first;
+
+            let grad = &mut above[..rows * layer.outputs];
+            if l + 1 < self.layers.len() {
+                let known = if slope_from_output(self.activation) { &work.outputs[l] } else { &work.inner[l] };
+                multiply_slopes(grad, &known[..grad.len()], self.activation);
+            }
+            if !add {
+                bias_grad.fill(0.0);
+            }
+            add_column_sums(bias_grad, grad);
+            let grad = Matrix::new(grad, rows, layer.outputs);
+            let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
+            product(weight_grad, grad.transposed(), layer.x(x, rows), add);
+            if l > 0 {
+                product(&mut below[..rows * layer.inputs], grad, layer.weight(), false);
+                std::mem::swap(above, below);
+            }
+        }
+    }
+}
+
+impl Layer<'_> {
+    fn weight(&self) -> Matrix<'_> {
+        Matrix::new(&self.weight, self.outputs, self.inputs)
+    }
+
+    fn x<'x>(&self, x: &'x [f32], rows: usize) -> Matrix<'x> {
+        Matrix::new(&x[..rows * self.inputs], rows, self.inputs)
+    }
+}
