@@ -9,7 +9,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::cli::BenchArgs;
+use crate::cli::{BenchArgs, Part};
 use crate::collect::{Scratch, collect};
 use crate::config::Config;
 use crate::env::{
@@ -51,39 +51,49 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
-    let (physics, pool, share) = physics_and_pool(&task, &config)?;
-    let (samples, gflops, matmul) = learner(&task, &config)?;
-    let end_to_end = end_to_end(&task, &config)?;
-    let threads = rayon::current_num_threads();
+    let asked = |part: Part| args.only.is_none_or(|only| only == part);
+    let mut figures = serde_json::Map::new();
+    let mut lines = format!(
+        "{} threads, {} environments, nets {:?}, minibatches of {}\n",
+        rayon::current_num_threads(),
+        config.env.num_envs,
+        config.ppo.hidden,
+        config.steps_per_iteration() / config.ppo.minibatches as u64,
+    );
+    if asked(Part::Physics) {
+        let (physics, pool, share) = physics_and_pool(&task, &config)?;
+        figures.extend(entries([("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)]));
+        lines += &format!("physics alone (mj_step)   {physics:>10.0} steps/s\n");
+        lines += &format!("environments              {pool:>10.0} steps/s   {:.1} % of the physics\n", 100.0 * share);
+    }
+    if asked(Part::Learner) {
+        let (samples, gflops, matmul) = learner(&task, &config)?;
+        figures.extend(entries([
+            ("learner_samples_per_s", samples),
+            ("learner_gflops", gflops),
+            ("matmul_gflops", matmul),
+        ]));
+        lines += &format!("learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n");
+        lines += &format!("its matrix products alone                      {matmul:.1} GFLOP/s\n");
+    }
+    if asked(Part::Training) {
+        let end_to_end = end_to_end(&task, &config)?;
+        figures.extend(entries([("end_to_end_steps_per_s", end_to_end)]));
+        lines += &format!("end to end                {end_to_end:>10.0} steps/s\n");
+    }
     if args.json {
-        let object = json!({
-            "physics_steps_per_s": physics,
-            "pool_steps_per_s": pool,
-            "pool_share": share,
-            "learner_samples_per_s": samples,
-            "learner_gflops": gflops,
-            "matmul_gflops": matmul,
-            "end_to_end_steps_per_s": end_to_end,
-            "threads": threads,
-            "hidden": config.ppo.hidden,
-            "num_envs": config.env.num_envs,
-        });
-        run::print(&format!("{object}\n"));
+        figures.insert("threads".into(), json!(rayon::current_num_threads()));
+        figures.insert("hidden".into(), json!(config.ppo.hidden));
+        figures.insert("num_envs".into(), json!(config.env.num_envs));
+        run::print(&format!("{}\n", serde_json::Value::Object(figures)));
     } else {
-        run::print(&format!(
-            "{threads} threads, {} environments, nets {:?}, minibatches of {}\n\
-             physics alone (mj_step)   {physics:>10.0} steps/s\n\
-             environments              {pool:>10.0} steps/s   {:.1} % of the physics\n\
-             learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
-             its matrix products alone                      {matmul:.1} GFLOP/s\n\
-             end to end                {end_to_end:>10.0} steps/s\n",
-            config.env.num_envs,
-            config.ppo.hidden,
-            config.steps_per_iteration() / config.ppo.minibatches as u64,
-            100.0 * share,
-        ));
+        run::print(&lines);
     }
     Ok(())
+}
+
+fn entries<const N: usize>(figures: [(&str, f64); N]) -> [(String, serde_json::Value); N] {
+    figures.map(|(name, value)| (name.into(), json!(value)))
 }
 
 /// What an environment did in a turn.

@@ -125,7 +125,21 @@ pub struct BenchArgs {
     /// Worker threads, 0 for one per core [default: run.threads]
     #[arg(long, value_name = "N", value_parser = threads())]
     pub threads: Option<usize>,
+    /// Measure only this part
+    #[arg(long, value_enum, value_name = "PART")]
+    pub only: Option<Part>,
     /// Print one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
+}
+
+/// A part of the machine's speed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Part {
+    /// The bare physics, and the environments around it
+    Physics,
+    /// Gradient steps, and their bare matrix products
+    Learner,
+    /// Whole iterations
+    Training,
 }

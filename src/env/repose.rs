@@ -174,8 +174,9 @@ impl Repose {
     }
 
     fn send_targets(&mut self) {
+        let ctrl = self.sim.ctrl_mut();
         for (actuator, target) in self.task.hand.actuators.iter().zip(self.targets) {
-            self.sim.ctrl_mut()[actuator.ctrl] = target;
+            ctrl[actuator.ctrl] = target;
         }
     }
 
@@ -199,31 +200,42 @@ impl Repose {
         assert_eq!(observation.len(), OBSERVATION_SIZE, "length of an observation");
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
-        let mut cells = observation.iter_mut();
-        // The one place where the doubles of the physics become the floats of the learner.
-        let mut put = |value: f64| *cells.next().expect("157 numbers") = value as f32;
-        hand.joints.iter().for_each(|joint| put(qpos[joint.qpos]));
-        hand.joints.iter().for_each(|joint| put(config.vel_obs_scale * qvel[joint.dof]));
+        let mut cells = Cells(observation);
+        cells.put(hand.joints.map(|joint| qpos[joint.qpos]));
+        cells.put(hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
         let (position, orientation) = self.cube();
-        let velocity = &qvel[hand.cube.dof..hand.cube.dof + 6];
+        let [vx, vy, vz, spin @ ..] = qvel[hand.cube.dof..].first_chunk::<6>().expect("a free joint");
+        cells.put(position);
+        cells.put(quat::canonical(orientation));
+        cells.put([*vx, *vy, *vz]);
         // MuJoCo keeps the angular velocity of a free joint in the body's frame.
-        let spin = quat::rotate(orientation, [velocity[3], velocity[4], velocity[5]]);
-        position.into_iter().for_each(&mut put);
-        quat::canonical(orientation).into_iter().for_each(&mut put);
-        velocity[..3].iter().copied().for_each(&mut put);
-        spin.into_iter().for_each(|x| put(config.vel_obs_scale * x));
-        config.goal_position.into_iter().for_each(&mut put);
-        quat::canonical(self.goal).into_iter().for_each(&mut put);
-        let relative = quat::mul(orientation, quat::conj(self.goal));
-        quat::canonical(relative).into_iter().for_each(&mut put);
+        cells.put(quat::rotate(orientation, *spin).map(|x| config.vel_obs_scale * x));
+        cells.put(config.goal_position);
+        cells.put(quat::canonical(self.goal));
+        cells.put(quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
 
-        for &tip in &hand.fingertips {
+        for tip in hand.fingertips {
             let (position, orientation) = self.sim.pose(tip);
             let (linear, angular) = self.sim.velocity(tip);
-            position.into_iter().chain(orientation).chain(linear).chain(angular).for_each(&mut put);
+            cells.put(position);
+            cells.put(orientation);
+            cells.put(linear);
+            cells.put(angular);
         }
-        self.previous_action.iter().for_each(|&action| put(f64::from(action)));
+        cells.0.copy_from_slice(&self.previous_action);
+    }
+}
+
+/// What is still to be written of an observation.
+struct Cells<'a>(&'a mut [f32]);
+
+impl Cells<'_> {
+    /// The one place where the doubles of the physics become the floats of the learner.
+    fn put<const N: usize>(&mut self, values: [f64; N]) {
+        let (cells, rest) = std::mem::take(&mut self.0).split_at_mut(N);
+        cells.iter_mut().zip(values).for_each(|(cell, value)| *cell = value as f32);
+        self.0 = rest;
     }
 }
 
@@ -278,14 +290,13 @@ impl Env for Repose {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         self.actuate(action);
-        let task = self.task.clone();
-        let config = &task.config;
-        let diverged = self.sim.step(config.substeps()) == Physics::Diverged;
+        let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls; whoever looks should find what was sent.
             self.send_targets();
         }
 
+        let config = &self.task.config;
         let (position, orientation) = self.cube();
         let rot_dist = quat::angle_between(orientation, self.goal);
         let offset = [0, 1, 2].map(|axis| position[axis] - config.goal_position[axis]);
@@ -300,19 +311,19 @@ impl Env for Repose {
         self.episode.length += 1;
         self.episode.reward += reward;
         self.episode.diverged = diverged;
-        self.episode.dropped = !diverged && goal_dist >= config.fall_dist;
+        self.episode.dropped = !diverged && goal_dist >= self.task.config.fall_dist;
         self.recent.steps += 1;
         self.recent.reward += reward;
         self.recent.diverged += u64::from(diverged);
         if !diverged {
             self.episode.rot_dist_sum += rot_dist;
-            self.hold(rot_dist <= config.success_tolerance);
+            self.hold(rot_dist <= self.task.config.success_tolerance);
         }
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
         } else {
-            (self.age >= config.max_episode_steps()).then_some(End::Truncated)
+            (self.age >= self.task.config.max_episode_steps()).then_some(End::Truncated)
         };
         self.observe(observation);
         Transition { reward: reward.total() as f32, end }

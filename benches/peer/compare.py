@@ -1,0 +1,91 @@
+"""Runs the program and its Python peers in turn on this machine and prints the medians of the ratios.
+
+Usage: python compare.py [--pairs 5] [--only NAME ...] [--program PATH] [--threads 2]
+Needs: torch, numpy, mujoco==3.17.0 in the Python that runs it, and `cargo build --release` before. Keep the machine idle.
+"""
+import argparse
+import json
+import os
+import pathlib
+import statistics
+import subprocess
+import sys
+import tempfile
+
+HERE = pathlib.Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+LARGE, SMALL = [512, 512, 256, 128], [256, 128, 64]
+
+
+def run(command):
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+class Sides:
+    """What either side makes of each figure."""
+
+    def __init__(self, program, threads):
+        self.program, self.threads = program, threads
+
+    def bench(self, part, key, *settings):
+        options = [x for setting in settings for x in ("--set", setting)]
+        threads = ["--threads", str(self.threads)]
+        return json.loads(run([self.program, "bench", "--only", part, "--json", *threads, *options]))[key]
+
+    def learner(self, hidden, envs, minibatches):
+        return self.bench("learner", "learner_samples_per_s", f"ppo.hidden={hidden}", f"env.num_envs={envs}",
+                          f"ppo.minibatches={minibatches}")
+
+    def torch(self, hidden, batch):
+        return json.loads(run([sys.executable, HERE / "torch_learner.py", "--hidden", ",".join(map(str, hidden)),
+                               "--batch", str(batch), "--threads", str(self.threads)]))["samples_per_s"]
+
+    def training(self):
+        return self.bench("training", "end_to_end_steps_per_s")
+
+    def peer(self):
+        lines = run([sys.executable, HERE / "ppo_peer.py", "--model", ROOT / "assets/shadow_hand/scene.xml",
+                     "--minutes", "0.6", "--threads", str(self.threads)]).splitlines()
+        return statistics.median(json.loads(line)["steps_per_s"] for line in lines)
+
+    def memory(self):
+        with tempfile.TemporaryDirectory() as folder:
+            command = [self.program, "train", "--run-dir", f"{folder}/run", "--total-steps", "500000"]
+            training = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            _, status, usage = os.wait4(training.pid, 0)
+            assert status == 0, "the training has failed"
+        return usage.ru_maxrss / 1024
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--only", nargs="*", help="part of a figure's name")
+    parser.add_argument("--program", type=pathlib.Path, default=ROOT / "target/release/shadow-repose")
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    sides = Sides(args.program, args.threads)
+    figures = {
+        "learner samples/s, nets 512 512 256 128, batch 8192": (lambda: sides.learner(LARGE, 512, 1),
+                                                                lambda: sides.torch(LARGE, 8192)),
+        "learner samples/s, nets 256 128 64, batch 4096": (lambda: sides.learner(SMALL, 1024, 4),
+                                                           lambda: sides.torch(SMALL, 4096)),
+        # Taken in turn within one run, so that neither side meets a faster machine.
+        "environments / bare physics": (lambda: sides.bench("physics", "pool_share"), lambda: 1.0),
+        "end to end steps/s, nets 256 128 64, 1024 x 16, 4 epochs x 4": (sides.training, sides.peer),
+    }
+    print("| figure | ours | other | ratio: median (range) |\n|---|---|---|---|")
+    for name, (ours, other) in figures.items():
+        if args.only and not any(part in name for part in args.only):
+            continue
+        pairs = [(ours(), other()) for _ in range(args.pairs)]
+        ratios = [a / b for a, b in pairs]
+        medians = [statistics.median(side) for side in zip(*pairs)]
+        print(f"| {name} | {medians[0]:.5g} | {medians[1]:.5g} "
+              f"| {statistics.median(ratios):.2f} ({min(ratios):.2f} … {max(ratios):.2f}) |", flush=True)
+    if not args.only:
+        print(f"| resident memory of a training, MiB | {sides.memory():.0f} | | |")
+
+
+if __name__ == "__main__":
+    main()

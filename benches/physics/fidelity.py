@@ -1,0 +1,215 @@
+"""What physics settings cost and how close they stay to a reference: all contact pairs, converged, timestep 0.002 s.
+
+Usage: python fidelity.py [--rollouts 1000] [--only NAME ...] [--list]
+Needs: numpy, mujoco==3.17.0. Run it from anywhere on an idle machine; about ten minutes on two cores.
+
+Each variant is the project's scene with one change. All variants play the same rollouts of 1 s from the task's start states,
+with actions drawn as a new policy draws them (Gaussian, standard deviation 0.5, a new one each 0.01 s). Per variant:
+- speed:  control steps/s over the default's, the median of rounds taken in turn
+- apart:  distance of the cube from where the reference has it after 1 s, median and 90th percentile; contacts are chaotic, so
+          the row `reference, moved 1 nm` shows what remains apart without any difference in the settings
+- lost:   rollouts in which the cube ends 0.24 m or more from the goal position; in brackets those that diverged
+- deep:   depth of the deepest contact, of the cube and within the hand, judged with all contact pairs: mean over states
+- energy: kinetic energy of the hand and of the cube: mean over states
+"""
+import argparse
+import os
+import pathlib
+import statistics
+import time
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+SCENE = pathlib.Path(__file__).resolve().parents[2] / "assets/shadow_hand/scene.xml"
+GOAL = np.array([0.33, 0.0, 0.295])
+CONTROL_STEPS, CONTROL_DT = 100, 0.01
+
+
+def build(change=None, dt=0.01):
+    spec = mujoco.MjSpec.from_file(str(SCENE))
+    if change:
+        change(spec)
+    model = spec.compile()
+    model.opt.timestep = dt
+    return model
+
+
+def converged(spec):
+    spec.option.iterations, spec.option.tolerance = 200, 1e-12
+    spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
+
+
+def option(**values):
+    def change(spec):
+        for name, value in values.items():
+            setattr(spec.option, name, value)
+    return change
+
+
+def disable(flag):
+    def change(spec):
+        spec.option.disableflags |= flag
+    return change
+
+
+def armature(value):
+    def change(spec):
+        for joint in spec.joints:
+            if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+                joint.armature = value
+    return change
+
+
+def all_pairs(spec):
+    """Every two parts can touch, but for those that the scene excludes by name."""
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype = geom.conaffinity = 1
+
+
+def no_contacts_in_the_hand(spec):
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = (1, 1) if geom.name == "cube" else (1, 0)
+
+
+def islands(spec):
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+
+
+def both(*changes):
+    def change(spec):
+        for one in changes:
+            one(spec)
+    return change
+
+
+VARIANTS = {
+    "default": build,
+    "with islands": lambda: build(islands),
+    "all contact pairs": lambda: build(all_pairs),
+    "all contact pairs, with islands": lambda: build(both(all_pairs, islands)),
+    "no contacts in the hand": lambda: build(no_contacts_in_the_hand),
+    "iterations 100": lambda: build(option(iterations=100)),
+    "iterations 5": lambda: build(option(iterations=5)),
+    "iterations 3": lambda: build(option(iterations=3)),
+    "tolerance 1e-8": lambda: build(option(tolerance=1e-8)),
+    "tolerance 1e-4": lambda: build(option(tolerance=1e-4)),
+    "tolerance 1e-3": lambda: build(option(tolerance=1e-3)),
+    "line search of 5 steps": lambda: build(option(ls_iterations=5)),
+    "conjugate gradients": lambda: build(option(solver=mujoco.mjtSolver.mjSOL_CG)),
+    "sparse": lambda: build(option(jacobian=mujoco.mjtJacobian.mjJAC_SPARSE)),
+    "no midphase": lambda: build(disable(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)),
+    "elliptic cone": lambda: build(option(cone=mujoco.mjtCone.mjCONE_ELLIPTIC)),
+    "impratio 1": lambda: build(option(impratio=1)),
+    "armature 0.0002": lambda: build(armature(0.0002)),
+    "armature 0.001": lambda: build(armature(0.001)),
+    "armature 0.005": lambda: build(armature(0.005)),
+    "timestep 0.005": lambda: build(dt=0.005),
+    "timestep 0.002": lambda: build(dt=0.002),
+    "converged": lambda: build(converged),
+}
+
+
+class Starts:
+    """Start states and actions of all rollouts."""
+
+    def __init__(self, model, count, rng):
+        hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+        at, limits = model.jnt_qposadr[hinges], model.jnt_range[hinges]
+        cube = model.jnt_qposadr[model.body("cube").jntadr[0]]
+        qpos = np.tile(model.qpos0, (count, 1))
+        qpos[:, at] = np.clip(qpos[:, at] + rng.uniform(-0.2, 0.2, (count, len(at))), *limits.T)
+        qpos[:, cube:cube + 3] = GOAL + rng.uniform(-0.01, 0.01, (count, 3))
+        turn = rng.normal(size=(count, 4))
+        qpos[:, cube + 3:cube + 7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self.states = np.zeros((count, size))
+        self.states[:, 1:1 + model.nq] = qpos
+        low, high = model.actuator_ctrlrange.T
+        action = np.clip(rng.normal(0, 0.5, (count, CONTROL_STEPS, model.nu)), -1, 1)
+        self.controls = low + (action + 1) / 2 * (high - low)
+        self.cube, self.nq = slice(1 + cube, 4 + cube), model.nq
+
+
+def play(pool, model, datas, starts, states=None):
+    substeps = round(CONTROL_DT / model.opt.timestep)
+    controls = np.repeat(starts.controls, substeps, axis=1)
+    start = time.perf_counter()
+    trajectory, _ = pool.rollout(model, datas, starts.states if states is None else states, control=controls)
+    seconds = time.perf_counter() - start
+    return np.asarray(trajectory)[:, substeps - 1::substeps], seconds
+
+
+def contacts_and_energy(judge, starts, trajectory):
+    """Mean depth (mm) of the deepest contact of the cube and within the hand, mean kinetic energies (mJ)."""
+    data, cube = mujoco.MjData(judge), judge.geom("cube").id
+    cube_dof = judge.jnt_dofadr[judge.body("cube").jntadr[0]]
+    depths, energies = [], []
+    for states in trajectory[:, 9::10]:
+        for state in states:
+            mujoco.mj_setState(judge, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            mujoco.mj_fwdPosition(judge, data)
+            contact = data.contact
+            of_cube = (contact.geom == cube).any(1)
+            depths.append([max(0.0, -contact.dist[which].min()) if which.any() else 0.0 for which in (of_cube, ~of_cube)])
+            momentum = np.zeros(judge.nv)
+            mujoco.mj_mulM(judge, data, momentum, data.qvel)
+            energy = 0.5 * data.qvel * momentum
+            of_cube = slice(cube_dof, cube_dof + 6)
+            energies.append([energy.sum() - energy[of_cube].sum(), energy[of_cube].sum()])
+    return 1e3 * np.mean(depths, 0), 1e3 * np.mean(energies, 0)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--rollouts", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--only", nargs="*", help="variants besides the default")
+    parser.add_argument("--list", action="store_true")
+    args = parser.parse_args()
+    mujoco.set_mju_user_warning(lambda message: None)  # of states that diverge; they are counted
+    if args.list:
+        print("\n".join(VARIANTS))
+        return
+    names = ["default", *(n for n in (args.only or VARIANTS) if n != "default")]
+    reference = build(both(all_pairs, converged), dt=0.002)
+    starts = Starts(reference, args.rollouts, np.random.default_rng(0))
+    with rollout.Rollout(nthread=args.threads) as pool:
+        def run(model, states=None):
+            return play(pool, model, [mujoco.MjData(model) for _ in range(args.threads)], starts, states)
+
+        truth, _ = run(reference)
+        moved = starts.states.copy()
+        moved[:, starts.cube.start] += 1e-9
+        results = {"reference": (truth, None), "reference, moved 1 nm": (run(reference, moved)[0], None)}
+        models = {name: VARIANTS[name]() for name in names}
+        seconds = {name: [] for name in names}
+        for _ in range(args.rounds):
+            for name, model in models.items():
+                trajectory, taken = run(model)
+                seconds[name].append(taken)
+                results[name] = (trajectory, name)
+    print(f"{args.rollouts} rollouts of 1 s, {args.threads} threads, default "
+          f"{args.rollouts * CONTROL_STEPS / statistics.median(seconds['default']):.0f} control steps/s")
+    print("| variant | speed | apart, mm: median, 90 % | lost | deep, mm: cube, hand | kinetic energy, mJ: hand, cube |")
+    print("|---|---|---|---|---|---|")
+    for name, (trajectory, timed) in results.items():
+        speed = "–"
+        if timed:
+            speed = f"{statistics.median(d / s for d, s in zip(seconds['default'], seconds[name])):.2f}"
+        end = trajectory[:, -1, starts.cube]
+        apart = 1e3 * np.linalg.norm(end - truth[:, -1, starts.cube], axis=1)
+        lost = (np.linalg.norm(end - GOAL, axis=1) >= 0.24).mean()
+        # MuJoCo resets a diverged state, and with it the time.
+        diverged = (trajectory[:, -1, 0] < CONTROL_STEPS * CONTROL_DT - 1e-6).mean()
+        depth, energy = contacts_and_energy(reference, starts, trajectory)
+        print(f"| {name} | {speed} | {np.median(apart):.1f}, {np.percentile(apart, 90):.1f} | {100 * lost:.1f} ({100 * diverged:.1f}) % "
+              f"| {depth[0]:.2f}, {depth[1]:.2f} | {energy[0]:.1f}, {energy[1]:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
