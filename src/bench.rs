@@ -269,11 +269,11 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let flops = flops_per_sample(ppo.policy());
     time_gradient_steps(&mut ppo, &mut rollout, 2)?;
     let samples = size as f64 / median(time_gradient_steps(&mut ppo, &mut rollout, REPEATS)?);
-    let matmul = median(matmul_gflops(ppo.policy(), size, REPEATS));
+    let matmul = median(matmul_gflops(&ppo, size, REPEATS));
     Ok((samples, 1e-9 * flops * samples, matmul))
 }
 
-/// Env steps per second of whole iterations, the first one aside if it is short.
+/// Env steps per second of whole iterations, the first one aside if there are more.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
     let (mut ppo, mut pool) = agent(task, config)?;
     let mut rollout = ppo.rollout(&pool.block_sizes());

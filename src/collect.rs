@@ -44,7 +44,8 @@ struct Collecting<'a, E: Env> {
     result: Result<()>,
 }
 
-/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile.
+/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile:
+/// then blocks have come to different steps, and the pool must be reset before it collects again.
 ///
 /// # Errors
 /// Only if candle cannot allocate.

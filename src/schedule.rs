@@ -1,50 +1,61 @@
 //! Runs blocks of work through many rounds on all threads, without a barrier between the rounds.
 //!
 //! A block is what one thread works on at a time; its rounds happen in order. Whoever is free takes the next round of the
-//! next block, so that threads wait for one another only at the very end. What a block holds must not depend on the number
-//! of threads: then neither does the result.
+//! block that has waited longest, and nobody waits for a block that another thread is at: with fewer blocks left than
+//! threads, the others leave. What a block holds must not depend on the number of threads: then neither does the result.
 
+use std::collections::VecDeque;
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// The number of items in each block, for `items` of them: few enough for many threads, enough for whole vectors of work.
+/// The number of items in each block, for `items` of them: enough blocks for many threads, enough items for whole vectors
+/// of work.
 pub fn block_sizes(items: usize) -> Vec<usize> {
     let size = (items / 32).clamp(8, 64);
     (0..items).step_by(size).map(|first| size.min(items - first)).collect()
 }
 
-/// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool.
+/// A block that waits for its next round.
+struct Waiting<B> {
+    place: usize,
+    round: usize,
+    block: B,
+}
+
+/// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool, and gives
+/// the blocks back in their order.
 ///
 /// # Panics
-/// If `work` does, after the other threads have finished what they were at.
+/// If `work` does, after the other blocks have gone through their rounds.
 pub fn in_rounds<B: Send>(
     blocks: impl IntoIterator<Item = B>,
     rounds: usize,
     work: impl Fn(&mut B, usize) + Sync,
 ) -> Vec<B> {
-    let blocks: Vec<Mutex<(B, usize)>> = blocks.into_iter().map(|block| Mutex::new((block, 0))).collect();
-    let tickets = AtomicUsize::new(0);
+    let wait = |(place, block)| Waiting { place, round: 0, block };
+    let queue: Mutex<VecDeque<Waiting<B>>> = Mutex::new(blocks.into_iter().enumerate().map(wait).collect());
+    let done: Mutex<Vec<Waiting<B>>> = Mutex::new(Vec::new());
+    // Neither lock is held while there is work, so no panic happens under them.
     rayon::broadcast(|_| {
         loop {
-            let ticket = tickets.fetch_add(1, Ordering::Relaxed);
-            if ticket >= rounds * blocks.len() {
-                break;
+            let Some(mut next) = queue.lock().expect("no panic under this lock").pop_front() else { break };
+            if next.round == rounds {
+                done.lock().expect("no panic under this lock").push(next);
+                continue;
             }
-            // Which round it is, the block knows: its last one may have been taken by another thread that is still at it.
-            let Ok(mut locked) = blocks[ticket % blocks.len()].lock() else {
-                break; // `work` has panicked; that panic goes on when all threads are back.
-            };
-            let (block, round) = &mut *locked;
-            work(block, *round);
-            *round += 1;
+            work(&mut next.block, next.round);
+            next.round += 1;
+            queue.lock().expect("no panic under this lock").push_back(next);
         }
     });
-    blocks.into_iter().map(|block| block.into_inner().expect("a panic has left already").0).collect()
+    let mut done = done.into_inner().expect("no panic under this lock");
+    done.sort_unstable_by_key(|waiting| waiting.place);
+    done.into_iter().map(|waiting| waiting.block).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rayon::prelude::*;
 
     #[test]
     fn every_block_goes_through_all_rounds_in_order_on_any_number_of_threads() {
@@ -53,7 +64,23 @@ mod tests {
             for blocks in [1, 3, 20] {
                 let seen = pool.install(|| in_rounds(vec![Vec::new(); blocks], 50, |seen, round| seen.push(round)));
                 assert_eq!(seen, vec![(0..50).collect::<Vec<_>>(); blocks], "{threads} threads, {blocks} blocks");
+                let numbers = pool.install(|| in_rounds(0..blocks, 3, |_, _| {}));
+                assert!(numbers.into_iter().eq(0..blocks), "the blocks come back in their order");
             }
+        }
+    }
+
+    /// A thread that waits inside one block for parallel work of its own may be given another block meanwhile.
+    #[test]
+    fn work_that_is_parallel_in_itself_does_not_hang() {
+        for threads in [1, 2, 4] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let sums = pool.install(|| {
+                in_rounds(vec![0u64; 5], 40, |sum, round| {
+                    *sum += (0..2000u64).into_par_iter().map(|i| std::hint::black_box(i ^ round as u64)).sum::<u64>();
+                })
+            });
+            assert!(sums.iter().all(|&sum| sum == sums[0] && sum > 0));
         }
     }
 

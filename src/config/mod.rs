@@ -84,6 +84,7 @@ pub struct PpoConfig {
     pub hidden: Vec<usize>,
     pub activation: Activation,
     pub backend: Backend,
+    pub precision: Precision,
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
     pub desired_kl: f64,
@@ -116,6 +117,18 @@ pub enum Backend {
     Fused,
     /// candle's tensors and automatic gradients: slower, the reference for the other.
     Candle,
+}
+
+/// The numbers that are multiplied in the nets while learning and collecting; all else is in floats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// Floats.
+    F32,
+    /// bf16, with sums in floats, on the tiles of processors that have them.
+    Bf16,
+    /// The rounding of bf16 without its speed, on any processor.
+    Bf16Rounded,
 }
 
 /// The course of a training; `configs/repose.toml` says what each key means.

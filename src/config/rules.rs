@@ -1,6 +1,6 @@
 //! Which values are allowed.
 
-use super::Config;
+use super::{Backend, Config, Precision};
 
 impl Config {
     /// Every rule that the values break, as "key = value: must …".
@@ -54,6 +54,12 @@ impl Config {
             "ppo.minibatches",
             ppo.minibatches,
             &format!("divide num_envs * horizon = {samples}"),
+        );
+        rules.check(
+            ppo.precision == Precision::F32 || ppo.backend == Backend::Fused,
+            "ppo.precision",
+            toml::Value::try_from(ppo.precision).expect("a word"),
+            "be \"f32\" with ppo.backend = \"candle\"",
         );
         let sizes_fit = !ppo.hidden.is_empty() && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
         let hidden = format!("{:?}", ppo.hidden);

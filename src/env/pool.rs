@@ -130,6 +130,8 @@ impl<E: Env> EnvBlock<E> {
         let (size, action_size) = (env.observation_size(), env.action_size());
         assert_eq!(actions.len(), self.len() * action_size, "actions of a block");
         assert!(buffers.rewards.len() == self.len() && buffers.ends.len() == self.len(), "rows of a block");
+        let both = [buffers.observations.len(), buffers.final_observations.len()];
+        assert_eq!(both, [self.len() * size; 2], "observations of a block");
         let rows = buffers.observations.chunks_exact_mut(size).zip(buffers.final_observations.chunks_exact_mut(size));
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));

@@ -3,8 +3,19 @@
 use anyhow::Result;
 use candle_core::Tensor;
 
+use super::fused::{Arithmetic, Fused};
+use super::reference::Reference;
 use super::{Policy, Rollout};
 use crate::config::{self, PpoConfig};
+
+/// Of Adam: the decay of the mean of the gradient.
+pub const BETA1: f64 = 0.9;
+
+/// Of Adam: the decay of the mean of its square.
+pub const BETA2: f64 = 0.999;
+
+/// Of Adam: against a division by zero.
+pub const EPSILON: f64 = 1e-8;
 
 /// Figures of one minibatch.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -72,10 +83,10 @@ pub trait Backend: Send {
 ///
 /// # Errors
 /// Only if candle cannot allocate.
-pub fn new(config: &PpoConfig, policy: &Policy) -> Result<Box<dyn Backend>> {
+pub fn new(config: &PpoConfig, policy: &Policy, arithmetic: Arithmetic) -> Result<Box<dyn Backend>> {
     Ok(match config.backend {
-        config::Backend::Fused => Box::new(super::fused::Fused::new(config, policy)),
-        config::Backend::Candle => Box::new(super::reference::Reference::new(config, policy)?),
+        config::Backend::Fused => Box::new(Fused::new(config, policy, arithmetic)),
+        config::Backend::Candle => Box::new(Reference::new(config, policy)?),
     })
 }
 
@@ -83,7 +94,7 @@ pub fn new(config: &PpoConfig, policy: &Policy) -> Result<Box<dyn Backend>> {
 mod tests {
     use super::super::Ppo;
     use super::*;
-    use crate::config::{Activation, Config};
+    use crate::config::{Activation, Config, Precision};
     use crate::rng;
 
     /// A learner of that kind, and a rollout that it could have collected with a slightly different policy.
@@ -192,19 +203,51 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_the_same_bits_for_any_number_of_threads() {
-        let run = |threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| {
+    fn gradients_are_the_same_bits_for_any_number_of_threads_and_whatever_came_before() {
+        for precision in [Precision::F32, Precision::Bf16Rounded] {
+            let run = |threads: &[usize]| {
                 let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Silu);
+                let arithmetic = Arithmetic::new(precision).unwrap();
+                ppo.backend = Box::new(Fused::new(&ppo.config, &ppo.policy, arithmetic));
+                ppo.backend.begin(&ppo.policy, &rollout).unwrap();
                 let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
-                let losses = ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap();
+                let mut losses = Vec::new();
+                for (i, &number) in threads.iter().enumerate() {
+                    // First a few samples, in the end all.
+                    let samples = if i + 1 < threads.len() { &samples[..40] } else { &samples[..] };
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(number).build().unwrap();
+                    losses.push(pool.install(|| ppo.backend.gradient(&ppo.policy, &rollout, samples).unwrap()));
+                }
                 ppo.backend.step(&ppo.policy, 1e-3, 1.0).unwrap();
-                (losses, parameters(&ppo.policy))
-            })
-        };
-        let one = run(1);
-        assert_eq!(one, run(2));
-        assert_eq!(one, run(8));
+                (losses.pop(), parameters(&ppo.policy))
+            };
+            let one = run(&[1]);
+            for threads in [&[2][..], &[8], &[1, 2], &[2, 8], &[8, 1]] {
+                assert!(one == run(threads), "{precision:?}, {threads:?} threads");
+            }
+        }
+    }
+
+    #[test]
+    fn the_smallest_nets_and_minibatches_agree_with_candle() {
+        let found = [config::Backend::Fused, config::Backend::Candle].map(|backend| {
+            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            (config.backend, config.hidden) = (backend, vec![1]);
+            let mut ppo = Ppo::new(&config, 1, 1, 3).unwrap();
+            let mut rollout = Rollout::new(1, &[1], 1, 1);
+            rollout.blocks[0].observations.fill(0.7);
+            rollout.blocks[0].actions.fill(0.4);
+            rollout.blocks[0].advantages.fill(1.5);
+            rollout.blocks[0].returns.fill(0.3);
+            ppo.backend.begin(&ppo.policy, &rollout).unwrap();
+            let losses = ppo.backend.gradient(&ppo.policy, &rollout, &[0]).unwrap();
+            ppo.backend.step(&ppo.policy, 1e-3, 1.0).unwrap();
+            (losses, parameters(&ppo.policy))
+        });
+        assert_close(found[0].0.grad_norm, found[1].0.grad_norm, 1e-5, "norm");
+        assert_close(found[0].0.total, found[1].0.total, 1e-5, "loss");
+        for ((name, a), (_, b)) in found[0].1.iter().zip(&found[1].1) {
+            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5), "{name}: {a:?} not {b:?}");
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::time::Instant;
 use anyhow::Result;
 use rayon::prelude::*;
 
-use super::fused::{Matrix, ROWS, product};
+use super::fused::{Matrix, Multiplier, ROWS};
 use super::{Policy, Ppo, Rollout};
 
 /// Seconds after which, from the third on, no further gradient step is timed.
@@ -24,9 +24,11 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
     while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {
-        let start = Instant::now();
-        ppo.minibatch_step(rollout, &minibatch)?;
-        seconds.push(start.elapsed().as_secs_f64());
+        let taken = rayon::scope(|_| {
+            let start = Instant::now();
+            ppo.minibatch_step(rollout, &minibatch, false).map(|_| start.elapsed())
+        });
+        seconds.push(taken?.as_secs_f64());
     }
     Ok(seconds)
 }
@@ -43,27 +45,28 @@ pub fn flops_per_sample(policy: &Policy) -> f64 {
     products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
 
-/// Times the matrix products of one forward and backward pass of `policy` on `samples` samples, on all threads, on numbers that
+/// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads, on numbers that
 /// lie in the caches as far as they fit; for each repeat 10⁹ floating-point operations per second.
-pub fn matmul_gflops(policy: &Policy, samples: usize, repeats: usize) -> Vec<f64> {
-    let blocks = samples.div_ceil(ROWS);
+pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
+    let (policy, arithmetic, blocks) = (&ppo.policy, ppo.arithmetic, samples.div_ceil(ROWS));
     let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");
     let pass = |_: usize| {
         let (x, dz) = (vec![0.5f32; ROWS * widest], vec![0.1f32; ROWS * widest]);
         let (mut out, weights) = (vec![0.0; (ROWS * widest).max(widest * widest)], vec![0.01f32; widest * widest]);
+        let mut multiplier = Multiplier::new(arithmetic);
         let start = Instant::now();
         for (o, i, inner) in products(policy) {
             let weight = Matrix::new(&weights[..o * i], o, i);
             let (x, dz) = (Matrix::new(&x[..ROWS * i], ROWS, i), Matrix::new(&dz[..ROWS * o], ROWS, o));
-            product(&mut out[..ROWS * o], x, weight.transposed(), false);
-            product(&mut out[..o * i], dz.transposed(), x, true);
+            multiplier.product(&mut out[..ROWS * o], x, weight.transposed(), false);
+            multiplier.product(&mut out[..o * i], dz.transposed(), x, true);
             if inner {
-                product(&mut out[..ROWS * i], dz, weight, false);
+                multiplier.product(&mut out[..ROWS * i], dz, weight, false);
             }
         }
         start.elapsed().as_secs_f64()
     };
-    let threads = rayon::current_num_threads() as f64;
+    let threads = rayon::current_num_threads().min(blocks) as f64;
     (0..repeats)
         .map(|_| {
             let seconds: f64 = (0..blocks).into_par_iter().with_max_len(1).map(pass).sum();

@@ -33,6 +33,7 @@ pub use rollout::{Rollout, RolloutBlock, RolloutStep};
 use crate::config::PpoConfig;
 use crate::rng::{self, Rng};
 use backend::{Backend, Losses};
+use fused::Arithmetic;
 
 /// The policy and what improves it.
 pub struct Ppo {
@@ -40,6 +41,7 @@ pub struct Ppo {
     seed: u64,
     policy: Policy,
     backend: Box<dyn Backend>,
+    arithmetic: Arithmetic,
     learning_rate: f64,
 }
 
@@ -74,11 +76,12 @@ impl Ppo {
     /// A new learner for observations and actions of these sizes; all its randomness follows from `seed`.
     ///
     /// # Errors
-    /// Only if candle cannot allocate.
+    /// A precision that this machine does not have.
     pub fn new(config: &PpoConfig, observation_size: usize, action_size: usize, seed: u64) -> Result<Self> {
         let policy = Policy::new(config, observation_size, action_size, seed)?;
-        let backend = backend::new(config, &policy)?;
-        Ok(Self { config: config.clone(), seed, policy, backend, learning_rate: config.learning_rate })
+        let arithmetic = Arithmetic::new(config.precision)?;
+        let backend = backend::new(config, &policy, arithmetic)?;
+        Ok(Self { config: config.clone(), seed, policy, backend, arithmetic, learning_rate: config.learning_rate })
     }
 
     /// The policy as it is now.
@@ -93,7 +96,7 @@ impl Ppo {
 
     /// What acting for blocks of up to `rows` environments needs, to be used again and again.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false)
+        self.policy.workspace(rows, false, self.arithmetic)
     }
 
     /// The policy of this iteration, to collect a rollout with.
@@ -116,6 +119,11 @@ impl Ppo {
     /// # Errors
     /// A loss, gradient or weight that is not finite; the policy must not be used or saved then.
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
+        // On a worker thread: from outside, each of the many short parallel parts would put this one to sleep and wake it.
+        rayon::scope(|_| self.learn(rollout, iteration))
+    }
+
+    fn learn(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
         let explained_variance = self.prepare(rollout);
         self.backend.begin(&self.policy, rollout)?;
         let size = rollout.samples() / self.config.minibatches;
@@ -125,10 +133,11 @@ impl Ppo {
         for epoch in 0..self.config.epochs {
             order.shuffle(&mut shuffle);
             for (part, samples) in order.chunks_exact(size).enumerate() {
+                let first = (epoch, part) == (0, 0);
                 let losses = self
-                    .minibatch_step(rollout, samples)
+                    .minibatch_step(rollout, samples, first)
                     .with_context(|| format!("iteration {iteration}, epoch {epoch}, minibatch {part}"))?;
-                if (epoch, part) == (0, 0) {
+                if first {
                     (stats.first_kl, stats.first_ratio_error) = (losses.kl, losses.ratio_error);
                 }
                 stats.add(&losses);
@@ -160,8 +169,8 @@ impl Ppo {
         if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
     }
 
-    /// One gradient step on these samples.
-    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32]) -> Result<Losses> {
+    /// One gradient step on these samples. The `first` of an update still sees the policy that acted.
+    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Losses> {
         let losses = self.backend.gradient(&self.policy, rollout, samples)?;
         let Losses { total, grad_norm, .. } = losses;
         if !total.is_finite() {
@@ -170,7 +179,9 @@ impl Ppo {
         if !grad_norm.is_finite() {
             bail!("the norm of the gradient is {grad_norm}: the training has failed and stops here");
         }
-        self.adapt_learning_rate(losses.kl);
+        if !first {
+            self.adapt_learning_rate(losses.kl);
+        }
         // As in PyTorch's clip_grad_norm_, with its constant against a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         self.backend.step(&self.policy, self.learning_rate, scale)?;
@@ -179,8 +190,11 @@ impl Ppo {
 
     fn check_weights(&self) -> Result<()> {
         for (name, var) in self.policy.parameters() {
-            let sound = var.flatten_all()?.to_vec1::<f32>()?.iter().all(|x| x.is_finite());
-            ensure!(sound, "the step has made `{name}` infinite or NaN: the training has failed and stops here");
+            // A sum with a number that is not finite is not finite.
+            ensure!(
+                var.sum_all()?.to_scalar::<f32>()?.is_finite(),
+                "the step has made `{name}` infinite or NaN: the training has failed and stops here"
+            );
         }
         Ok(())
     }
@@ -194,7 +208,7 @@ impl Ppo {
         }
         if kl > 2.0 * desired {
             self.learning_rate = (self.learning_rate / 1.5).max(lowest);
-        } else if kl > 0.0 && kl < 0.5 * desired {
+        } else if kl < 0.5 * desired {
             self.learning_rate = (self.learning_rate * 1.5).min(highest);
         }
     }
@@ -250,7 +264,7 @@ mod tests {
     fn the_learning_rate_follows_the_divergence_within_its_range() {
         let mut ppo = learner(0.01);
         // The divergence, and the factor that the rate is then changed by.
-        for (kl, factor) in [(0.021, 1.0 / 1.5), (0.019, 1.0), (0.006, 1.0), (0.004, 1.5), (0.0, 1.0)] {
+        for (kl, factor) in [(0.021, 1.0 / 1.5), (0.019, 1.0), (0.006, 1.0), (0.004, 1.5), (0.0, 1.5)] {
             ppo.learning_rate = 1e-3;
             ppo.adapt_learning_rate(kl);
             assert!((ppo.learning_rate / 1e-3 - factor).abs() < 1e-12, "KL {kl}: {}", ppo.learning_rate);

@@ -5,7 +5,7 @@ use candle_core::{Device, Tensor, Var};
 use rand::RngExt;
 
 use super::Normalizer;
-use super::fused::{Net, Workspace};
+use super::fused::{Arithmetic, Net, Workspace};
 use super::normalizer::Scaling;
 use super::reference::Mlp;
 use crate::config::{Activation, Backend, PpoConfig};
@@ -25,7 +25,7 @@ pub struct Policy {
     sizes: [usize; 2],
 }
 
-/// A policy to act with, as it is at one moment: no graph, and nothing is allocated with our own kernels. While it lives,
+/// A policy to act with, as it is at one moment: no graph, and no array allocated with our own kernels. While it lives,
 /// the parameters cannot be written to.
 pub struct FrozenPolicy<'a> {
     policy: &'a Policy,
@@ -111,10 +111,10 @@ impl Policy {
     }
 
     /// What both nets need for blocks of up to `rows` rows.
-    pub(super) fn workspace(&self, rows: usize, learning: bool) -> Workspace {
+    pub(super) fn workspace(&self, rows: usize, learning: bool, arithmetic: Arithmetic) -> Workspace {
         let [observation, action] = self.sizes;
         let sizes: Vec<usize> = [observation].iter().chain(&self.hidden).chain([&action]).copied().collect();
-        Workspace::new(&sizes, self.activation, rows, learning)
+        Workspace::new(&sizes, self.activation, rows, learning, arithmetic)
     }
 
     /// The policy of this moment.
@@ -144,9 +144,9 @@ impl Policy {
 }
 
 impl FrozenPolicy<'_> {
-    /// What [`FrozenPolicy::forward`] needs, to be used again and again; `rows` rows are computed at a time.
+    /// What [`FrozenPolicy::forward`] needs, to be used again and again; `rows` rows are computed at a time, in floats.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false)
+        self.policy.workspace(rows, false, Arithmetic::F32)
     }
 
     /// The standard deviations of the actions `[A]`.

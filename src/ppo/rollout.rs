@@ -57,6 +57,9 @@ pub struct RolloutStep<'a> {
 impl Rollout {
     /// An empty rollout of `horizon` steps of blocks of so many environments, all blocks but the last of one size.
     pub fn new(horizon: usize, block_sizes: &[usize], observation_size: usize, action_size: usize) -> Self {
+        let (last, others) = block_sizes.split_last().expect("a rollout has a block");
+        let even = others.iter().all(|size| *size == block_sizes[0]) && *last <= block_sizes[0];
+        assert!(even, "only the last block may be smaller: {block_sizes:?}");
         let block = |&envs: &usize| RolloutBlock::new([horizon, envs, observation_size, action_size]);
         Self { blocks: block_sizes.iter().map(block).collect() }
     }

@@ -49,6 +49,20 @@ fn settings_that_cannot_be_are_named_all_at_once() {
 }
 
 #[test]
+fn tiles_that_the_processor_lacks_are_refused_before_anything_is_begun() {
+    let folder = tempfile::tempdir().unwrap();
+    let bf16 = ["--set", "ppo.precision=bf16", "--set", "env.num_envs=4", "--set", "ppo.hidden=[8]"];
+    let output = program(folder.path(), &[&["bench", "--only", "learner"], &bf16[..]].concat());
+    if !output.status.success() {
+        assert!(stderr(&output).contains("(AMX)"), "{}", stderr(&output));
+        refused(folder.path(), &[&["train"], &bf16[..]].concat(), 1, &["ppo.precision = \"bf16\"", "\"f32\"", "(AMX)"]);
+        assert!(!folder.path().join("runs").exists(), "nothing is begun");
+    }
+    let both = ["train", "--set", "ppo.precision=bf16-rounded", "--set", "ppo.backend=candle"];
+    refused(folder.path(), &both, 1, &["ppo.precision = \"bf16-rounded\": must be \"f32\" with ppo.backend"]);
+}
+
+#[test]
 fn files_that_are_missing_or_no_configurations_are_named() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("broken.toml"), "[env\n").unwrap();

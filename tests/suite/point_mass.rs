@@ -3,6 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::collect::{Scratch, collect};
+use shadow_repose::config::{Backend, PpoConfig, Precision};
 use shadow_repose::env::{End, Env, EnvPool, Transition};
 use shadow_repose::ppo::Ppo;
 use shadow_repose::rng::{self, Rng};
@@ -66,32 +67,59 @@ impl Env for PointMass {
 }
 
 fn pool(seed: u64) -> EnvPool<PointMass> {
-    EnvPool::new(seed, (0..64).map(|_| PointMass { position: [0.0; 2], age: 0 }).collect())
+    pool_of(64, seed)
 }
 
-fn settings() -> shadow_repose::config::PpoConfig {
+fn pool_of(envs: usize, seed: u64) -> EnvPool<PointMass> {
+    EnvPool::new(seed, (0..envs).map(|_| PointMass { position: [0.0; 2], age: 0 }).collect())
+}
+
+fn settings() -> PpoConfig {
     let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9"];
     config(&settings).ppo
 }
 
-#[test]
-fn ppo_learns_to_bring_the_point_home_on_three_seeds() {
-    for seed in 0..3 {
-        let (mut pool, mut ppo) = (pool(seed), Ppo::new(&settings(), 2, 2, seed).unwrap());
-        let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-        pool.reset(0, rollout.first_observations_mut());
-        let mut distances = Vec::new();
-        for iteration in 1..=60 {
-            collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
-            ppo.update(&mut rollout, iteration).unwrap();
-            rollout.carry_over();
-            let finished = pool.take_finished();
-            if !finished.is_empty() {
-                distances.push(finished.iter().sum::<f64>() / finished.len() as f64);
-            }
+/// Mean distances at the end of the episodes of the first and of the last of 60 iterations.
+fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
+    let (mut pool, mut ppo) = (pool(seed), Ppo::new(settings, 2, 2, seed).unwrap());
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+    pool.reset(0, rollout.first_observations_mut());
+    let mut distances = Vec::new();
+    for iteration in 1..=60 {
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
+        ppo.update(&mut rollout, iteration).unwrap();
+        rollout.carry_over();
+        let finished = pool.take_finished();
+        if !finished.is_empty() {
+            distances.push(finished.iter().sum::<f64>() / finished.len() as f64);
         }
-        let (first, last) = (distances[0], distances[distances.len() - 1]);
-        assert!(first > 0.5 && last < 0.15, "seed {seed}: {first} → {last}");
+    }
+    [distances[0], distances[distances.len() - 1]]
+}
+
+#[test]
+fn ppo_learns_to_bring_the_point_home_on_three_seeds_in_floats_and_in_bf16() {
+    for precision in [Precision::F32, Precision::Bf16Rounded] {
+        for seed in 0..3 {
+            let [first, last] = distances(&PpoConfig { precision, ..settings() }, seed);
+            assert!(first > 0.5 && last < 0.15, "{precision:?}, seed {seed}: {first} → {last}");
+        }
+    }
+}
+
+#[test]
+fn ppo_learns_with_candles_tensors_too() {
+    let [first, last] = distances(&PpoConfig { backend: Backend::Candle, ..settings() }, 0);
+    assert!(first > 0.5 && last < 0.15, "{first} → {last}");
+}
+
+/// On a processor with tiles for bf16; elsewhere the refusal is tested with the program.
+#[test]
+fn ppo_learns_on_tiles_where_there_are_any() {
+    let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
+    if Ppo::new(&settings, 2, 2, 0).is_ok() {
+        let [first, last] = distances(&settings, 0);
+        assert!(first > 0.5 && last < 0.15, "{first} → {last}");
     }
 }
 
@@ -167,4 +195,30 @@ fn an_interrupted_collection_says_so() {
         |interrupted| collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(interrupted)).unwrap();
     assert!(!collected(true));
     assert!(collected(false));
+}
+
+#[test]
+fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
+    for envs in [1, 9, 21] {
+        let learn = |threads: usize| {
+            let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            threads.install(|| {
+                let (mut pool, mut ppo) = (pool_of(envs, 5), Ppo::new(&settings(), 2, 2, 5).unwrap());
+                let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+                pool.reset(0, rollout.first_observations_mut());
+                for iteration in 1..=4 {
+                    let never = AtomicBool::new(false);
+                    assert!(collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &never).unwrap());
+                    ppo.update(&mut rollout, iteration).unwrap();
+                    rollout.carry_over();
+                }
+                let (policy, mut means) = (ppo.policy().freeze().unwrap(), [0.0; 2]);
+                policy.forward(&[0.3, -0.4], [Some(&mut means), None], &mut policy.workspace(1)).unwrap();
+                (means, pool.take_finished())
+            })
+        };
+        let one = learn(1);
+        assert!(one.1.len() >= 3 * envs, "episodes must end meanwhile");
+        assert!(one == learn(2) && one == learn(8), "{envs} environments");
+    }
 }

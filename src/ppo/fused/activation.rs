@@ -18,15 +18,15 @@ fn exp_m1(x: f32) -> f32 {
     /// ln 2 in two parts, the first of so few digits that its product with n is exact.
     const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
     let x = x.clamp(-87.0, 88.0);
-    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
-    let r = (x - n * LN2[0]) - n * LN2[1];
-    let mut p = 1.987_569_1e-4;
+    let r = n.mul_add(-LN2[1], n.mul_add(-LN2[0], x));
+    let mut p = 1.987_569_1e-4f32;
     for coefficient in [1.398_2e-3, 8.333_452e-3, 4.166_579_6e-2, 0.166_666_66, 0.5] {
-        p = p * r + coefficient;
+        p = p.mul_add(r, coefficient);
     }
     let scale = f32::from_bits((shifted.to_bits() << 23).wrapping_add(127 << 23));
-    scale * (p * r * r + r) + (scale - 1.0)
+    scale.mul_add((p * r).mul_add(r, r), scale - 1.0)
 }
 
 #[inline(always)]
@@ -87,25 +87,44 @@ pub fn activate(out: &mut [f32], z: &[f32], activation: Activation) {
     }
 }
 
-/// Multiplies `grad` by the slopes of the activation, in place.
+/// Multiplies `grad` `[B, C]` by the slopes of the activation, in place, and adds the sums of its columns to `sums` `[C]`.
 ///
-/// `known` has the outputs of the activation, or its inputs where [`slope_from_output`] is false.
-pub fn multiply_slopes(grad: &mut [f32], known: &[f32], activation: Activation) {
+/// `known` `[B, C]` has the outputs of the activation, or its inputs where [`slope_from_output`] is false; without an
+/// activation it is not looked at.
+pub fn slopes_and_sums(grad: &mut [f32], known: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
     match activation {
-        Activation::Elu => each(grad, known, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
-        Activation::Relu => each(grad, known, |g, y| if y > 0.0 { g } else { 0.0 }),
-        Activation::Silu => each(grad, known, |g, x| g * silu_slope(x)),
-        Activation::Tanh => each(grad, known, |g, y| g * (1.0 - y * y)),
+        None => add_columns(sums, grad),
+        Some(Activation::Elu) => each_and_sum(grad, known, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
+        Some(Activation::Relu) => each_and_sum(grad, known, sums, |g, y| if y > 0.0 { g } else { 0.0 }),
+        Some(Activation::Silu) => each_and_sum(grad, known, sums, |g, x| g * silu_slope(x)),
+        Some(Activation::Tanh) => each_and_sum(grad, known, sums, |g, y| g * (1.0 - y * y)),
     }
 }
 
-/// Adds the sums of the columns of `rows` `[B, C]` to `sums` `[C]`.
-pub fn add_column_sums(sums: &mut [f32], rows: &[f32]) {
+fn add_columns(sums: &mut [f32], rows: &[f32]) {
     Arch::new().dispatch(
         #[inline(always)]
         || {
             for row in rows.chunks_exact(sums.len()) {
                 sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+            }
+        },
+    );
+}
+
+/// `x[i] = f(x[i], y[i])`, and the rows of `x` are added to `sums`.
+#[inline(always)]
+fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32) -> f32) {
+    assert_eq!(x.len(), y.len());
+    let width = sums.len();
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
+                for ((x, &y), sum) in x.iter_mut().zip(y).zip(&mut *sums) {
+                    *x = f(*x, y);
+                    *sum += *x;
+                }
             }
         },
     );
@@ -202,7 +221,9 @@ mod tests {
                 add_bias_activate(&mut output, &[0.0], activation);
                 let known = if slope_from_output(activation) { output } else { [x] };
                 let mut grad = [2.0];
-                multiply_slopes(&mut grad, &known, activation);
+                let mut sums = [1.0];
+                slopes_and_sums(&mut grad, &known, Some(activation), &mut sums);
+                assert_eq!(sums[0], 1.0 + grad[0]);
                 let step = 1e-6;
                 let x = f64::from(x);
                 let slope = (exact(activation, x + step) - exact(activation, x - step)) / (2.0 * step);
@@ -212,9 +233,10 @@ mod tests {
     }
 
     #[test]
-    fn sums_of_columns_are_added_to_what_is_there() {
-        let mut sums = [10.0, 20.0, 30.0];
-        add_column_sums(&mut sums, &[1.0, 2.0, 3.0, 0.5, -2.0, 4.0]);
+    fn without_an_activation_only_the_columns_are_summed() {
+        let (mut grad, mut sums) = ([1.0, 2.0, 3.0, 0.5, -2.0, 4.0], [10.0, 20.0, 30.0]);
+        slopes_and_sums(&mut grad, &[], None, &mut sums);
         assert_eq!(sums, [11.5, 20.0, 37.0]);
+        assert_eq!(grad, [1.0, 2.0, 3.0, 0.5, -2.0, 4.0]);
     }
 }

@@ -6,7 +6,7 @@ use pulp::Arch;
 use rayon::prelude::*;
 use std::sync::Mutex;
 
-use super::super::reference::adam::{BETA1, BETA2, EPSILON};
+use super::super::backend::{BETA1, BETA2, EPSILON};
 
 /// Parameters that one task takes.
 const CHUNK: usize = 8192;

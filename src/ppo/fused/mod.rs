@@ -3,11 +3,15 @@
 //! The samples are split into groups, and each (group, net) is one task for one thread: it gathers and normalises a block of
 //! rows at a time, takes it forward, computes the loss and goes backward while all of it lies in the cache of that core, and
 //! adds up the gradient of its group. Then the groups are added in a fixed order. How samples are grouped depends on
-//! their number alone, so the result is the same for any number of threads. After the first minibatch nothing is allocated.
+//! their number alone, so the result is the same for any number of threads. After the first minibatch no array of samples or
+//! weights is allocated, but for what gemm packs matrices into.
 
 mod activation;
 mod adam;
+mod amx;
+mod bf16;
 mod loss;
+mod multiplier;
 mod net;
 mod product;
 
@@ -18,8 +22,9 @@ use candle_core::{Device, Tensor};
 use pulp::Arch;
 use rayon::prelude::*;
 
+pub use multiplier::{Arithmetic, Multiplier};
 pub use net::{Net, Workspace};
-pub use product::{Matrix, product};
+pub use product::Matrix;
 
 use super::backend::{Backend, Losses, Moments};
 use super::normalizer::Scaling;
@@ -43,7 +48,8 @@ const CHUNK: usize = 4096;
 /// Gradients and steps by our own kernels.
 pub struct Fused {
     config: PpoConfig,
-    /// For each thread that has taken part.
+    arithmetic: Arithmetic,
+    /// For each thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
     /// For each group and net.
     parts: Vec<Part>,
@@ -55,6 +61,15 @@ pub struct Fused {
     scaling: Scaling,
     old_log_std: Vec<f32>,
     squares: Vec<f64>,
+}
+
+/// How a minibatch is split up, which follows from its size alone.
+struct Grouping {
+    /// Samples of a group; the last one may have fewer.
+    size: usize,
+    groups: usize,
+    /// Rows that go through a net together: blocks of one size, as far as that goes.
+    rows: usize,
 }
 
 /// What a task leaves behind.
@@ -75,10 +90,11 @@ const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 
 impl Fused {
     /// For the parameters of `policy`.
-    pub fn new(config: &PpoConfig, policy: &Policy) -> Self {
+    pub fn new(config: &PpoConfig, policy: &Policy, arithmetic: Arithmetic) -> Self {
         let zeros = || vec![0.0; policy.parameter_count()];
         Self {
             config: config.clone(),
+            arithmetic,
             workspaces: Vec::new(),
             parts: Vec::new(),
             gradient: zeros(),
@@ -90,17 +106,18 @@ impl Fused {
         }
     }
 
-    /// Makes room for a minibatch; returns the number of groups and of samples in each but the last.
-    fn reserve(&mut self, policy: &Policy, samples: usize) -> (usize, usize) {
+    /// Makes room for a minibatch.
+    fn reserve(&mut self, policy: &Policy, samples: usize) -> Grouping {
         let size = samples.div_ceil(GROUPS).max(SMALLEST_GROUP);
-        let groups = samples.div_ceil(size);
+        let grouping = Grouping { size, groups: samples.div_ceil(size), rows: size.div_ceil(size.div_ceil(ROWS)) };
+        self.workspaces.retain_mut(|work| work.get_mut().expect("no task has panicked").rows() >= grouping.rows);
         while self.workspaces.len() < rayon::current_num_threads() {
-            self.workspaces.push(Mutex::new(policy.workspace(ROWS.min(size), true)));
+            self.workspaces.push(Mutex::new(policy.workspace(grouping.rows, true, self.arithmetic)));
         }
-        if self.parts.len() < 2 * groups {
-            self.parts.resize(2 * groups, Part::default());
+        if self.parts.len() < 2 * grouping.groups {
+            self.parts.resize(2 * grouping.groups, Part::default());
         }
-        (groups, size)
+        grouping
     }
 
     /// Adds the gradients of the groups; returns the norm of the result.
@@ -137,7 +154,7 @@ impl Backend for Fused {
     }
 
     fn gradient(&mut self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Losses> {
-        let (groups, size) = self.reserve(policy, samples.len());
+        let Grouping { size, groups, rows } = self.reserve(policy, samples.len());
         let nets = policy.fused_nets();
         let log_std: Vec<f32> = policy.log_std().to_vec1()?;
         let loss = Loss::new(rollout, samples.len(), self.config.clip, self.config.value_coef, &log_std);
@@ -149,8 +166,6 @@ impl Backend for Fused {
             part.sums.clear(log_std.len());
             let thread = rayon::current_thread_index().expect("rayon runs this");
             let work = &mut *self.workspaces[thread].lock().expect("no task has panicked");
-            // Blocks of one size, as far as that goes.
-            let rows = group.len().div_ceil(group.len().div_ceil(work.rows()));
             for (i, block) in group.chunks(rows).enumerate() {
                 gather(rollout, block, &self.scaling, &mut work.inputs);
                 net.forward(block.len(), work);

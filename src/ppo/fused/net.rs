@@ -2,8 +2,9 @@
 
 use candle_core::{CpuStorage, Storage, StorageRef, Var};
 
-use super::activation::{activate, add_bias, add_bias_activate, add_column_sums, multiply_slopes, slope_from_output};
-use super::product::{Matrix, product};
+use super::activation::{activate, add_bias, add_bias_activate, slope_from_output, slopes_and_sums};
+use super::multiplier::{Arithmetic, Multiplier};
+use super::product::Matrix;
 use crate::config::Activation;
 
 /// One network on the present parameters. While it lives, they cannot be written to.
@@ -55,12 +56,13 @@ pub struct Workspace {
     inner: Vec<Vec<f32>>,
     /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the one below it.
     grads: [Vec<f32>; 2],
+    multiplier: Multiplier,
     rows: usize,
 }
 
 impl Workspace {
     /// For nets with these sizes of inputs, hidden layers and (the most) outputs. Only a `learning` one can go backward.
-    pub fn new(sizes: &[usize], activation: Activation, rows: usize, learning: bool) -> Self {
+    pub fn new(sizes: &[usize], activation: Activation, rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
         let (inputs, layers) = sizes.split_first().expect("a net has inputs");
         let arrays = || layers.iter().map(|size| vec![0.0; rows * size]).collect();
         let widest = layers.iter().max().expect("a net has layers");
@@ -69,6 +71,7 @@ impl Workspace {
             outputs: arrays(),
             inner: if learning && !slope_from_output(activation) { arrays() } else { Vec::new() },
             grads: [0, 1].map(|_| vec![0.0; if learning { rows * widest } else { 0 }]),
+            multiplier: Multiplier::new(arithmetic),
             rows,
         }
     }
@@ -112,7 +115,7 @@ impl<'a> Net<'a> {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
-            product(y, layer.x(x, rows), layer.weight().transposed(), false);
+            work.multiplier.product(y, layer.x(x, rows), layer.weight().transposed(), false);
             if l + 1 == self.layers.len() {
                 add_bias(y, &layer.bias);
             } else if let Some(inner) = work.inner.get_mut(l) {
@@ -139,19 +142,18 @@ impl<'a> Net<'a> {
             rest = first;
 
             let grad = &mut above[..rows * layer.outputs];
-            if l + 1 < self.layers.len() {
-                let known = if slope_from_output(self.activation) { &work.outputs[l] } else { &work.inner[l] };
-                multiply_slopes(grad, &known[..grad.len()], self.activation);
-            }
             if !add {
                 bias_grad.fill(0.0);
             }
-            add_column_sums(bias_grad, grad);
+            let known = if slope_from_output(self.activation) { work.outputs.get(l) } else { work.inner.get(l) };
+            let known = &known.expect("a learning workspace")[..grad.len()];
+            let activation = (l + 1 < self.layers.len()).then_some(self.activation);
+            slopes_and_sums(grad, known, activation, bias_grad);
             let grad = Matrix::new(grad, rows, layer.outputs);
             let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
-            product(weight_grad, grad.transposed(), layer.x(x, rows), add);
+            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), add);
             if l > 0 {
-                product(&mut below[..rows * layer.inputs], grad, layer.weight(), false);
+                work.multiplier.product(&mut below[..rows * layer.inputs], grad, layer.weight(), false);
                 std::mem::swap(above, below);
             }
         }

@@ -23,6 +23,27 @@ impl<'a> Matrix<'a> {
         Self { data, size: [rows, columns], strides: [columns as isize, 1] }
     }
 
+    /// The numbers as they lie in memory.
+    pub fn data(&self) -> &'a [f32] {
+        self.data
+    }
+
+    /// Rows and columns.
+    pub fn size(&self) -> [usize; 2] {
+        self.size
+    }
+
+    /// Distance in the data between neighbours in a column and in a row; one of them is 1.
+    pub fn strides(&self) -> [isize; 2] {
+        self.strides
+    }
+
+    /// Other numbers that lie in the same way.
+    pub fn of<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
+        assert_eq!(data.len(), self.data.len(), "elements of a matrix");
+        Matrix { data, size: self.size, strides: self.strides }
+    }
+
     /// The same numbers with rows and columns exchanged.
     pub fn transposed(self) -> Self {
         let ([rows, columns], [down, right]) = (self.size, self.strides);

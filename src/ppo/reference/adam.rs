@@ -4,12 +4,7 @@ use anyhow::Result;
 use candle_core::backprop::GradStore;
 use candle_core::{Tensor, Var};
 
-/// Decay of the mean of the gradient.
-pub const BETA1: f64 = 0.9;
-/// Decay of the mean of its square.
-pub const BETA2: f64 = 0.999;
-/// Against a division by zero.
-pub const EPSILON: f64 = 1e-8;
+use super::super::backend::{BETA1, BETA2, EPSILON};
 
 /// D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
 pub struct Adam {

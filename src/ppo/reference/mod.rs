@@ -1,7 +1,7 @@
 //! The same computation in candle's own tensors and its automatic gradients: slower, the reference that the kernels are
 //! compared with, and the one that could run on another device.
 
-pub mod adam;
+mod adam;
 mod loss;
 mod mlp;
 
