@@ -11,6 +11,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -43,14 +44,21 @@ class Sides:
     def training(self):
         return self.bench("training", "end_to_end_steps_per_s")
 
-    def peer(self):
-        lines = run([sys.executable, HERE / "ppo_peer.py", "--model", ROOT / "assets/shadow_hand/scene.xml",
-                     "--minutes", "0.6", "--threads", str(self.threads)]).splitlines()
-        return statistics.median(json.loads(line)["steps_per_s"] for line in lines)
+    def peer(self, torch_threads):
+        """Env steps/s between the first and the last line that it prints, one for each ten iterations."""
+        command = [sys.executable, HERE / "ppo_peer.py", "--model", ROOT / "assets/shadow_hand/scene.xml",
+                   "--minutes", "0.9", "--threads", str(self.threads), "--torch-threads", str(torch_threads)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
+            seen = [(time.perf_counter(), json.loads(line)["env_steps"]) for line in peer.stdout]
+        if len(seen) < 2:
+            sys.exit("ppo_peer.py is too slow on this machine to be timed in this way: give it more --minutes")
+        (start, before), (end, after) = seen[0], seen[-1]
+        return (after - before) / (end - start)
 
     def memory(self):
         with tempfile.TemporaryDirectory() as folder:
-            command = [self.program, "train", "--run-dir", f"{folder}/run", "--total-steps", "500000"]
+            command = [self.program, "train", "--run-dir", f"{folder}/run", "--total-steps", "500000",
+                       "--threads", str(self.threads)]
             training = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             _, status, usage = os.wait4(training.pid, 0)
             assert status == 0, "the training has failed"
@@ -72,7 +80,9 @@ def main():
                                                            lambda: sides.torch(SMALL, 4096)),
         # Taken in turn within one run, so that neither side meets a faster machine.
         "environments / bare physics": (lambda: sides.bench("physics", "pool_share"), lambda: 1.0),
-        "end to end steps/s, nets 256 128 64, 1024 x 16, 4 epochs x 4": (sides.training, sides.peer),
+        # The peer as it comes, with PyTorch on one thread, and with PyTorch on all of them.
+        "end to end steps/s, nets 256 128 64, 1024 x 16, 4 epochs x 4": (sides.training, lambda: sides.peer(1)),
+        "the same, PyTorch on all threads": (sides.training, lambda: sides.peer(args.threads)),
     }
     print("| figure | ours | other | ratio: median (range) |\n|---|---|---|---|")
     for name, (ours, other) in figures.items():
