@@ -8,6 +8,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
+#[path = "src/run/pip.rs"]
+mod pip;
+
 const VERSION: &str = "3.17.0";
 
 /// Wheels of `mujoco` 3.17.0 by target architecture: (pip platform tag, sha256). The Python tag only selects the wheel;
@@ -19,6 +22,7 @@ const WHEELS: [(&str, &str, &str); 2] = [
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-changed=src/run/pip.rs");
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
     version_facts();
@@ -65,7 +69,7 @@ fn version_facts() {
     println!("cargo::rustc-env=SHADOW_REPOSE_TARGET={}", variable("TARGET"));
 }
 
-/// Downloads the wheel with pip (which checks the hash) and moves the library out of it to `library`.
+/// Fetches the wheel and moves the library out of it to `library`.
 fn fetch(library: &Path) -> Result<(), String> {
     let (os, arch) = (variable("CARGO_CFG_TARGET_OS"), variable("CARGO_CFG_TARGET_ARCH"));
     let (_, platform, hash) = WHEELS
@@ -73,29 +77,9 @@ fn fetch(library: &Path) -> Result<(), String> {
         .find(|(name, ..)| os == "linux" && *name == arch)
         .ok_or(format!("there is no prepared download for {os} on {arch}"))?;
     let work = PathBuf::from(variable("OUT_DIR")).join("mujoco-wheel");
+    let selection = ["--python-version", "311", "--implementation", "cp", "--abi", "cp311", "--platform", platform];
+    pip::unpack_wheel(&format!("mujoco=={VERSION}"), hash, &selection, &work)?;
     let told = |error: std::io::Error| error.to_string();
-    let _ = fs::remove_dir_all(&work);
-    fs::create_dir_all(&work).map_err(told)?;
-    let requirement = work.join("requirement.txt");
-    fs::write(&requirement, format!("mujoco=={VERSION} --hash=sha256:{hash}\n")).map_err(told)?;
-    let pip = "-m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --python-version 311 \
-               --implementation cp --abi cp311 --require-hashes --platform";
-    python(
-        Command::new("python3")
-            .args(pip.split_whitespace())
-            .arg(platform)
-            .arg("-r")
-            .arg(&requirement)
-            .arg("-d")
-            .arg(&work),
-    )?;
-    let wheel = fs::read_dir(&work)
-        .map_err(told)?
-        .flatten()
-        .map(|entry| entry.path())
-        .find(|path| path.extension().is_some_and(|e| e == "whl"))
-        .ok_or("pip reported success but left no wheel")?;
-    python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(&work))?;
     let unpacked = work.join(format!("mujoco/libmujoco.so.{VERSION}"));
     let folder = library.parent().expect("the library lies in a folder");
     fs::create_dir_all(folder).map_err(told)?;
@@ -105,17 +89,6 @@ fn fetch(library: &Path) -> Result<(), String> {
     fs::rename(&partial, library).map_err(told)?;
     let _ = fs::remove_dir_all(&work);
     Ok(())
-}
-
-fn python(command: &mut Command) -> Result<(), String> {
-    let output = command.output().map_err(|e| format!("python3 could not be started ({e})"))?;
-    if output.status.success() {
-        return Ok(());
-    }
-    let said = String::from_utf8_lossy(&output.stderr);
-    let last: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).rev().take(3).collect();
-    let last: Vec<&str> = last.into_iter().rev().collect();
-    Err(format!("python3 -m pip said: {}", last.join(" / ")))
 }
 
 fn fail(reason: &str) -> ! {

@@ -6,6 +6,7 @@ use clap::builder::RangedU64ValueParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::config::Override;
+use crate::sim::{Camera, Quality};
 
 /// The largest whole number of a TOML file.
 const LARGEST: u64 = i64::MAX as u64;
@@ -29,8 +30,10 @@ pub struct Cli {
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
     Train(TrainArgs),
-    /// Let a policy play whole episodes and print its score
+    /// Let a policy play: in a window, as a film, or without either, for its score
     Play(PlayArgs),
+    /// Look at the scene, without a policy
+    View(ViewArgs),
     /// Measure this machine: physics, environments, learner, and all together
     Bench(BenchArgs),
 }
@@ -78,9 +81,9 @@ pub struct PlayArgs {
     /// A checkpoint, or a run folder (its best checkpoint, or its latest) [default: the newest run]
     #[arg(long, value_name = "FILE|RUN")]
     pub ckpt: Option<PathBuf>,
-    /// Whole episodes to play, every one counted
-    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
-    pub episodes: u64,
+    /// Whole episodes to play, every one counted [default: 256; in a window, until it is closed; in a film, 1]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub episodes: Option<u64>,
     /// Episode k is drawn from (seed, k)
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
     pub seed: u64,
@@ -90,21 +93,119 @@ pub struct PlayArgs {
     /// Draw actions from the policy's distribution instead of taking their mean
     #[arg(long, conflicts_with = "policy")]
     pub stochastic: bool,
-    /// Play without a window (the only mode so far)
-    #[arg(long)]
-    pub headless: bool,
-    /// One env.* setting of the task that is scored; may be repeated
+    /// One env.* setting of the task that is played; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<Override>,
     /// Play this instead of a checkpoint
     #[arg(long, conflicts_with = "ckpt")]
     pub policy: Option<Baseline>,
-    /// Print one JSON object and nothing else
+    /// Play in a window, at real time [default: where there is a display]
+    #[arg(long, conflicts_with_all = ["headless", "json", "trace", "video"])]
+    pub window: bool,
+    /// Play without a window and print the score
+    #[arg(long)]
+    pub headless: bool,
+    /// Print the score as one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
     /// Write the first episodes, whole, as JSON lines: at least 2000 records
     #[arg(long, value_name = "FILE")]
     pub trace: Option<PathBuf>,
+    /// Film the episodes, one after the other: MP4 or GIF, by the name; needs no display
+    #[arg(long, value_name = "FILE")]
+    pub video: Option<PathBuf>,
+    /// Frames of a film per second of its episodes
+    #[arg(long, default_value_t = 50, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120))]
+    pub fps: u32,
+    /// How it is looked at.
+    #[command(flatten)]
+    pub shot: Shot,
+}
+
+/// `view`
+#[derive(Args, Debug)]
+pub struct ViewArgs {
+    /// File and single settings.
+    #[command(flatten)]
+    pub settings: Settings,
+    /// What moves the hand
+    #[arg(long, value_enum, default_value_t = Motion::Zero)]
+    pub actions: Motion,
+    /// Episode k is drawn from (seed, k)
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
+    pub seed: u64,
+    /// Draw one picture (PNG) instead of opening a window, and exit; needs no display
+    #[arg(long, value_name = "FILE")]
+    pub screenshot: Option<PathBuf>,
+    /// Seconds of the episode before the picture
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "screenshot", value_parser = seconds)]
+    pub at: f64,
+    /// How it is looked at.
+    #[command(flatten)]
+    pub shot: Shot,
+}
+
+/// How a scene is looked at.
+#[derive(Args, Clone, Debug)]
+pub struct Shot {
+    /// Width and height of film or picture in pixels [default: 640x480; of one picture 1280x720]
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    pub size: Option<[u32; 2]>,
+    /// The direction of view in degrees and its distance in m, as 150,-27,0.66
+    #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true)]
+    pub camera: Option<Camera>,
+    /// fast, or high: with shadows, reflections and smooth edges [default: fast for a film, else high]
+    #[arg(long, value_parser = quality, value_name = "fast|high")]
+    pub quality: Option<Quality>,
+    /// Show the primitives that collide instead of the real hand's meshes
+    #[arg(long)]
+    pub plain: bool,
+}
+
+/// What moves the hand in `view`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Motion {
+    /// Every actuator in the middle of its range
+    Zero,
+    /// Uniformly random actions
+    Random,
+    /// Each actuator swings slowly around the middle, a little after the one before it
+    Wave,
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, as 640x480")?;
+    let pixels = |text: &str, largest: u32| match text.parse() {
+        Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
+        _ => Err(format!("{text} must be a whole number from 16 to {largest}")),
+    };
+    Ok([pixels(width, 3840)?, pixels(height, 2160)?])
+}
+
+fn camera(text: &str) -> Result<Camera, String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    match numbers.as_deref() {
+        Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
+            match (0.05..=10.0).contains(&distance) {
+                true => Ok(Camera { azimuth, elevation, distance }),
+                false => Err(format!("the distance {distance} m must be from 0.05 to 10")),
+            }
+        }
+        _ => Err("must be three numbers, as 150,-27,0.66".into()),
+    }
+}
+
+fn quality(text: &str) -> Result<Quality, String> {
+    match text {
+        "fast" => Ok(Quality::Fast),
+        "high" => Ok(Quality::High),
+        _ => Err("must be fast or high".into()),
+    }
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.0..=3600.0).contains(seconds));
+    seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
 }
 
 /// Policies that need no checkpoint.

@@ -3,6 +3,7 @@
 //! Episode k depends on (seed, k) and the actor alone. Episodes run in groups of a fixed size, one in each lane, so that the
 //! nets always see batches of one shape and the result does not depend on threads or on how many episodes are asked for.
 
+use std::f64::consts::TAU;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -17,6 +18,9 @@ use crate::rng::{self, Rng};
 /// Episodes that run together.
 const LANES: usize = 64;
 
+/// Control steps of one swing of [`Actor::Wave`].
+const SWING: f64 = 300.0;
+
 /// What chooses the actions.
 pub enum Actor<'a> {
     /// The mean action of a policy.
@@ -27,6 +31,8 @@ pub enum Actor<'a> {
     Zero,
     /// Uniform in [-1, 1].
     Random,
+    /// Each actuator swings slowly around the middle of its range, a little after the one before it.
+    Wave,
 }
 
 /// A set of episodes.
@@ -36,6 +42,8 @@ pub struct Episodes {
     pub seed: u64,
     /// What they are for: the episodes that choose a policy are not those that score it.
     pub purpose: &'static str,
+    /// Number of the first episode.
+    pub first: usize,
     /// How many.
     pub count: usize,
 }
@@ -59,12 +67,14 @@ struct Lane {
 }
 
 impl Lane {
+    fn new(task: &Arc<Task>) -> Self {
+        Self { env: Repose::new(task), noise: rng::stream(0, "unused", 0), running: false }
+    }
+
     fn start(&mut self, episodes: Episodes, episode: usize, observation: &mut [f32]) {
-        self.running = episode < episodes.count;
-        if self.running {
-            self.env.reset(rng::stream(episodes.seed, episodes.purpose, episode as u64), observation);
-            self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
-        }
+        self.env.reset(rng::stream(episodes.seed, episodes.purpose, episode as u64), observation);
+        self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
+        self.running = true;
     }
 }
 
@@ -72,27 +82,28 @@ impl Lane {
 /// of one episode in order, those of different episodes interleaved.
 ///
 /// # Errors
-/// Only if candle cannot allocate.
+/// The observer's, and candle's if it cannot allocate.
 pub fn evaluate(
     task: &Arc<Task>,
     actor: &Actor,
     episodes: Episodes,
     interrupted: &AtomicBool,
-    observer: &mut dyn FnMut(Moment),
+    observer: &mut dyn FnMut(Moment) -> Result<()>,
 ) -> Result<Option<Vec<EpisodeStats>>> {
-    let lane = || Lane { env: Repose::new(task), noise: rng::stream(0, "unused", 0), running: false };
-    let mut lanes: Vec<Lane> = (0..LANES.min(episodes.count)).map(|_| lane()).collect();
+    let mut lanes: Vec<Lane> = (0..LANES.min(episodes.count)).map(|_| Lane::new(task)).collect();
     let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
     let mut actions = vec![0.0; LANES * ACTION_SIZE];
     let mut work = actor.policy().map(|policy| policy.workspace(LANES));
     let mut results = Vec::with_capacity(episodes.count);
-    for first in (0..episodes.count).step_by(LANES) {
+    let end = episodes.first + episodes.count;
+    for first in (episodes.first..end).step_by(LANES) {
+        let started = LANES.min(end - first);
         let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE);
-        lanes.par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| lane.start(episodes, first + i, row));
-        let started = lanes.iter().filter(|lane| lane.running).count();
+        let starting = lanes[..started].par_iter_mut().zip(rows).enumerate();
+        starting.for_each(|(i, (lane, row))| lane.start(episodes, first + i, row));
         let mut ends: Vec<Option<End>> = vec![None; lanes.len()];
         for (i, observation) in observations.chunks_exact(OBSERVATION_SIZE).take(started).enumerate() {
-            observer(Moment { episode: first + i, env: &lanes[i].env, observation, step: None });
+            observer(Moment { episode: first + i, env: &lanes[i].env, observation, step: None })?;
         }
         while lanes.iter().any(|lane| lane.running) {
             if interrupted.load(Ordering::Relaxed) {
@@ -110,7 +121,7 @@ pub fn evaluate(
                 let observation = &observations[i * OBSERVATION_SIZE..][..OBSERVATION_SIZE];
                 let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
                 let step = Some((action, ends[i]));
-                observer(Moment { episode: first + i, env: &lane.env, observation, step });
+                observer(Moment { episode: first + i, env: &lane.env, observation, step })?;
                 lane.running = ends[i].is_none();
             }
         }
@@ -123,7 +134,7 @@ impl Actor<'_> {
     fn policy(&self) -> Option<&FrozenPolicy<'_>> {
         match self {
             Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
-            Actor::Zero | Actor::Random => None,
+            Actor::Zero | Actor::Random | Actor::Wave => None,
         }
     }
 
@@ -149,8 +160,62 @@ impl Actor<'_> {
                 }
                 Actor::Zero => row.fill(0.0),
                 Actor::Random => row.fill_with(|| rng::uniform(&mut lane.noise, -1.0, 1.0) as f32),
+                Actor::Wave => {
+                    let swings = f64::from(lane.env.episode().length) / SWING;
+                    for (i, action) in row.iter_mut().enumerate() {
+                        let phase = swings - i as f64 / ACTION_SIZE as f64;
+                        *action = (0.3 * (TAU * phase).sin()) as f32;
+                    }
+                }
             }
         }
         Ok(())
+    }
+}
+
+/// One environment that is played episode after episode, a step at a time, by an actor that may change.
+pub struct Player {
+    lane: Lane,
+    observation: Vec<f32>,
+    action: Vec<f32>,
+}
+
+impl Player {
+    /// A player at the start of the first of these episodes; how many they are is up to the caller.
+    pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
+        let mut player =
+            Self { lane: Lane::new(task), observation: vec![0.0; OBSERVATION_SIZE], action: vec![0.0; ACTION_SIZE] };
+        player.start(episodes, episodes.first);
+        player
+    }
+
+    /// Starts this episode.
+    pub fn start(&mut self, episodes: Episodes, episode: usize) {
+        self.lane.start(episodes, episode, &mut self.observation);
+    }
+
+    /// Takes one step as `actor` chooses; tells if it was the last of the episode.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn step(&mut self, actor: &Actor) -> Result<Option<End>> {
+        let mut work = actor.policy().map(|policy| policy.workspace(1));
+        actor.choose(&self.observation, std::slice::from_mut(&mut self.lane), &mut self.action, work.as_mut())?;
+        Ok(self.lane.env.step(&self.action, &mut self.observation).end)
+    }
+
+    /// Draws another goal.
+    pub fn new_goal(&mut self) {
+        self.lane.env.new_goal(&mut self.observation);
+    }
+
+    /// The environment.
+    pub fn env(&self) -> &Repose {
+        &self.lane.env
+    }
+
+    /// The environment, to be shown and pulled at.
+    pub fn env_mut(&mut self) -> &mut Repose {
+        &mut self.lane.env
     }
 }

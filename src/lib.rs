@@ -15,7 +15,9 @@
 //! | [`train`] | the training, from top to bottom |
 //! | [`mod@collect`] | environments stepping under the policy: the only place where the two meet |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
-//! | [`play`], [`trace`] | scores as table and JSON; episodes as JSON lines |
+//! | [`play`], [`trace`] | a policy plays: scores as table and JSON; episodes as JSON lines |
+//! | [`mod@view`] | the scene without a policy |
+//! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
 //! | [`mod@bench`] | what this machine can do |
 //! | [`mod@env`] | the task, its reward, and many of them in blocks |
 //! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
@@ -24,7 +26,7 @@
 //! | [`run`] | the outside: run folder, logs, terminal, signals |
 //! | [`quat`], [`rng`] | rotations; generators named by (seed, purpose, index) |
 //!
-//! Direction of knowledge: `main → {train, play, bench} → {collect, evaluate} → {env → sim, ppo, run} → {config, rng, quat,
+//! Direction of knowledge: `main → {train, play, view, bench} → {collect, evaluate, window, film} → {env → sim, ppo, run} → {config, rng, quat,
 //! schedule}`. `env` and `ppo` do not know each other, `run` knows neither; a test holds the fences up.
 //!
 //! # Data path of an iteration
@@ -41,6 +43,10 @@
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
 //! How a minibatch is computed is described in `ppo::fused`; `ppo::reference` is the same in candle's tensors.
+//!
+//! # Features
+//! Without `viewer` there is no window, without `video` there are no films and pictures: [`window`] and [`film`] are then
+//! replaced by modules of the same shape that say so. Neither changes anything else.
 
 pub mod bench;
 pub mod cli;
@@ -48,12 +54,18 @@ pub mod collect;
 pub mod config;
 pub mod env;
 pub mod evaluate;
+#[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
+pub mod film;
 pub mod play;
 pub mod ppo;
 pub mod quat;
 pub mod rng;
 pub mod run;
+pub mod scenery;
 pub mod schedule;
 pub mod sim;
 pub mod trace;
 pub mod train;
+pub mod view;
+#[cfg_attr(not(feature = "viewer"), path = "window_absent.rs")]
+pub mod window;

@@ -1,6 +1,8 @@
-//! Scores a policy: whole episodes, a table or one JSON object, and the trace of the first episodes.
+//! Lets a policy play: in a window, as a film, or for its score: whole episodes, a table or one JSON object, and the trace of
+//! the first episodes.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, Result, ensure};
@@ -10,15 +12,20 @@ use crate::cli::{Baseline, PlayArgs};
 use crate::config::{Config, Override};
 use crate::env::{ACTION_SIZE, OBSERVATION_SIZE, RewardTerms, Score, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::film::Film;
 use crate::ppo::{Checkpoint, Policy};
 use crate::run;
+use crate::scenery::task_to_see;
+use crate::sim::Quality;
 use crate::trace::Trace;
+use crate::train::Outcome;
+use crate::window::{self, Window};
 
-/// Plays as asked and prints the score.
+/// Plays as asked: in a window, as a film, or without either; and prints the score of what is not played in a window.
 ///
 /// # Errors
-/// A checkpoint, setting or scene that cannot be used; a trace that cannot be written.
-pub fn play(args: &PlayArgs) -> Result<()> {
+/// A checkpoint, setting or scene that cannot be used; a window that cannot be opened; a trace or film that cannot be written.
+pub fn play(args: &PlayArgs) -> Result<Outcome> {
     let loaded = match args.policy {
         Some(_) => None,
         None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
@@ -28,7 +35,9 @@ pub fn play(args: &PlayArgs) -> Result<()> {
         None => Config::resolve(None, of_the_task(&args.set)?)?,
     };
     run::start_threads(args.threads)?;
-    let task = Task::new(&config.env)?;
+    if wants_window(args) && show(args, &config, loaded.as_ref())? {
+        return Ok(Outcome::Finished);
+    }
     let actor = match (&loaded, args.policy) {
         (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()?),
         (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()?),
@@ -39,29 +48,106 @@ pub fn play(args: &PlayArgs) -> Result<()> {
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
     let mut trace = output.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
-    let score = score(&task, &actor, args, trace.as_mut())?;
+    let played = match &args.video {
+        Some(path) => film(path, &config, &actor, args, trace.as_mut())?,
+        None => {
+            let never = AtomicBool::new(false);
+            score(&Task::new(&config.env)?, &actor, episodes(args, 256), &never, trace.as_mut())?
+        }
+    };
+    let Some(score) = played else { return Ok(Outcome::Interrupted) };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
     if args.json {
         run::print(&format!("{}\n", json_score(&score, checkpoint.as_deref(), args.seed)));
-        return Ok(());
+        return Ok(Outcome::Finished);
     }
     let name = match &actor {
         Actor::Mean(_) => "policy",
         Actor::Stochastic(_) => "policy, stochastic",
-        Actor::Zero => "zero actions",
         Actor::Random => "random actions",
+        Actor::Zero | Actor::Wave => "zero actions",
     };
     if let Some(checkpoint) = &checkpoint {
         run::print(&format!("checkpoint {checkpoint}\n"));
     }
     let mut columns = vec![(name, score)];
-    if loaded.is_some() {
-        columns.push(("zero actions", self::score(&task, &Actor::Zero, args, None)?));
+    if loaded.is_some() && args.video.is_none() {
+        let never = AtomicBool::new(false);
+        let zero = self::score(&Task::new(&config.env)?, &Actor::Zero, episodes(args, 256), &never, None)?;
+        columns.push(("zero actions", zero.context("nothing interrupts these episodes")?));
     }
     run::print(&table(&columns));
-    Ok(())
+    Ok(Outcome::Finished)
+}
+
+fn wants_window(args: &PlayArgs) -> bool {
+    let otherwise = args.headless || args.json || args.trace.is_some() || args.video.is_some();
+    args.window || !otherwise && window::PRESENT && run::has_display()
+}
+
+/// Plays in a window; false if none can be opened and none was asked for by name.
+fn show(args: &PlayArgs, config: &Config, loaded: Option<&Loaded>) -> Result<bool> {
+    let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
+    let (names, actors, first) = match (loaded, args.policy) {
+        (Some(loaded), _) => {
+            let policy = &loaded.policy;
+            let actors = vec![Actor::Mean(policy.freeze()?), Actor::Stochastic(policy.freeze()?)];
+            (vec!["deterministic", "stochastic"], actors, usize::from(args.stochastic))
+        }
+        (None, policy) => {
+            let first = usize::from(policy == Some(Baseline::Random));
+            (vec!["zero", "random"], vec![Actor::Zero, Actor::Random], first)
+        }
+    };
+    let window = match Window::open(&task, names, first) {
+        Err(error) if !args.window => {
+            run::say(&format!("note: {error:#}; playing on without one, as with --headless"));
+            return Ok(false);
+        }
+        window => window?,
+    };
+    run::say(&window.play(&task, &actors, episodes(args, u64::MAX))?);
+    Ok(true)
+}
+
+/// Plays the episodes one after the other and films them. Interrupted, it leaves the film of what was played.
+fn film(
+    path: &Path,
+    config: &Config,
+    actor: &Actor,
+    args: &PlayArgs,
+    mut trace: Option<&mut Trace>,
+) -> Result<Option<Score>> {
+    let task = task_to_see(&config.env, &args.shot, [640, 480], Quality::Fast)?;
+    let all = episodes(args, 1);
+    let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
+    let interrupted = run::on_interrupt()?;
+    let mut played = Vec::new();
+    for first in all.first..all.first + all.count {
+        let one = Episodes { first, count: 1, ..all };
+        let result = evaluate(&task, actor, one, &interrupted, &mut |moment| {
+            if let Some(trace) = &mut trace {
+                trace.record(&moment);
+            }
+            film.observe(&moment)
+        });
+        match result {
+            Ok(Some(stats)) => played.extend(stats),
+            Ok(None) => break,
+            // Where the film failed, its end knows more.
+            Err(error) => return Err(film.finish().err().unwrap_or(error)),
+        }
+    }
+    run::say(&format!("{}: {}", path.display(), film.finish()?));
+    Ok((played.len() == all.count).then(|| Score::of(&played)))
+}
+
+/// The episodes that are asked for, or else so many.
+fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
+    let count = args.episodes.unwrap_or(otherwise) as usize;
+    Episodes { seed: args.seed, purpose: "score", first: 0, count }
 }
 
 /// A policy from a file, with the configuration that it was trained with and `--set` on top.
@@ -96,19 +182,25 @@ fn of_the_task(overrides: &[Override]) -> Result<&[Override]> {
     Ok(overrides)
 }
 
-fn score(task: &std::sync::Arc<Task>, actor: &Actor, args: &PlayArgs, mut trace: Option<&mut Trace>) -> Result<Score> {
-    let episodes = Episodes { seed: args.seed, purpose: "score", count: args.episodes as usize };
-    let progress = run::EpisodeBar::new(args.episodes);
-    let never = AtomicBool::new(false);
-    let played = evaluate(task, actor, episodes, &never, &mut |moment| {
+/// The score of the episodes; none if interrupted.
+fn score(
+    task: &Arc<Task>,
+    actor: &Actor,
+    episodes: Episodes,
+    interrupted: &AtomicBool,
+    mut trace: Option<&mut Trace>,
+) -> Result<Option<Score>> {
+    let progress = run::Bar::new(episodes.count as u64, "episodes");
+    let played = evaluate(task, actor, episodes, interrupted, &mut |moment| {
         if let Some(trace) = &mut trace {
             trace.record(&moment);
         }
         if moment.step.is_some_and(|(_, end)| end.is_some()) {
-            progress.episode_ended();
+            progress.count();
         }
+        Ok(())
     })?;
-    Ok(Score::of(&played.context("nothing interrupts these episodes")?))
+    Ok(played.map(|played| Score::of(&played)))
 }
 
 /// One object with everything that is known; what has no value is null.

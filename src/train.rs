@@ -217,10 +217,12 @@ impl Session {
 
     /// Plays the evaluation episodes, and saves the policy if it is the best so far.
     fn evaluate(&mut self, interrupted: &AtomicBool, report: &Report) -> Result<Option<Score>> {
-        let episodes =
-            Episodes { seed: self.config.run.seed, purpose: "evaluation", count: self.config.run.eval_episodes };
+        let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
+        let episodes = Episodes { seed, purpose: "evaluation", first: 0, count };
         let actor = Actor::Mean(self.ppo.policy().freeze()?);
-        let Some(played) = evaluate(&self.task, &actor, episodes, interrupted, &mut |_| {})? else { return Ok(None) };
+        let Some(played) = evaluate(&self.task, &actor, episodes, interrupted, &mut |_| Ok(()))? else {
+            return Ok(None);
+        };
         let score = Score::of(&played);
         report.say(&format!(
             "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",

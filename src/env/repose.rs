@@ -11,7 +11,7 @@ use super::{ACTION_SIZE, End, Env, EpisodeStats, Hand, OBSERVATION_SIZE, RewardT
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Physics, Scene, Simulation};
+use crate::sim::{Look, Physics, Scene, Simulation};
 
 /// What all environments of a run share: the scene, the hand in it, the settings.
 pub struct Task {
@@ -26,7 +26,18 @@ impl Task {
     /// # Errors
     /// A scene that cannot be loaded or lacks a name, with its file.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        let scene = Scene::load(config.model_file(), config.sim_dt)?;
+        Self::of(Scene::load(config.model_file(), config.sim_dt)?, config)
+    }
+
+    /// The same task in a scene to be looked at.
+    ///
+    /// # Errors
+    /// As [`Task::new`], and meshes that cannot be read.
+    pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
+        Self::of(Scene::load_to_see(config.model_file(), config.sim_dt, look)?, config)
+    }
+
+    fn of(scene: Scene, config: &EnvConfig) -> Result<Arc<Self>> {
         let hand = Hand::bind(&scene)?;
         Ok(Arc::new(Self { scene, hand, config: config.clone() }))
     }
@@ -127,6 +138,11 @@ impl Repose {
         self.held
     }
 
+    /// The present rotation error, rad.
+    pub fn rot_dist(&self) -> f64 {
+        quat::angle_between(self.cube().1, self.goal)
+    }
+
     /// The physics state.
     pub fn simulation(&self) -> &Simulation {
         &self.sim
@@ -135,6 +151,19 @@ impl Repose {
     /// The physics state, to be changed; [`Simulation::refresh`] must follow.
     pub fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.sim
+    }
+
+    /// Draws another goal, which must be held anew, and writes the observation that shows it.
+    pub fn new_goal(&mut self, observation: &mut [f32]) {
+        self.set_goal();
+        self.held = 0;
+        self.sim.refresh();
+        self.observe(observation);
+    }
+
+    /// The settings of the task.
+    pub fn config(&self) -> &EnvConfig {
+        &self.task.config
     }
 
     /// The sums since the last call.

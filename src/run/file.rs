@@ -1,7 +1,7 @@
 //! Files that are read whole, and written whole or not at all.
 
 use std::fs::{self, File};
-use std::io::Write;
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -61,15 +61,45 @@ impl OutputFile {
     /// # Errors
     /// A place that cannot be written to.
     pub fn finish(mut self, bytes: &[u8]) -> Result<()> {
-        let mut write = || {
-            self.file.write_all(bytes)?;
+        let written = self.file.write_all(bytes);
+        written.with_context(|| format!("cannot write {}", self.path.display()))?;
+        self.complete()
+    }
+
+    /// Gives the file its name, with what was written to it through [`std::io::Write`].
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn complete(self) -> Result<()> {
+        let complete = || {
             if let Some(partial) = &self.partial {
                 self.file.sync_all()?;
                 fs::rename(partial, &self.path)?;
             }
             Ok::<(), std::io::Error>(())
         };
-        write().with_context(|| format!("cannot write {}", self.path.display()))
+        complete().with_context(|| format!("cannot write {}", self.path.display()))
+    }
+
+    /// Where it will be.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl Write for OutputFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+impl Seek for OutputFile {
+    fn seek(&mut self, place: SeekFrom) -> io::Result<u64> {
+        self.file.seek(place)
     }
 }
 

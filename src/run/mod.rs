@@ -2,14 +2,21 @@
 
 mod events;
 mod file;
+#[cfg(feature = "video")]
+mod film;
 mod folder;
 mod interrupt;
+mod meshes;
+mod pip;
 mod report;
 
 pub use file::{OutputFile, read_bytes, read_text, write_whole};
+#[cfg(feature = "video")]
+pub use film::{FilmFormat, FilmWriter, write_png};
 pub use folder::{RunFolder, newest_checkpoint, resolve_checkpoint};
 pub use interrupt::{INTERRUPTED, on_interrupt};
-pub use report::{EpisodeBar, Report, Status};
+pub use meshes::hand_meshes;
+pub use report::{Bar, Report, Status};
 
 use anyhow::{Context, Result};
 
@@ -21,6 +28,11 @@ pub fn print(text: &str) {
 /// Prints a line on stderr.
 pub fn say(line: &str) {
     let _ = std::io::Write::write_all(&mut std::io::stderr(), format!("{line}\n").as_bytes());
+}
+
+/// Whether there is a display that a window could open on.
+pub fn has_display() -> bool {
+    ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
 }
 
 /// Gives rayon, and with it every part of the program, this many worker threads (0: one for every core); once.

@@ -169,26 +169,36 @@ impl Shown {
     }
 }
 
-/// A bar that counts the episodes that have ended; invisible where stderr is no terminal.
-pub struct EpisodeBar {
+/// How far a job has come; on a terminal only.
+pub struct Bar {
     bar: ProgressBar,
 }
 
-impl EpisodeBar {
-    /// A bar at zero.
-    pub fn new(episodes: u64) -> Self {
-        let style = ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {pos}/{len} episodes");
-        let style = style.expect("a template that indicatif knows").progress_chars("=> ");
-        Self { bar: ProgressBar::new(episodes).with_style(style) }
+impl Bar {
+    /// A bar at zero of `total` things of this name.
+    pub fn new(total: u64, name: &str) -> Self {
+        let style = format!("{{elapsed_precise}} [{{bar:24}}] {{human_pos}}/{{human_len}} {name}  {{msg}}");
+        let style = ProgressStyle::with_template(&style).expect("a template that indicatif knows");
+        Self { bar: ProgressBar::new(total).with_style(style.progress_chars("=> ")) }
     }
 
     /// Counts one.
-    pub fn episode_ended(&self) {
+    pub fn count(&self) {
         self.bar.inc(1);
+    }
+
+    /// So many of them will not come.
+    pub fn shorten(&self, by: u64) {
+        self.bar.dec_length(by);
+    }
+
+    /// Says something beside it.
+    pub fn say(&self, message: String) {
+        self.bar.set_message(message);
     }
 }
 
-impl Drop for EpisodeBar {
+impl Drop for Bar {
     fn drop(&mut self) {
         self.bar.finish_and_clear();
     }

@@ -7,7 +7,7 @@ use anyhow::{Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{MjModel, MjtBias, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
-use super::Simulation;
+use super::{Look, Simulation};
 
 /// The scene that is built into the program.
 const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -63,15 +63,36 @@ impl Scene {
     /// MuJoCo's own message, with the file's name, where it refuses the scene.
     pub fn load(file: Option<&Path>, sim_dt: f64) -> Result<Self> {
         quieten_mujoco();
-        let origin = file.map_or("the built-in scene".into(), |path| path.display().to_string());
         let model = match file {
             None => MjModel::from_xml_string(BUILTIN),
             Some(path) => {
-                ensure!(path.is_file(), "{origin}: env.model must name a MuJoCo scene, but there is no such file");
+                ensure!(
+                    path.is_file(),
+                    "{}: env.model must name a MuJoCo scene, but there is no such file",
+                    path.display()
+                );
                 MjModel::from_xml(path)
             }
         };
-        let mut model = model.map_err(|error| anyhow!("{origin}: MuJoCo refuses this scene: {error}"))?;
+        let origin = file.map_or("the built-in scene".into(), |path| path.display().to_string());
+        let model = model.map_err(|error| anyhow!("{origin}: MuJoCo refuses this scene: {error}"))?;
+        Self::of(model, origin, sim_dt)
+    }
+
+    /// The same scene, with the same physics, to be looked at.
+    ///
+    /// # Errors
+    /// As [`Scene::load`], and meshes that cannot be read.
+    pub fn load_to_see(file: Option<&Path>, sim_dt: f64, look: &Look) -> Result<Self> {
+        let mut scene = Self::load(file, sim_dt)?;
+        if file.is_none() && !look.meshes.is_empty() {
+            scene = Self::of(look.dress(BUILTIN)?, scene.origin, sim_dt)?;
+        }
+        look.set_up(Arc::get_mut(&mut scene.model).expect("a new scene is not shared"));
+        Ok(scene)
+    }
+
+    fn of(mut model: MjModel, origin: String, sim_dt: f64) -> Result<Self> {
         model.opt_mut().timestep = sim_dt;
         let scene = Self { model: Arc::new(model), origin };
         if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {

@@ -26,7 +26,7 @@ const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 
 /// The state of one world. Positions of bodies, velocities and joints are always those of the same instant.
 pub struct Simulation {
-    data: MjData<Arc<MjModel>>,
+    pub(super) data: MjData<Arc<MjModel>>,
 }
 
 impl Simulation {

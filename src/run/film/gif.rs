@@ -1,0 +1,164 @@
+//! GIF: one palette for the whole film, and of each frame only what differs from the one before.
+
+use std::borrow::Cow;
+use std::io::BufWriter;
+
+use anyhow::{Result, anyhow};
+use color_quant::NeuQuant;
+use gif::{DisposalMethod, Encoder, Frame, Repeat};
+
+use super::{Film, FilmFormat};
+use crate::run::OutputFile;
+
+/// Colours of the palette; the index after them leaves a pixel as it was.
+const COLOURS: usize = 255;
+const TRANSPARENT: u8 = COLOURS as u8;
+/// The palette is chosen for the frames at the start, as many as fit in so many bytes.
+const BYTES_FOR_PALETTE: usize = 200 << 20;
+/// Pixels that the palette is chosen by, at most.
+const PIXELS_FOR_PALETTE: usize = 400_000;
+
+/// A GIF file being written.
+pub struct GifFilm {
+    format: FilmFormat,
+    stage: Stage,
+}
+
+enum Stage {
+    /// Frames `[height, width, 3]` wait for the palette.
+    Gathering {
+        file: Option<OutputFile>,
+        frames: Vec<Vec<u8>>,
+    },
+    Writing(Box<Writing>),
+}
+
+struct Writing {
+    encoder: Encoder<BufWriter<OutputFile>>,
+    palette: Palette,
+    format: FilmFormat,
+    previous: Vec<u8>,
+    frames: u64,
+}
+
+impl GifFilm {
+    /// Nothing is written until the palette is known.
+    pub fn new(file: OutputFile, format: FilmFormat) -> Self {
+        Self { format, stage: Stage::Gathering { file: Some(file), frames: Vec::new() } }
+    }
+
+    /// Chooses the palette, if that is still to be done, and writes what waited for it.
+    fn writing(&mut self) -> Result<&mut Writing> {
+        if let Stage::Gathering { file, frames } = &mut self.stage {
+            let file = file.take().ok_or_else(|| anyhow!("the film could not be begun"))?;
+            let mut writing = Writing::new(file, self.format, Palette::of(frames))?;
+            frames.iter().try_for_each(|rgb| writing.write(rgb))?;
+            self.stage = Stage::Writing(Box::new(writing));
+        }
+        match &mut self.stage {
+            Stage::Writing(writing) => Ok(writing),
+            Stage::Gathering { .. } => unreachable!("the stage was just changed"),
+        }
+    }
+}
+
+impl Film for GifFilm {
+    fn push(&mut self, rgb: &[u8]) -> Result<()> {
+        match &mut self.stage {
+            Stage::Gathering { frames, .. } if (frames.len() + 1) * rgb.len() <= BYTES_FOR_PALETTE => {
+                frames.push(rgb.to_vec());
+                Ok(())
+            }
+            _ => self.writing()?.write(rgb),
+        }
+    }
+
+    fn finish(mut self: Box<Self>) -> Result<OutputFile> {
+        self.writing()?;
+        match self.stage {
+            Stage::Writing(writing) => {
+                let file = writing.encoder.into_inner()?;
+                file.into_inner().map_err(|error| anyhow!("{}", error.error()))
+            }
+            Stage::Gathering { .. } => unreachable!("it was just begun"),
+        }
+    }
+}
+
+impl Writing {
+    fn new(file: OutputFile, format: FilmFormat, palette: Palette) -> Result<Self> {
+        let [width, height] = [u16::try_from(format.size[0])?, u16::try_from(format.size[1])?];
+        let mut encoder = Encoder::new(BufWriter::new(file), width, height, &palette.colours())?;
+        encoder.set_repeat(Repeat::Infinite)?;
+        Ok(Self { encoder, palette, format, previous: Vec::new(), frames: 0 })
+    }
+
+    fn write(&mut self, rgb: &[u8]) -> Result<()> {
+        let [width, height] = self.format.size.map(|pixels| pixels as usize);
+        let changed = |x: usize, y: usize| {
+            let at = 3 * (y * width + x);
+            self.previous.get(at..at + 3) != Some(&rgb[at..at + 3])
+        };
+        // The smallest rectangle around all changes; one pixel where there are none.
+        let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
+        let (top, bottom) = (rows.first().copied().unwrap_or(0), rows.last().copied().unwrap_or(0));
+        let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
+        let left = (0..width).find(in_column).unwrap_or(0);
+        let right = (left..width).rev().find(in_column).unwrap_or(left);
+        let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
+        for y in top..=bottom {
+            for x in left..=right {
+                let at = 3 * (y * width + x);
+                pixels.push(if changed(x, y) { self.palette.index(&rgb[at..at + 3]) } else { TRANSPARENT });
+            }
+        }
+        // Hundredths of a second, so that the whole film has the right length whatever the pace.
+        let hundredths = |frames: u64| (frames * 100 + u64::from(self.format.fps) / 2) / u64::from(self.format.fps);
+        self.encoder.write_frame(&Frame {
+            delay: (hundredths(self.frames + 1) - hundredths(self.frames)) as u16,
+            dispose: DisposalMethod::Keep,
+            transparent: Some(TRANSPARENT),
+            top: top as u16,
+            left: left as u16,
+            width: (right + 1 - left) as u16,
+            height: (bottom + 1 - top) as u16,
+            buffer: Cow::Owned(pixels),
+            ..Frame::default()
+        })?;
+        self.frames += 1;
+        self.previous.clear();
+        self.previous.extend_from_slice(rgb);
+        Ok(())
+    }
+}
+
+/// Colours, and the nearest of them for each other colour.
+struct Palette {
+    quantizer: NeuQuant,
+    /// By the upper six bits of red, green and blue, what was looked up already.
+    known: Vec<Option<u8>>,
+}
+
+impl Palette {
+    /// The palette that suits these frames.
+    fn of(frames: &[Vec<u8>]) -> Self {
+        let pixels: usize = frames.iter().map(|rgb| rgb.len() / 3).sum();
+        let every = pixels.div_ceil(PIXELS_FOR_PALETTE).max(1);
+        let all = frames.iter().flat_map(|rgb| rgb.chunks_exact(3));
+        let sample: Vec<u8> = all.step_by(every).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
+        Self { quantizer: NeuQuant::new(10, COLOURS, &sample), known: vec![None; 1 << 18] }
+    }
+
+    fn colours(&self) -> Vec<u8> {
+        self.quantizer.color_map_rgb()
+    }
+
+    fn index(&mut self, rgb: &[u8]) -> u8 {
+        let key = rgb.iter().fold(0, |key, &channel| key << 6 | usize::from(channel >> 2));
+        *self.known[key].get_or_insert_with(|| {
+            // The middle of what shares the key.
+            let middle = |channel: u8| channel & !3 | 2;
+            self.quantizer.index_of(&[middle(rgb[0]), middle(rgb[1]), middle(rgb[2]), 255]) as u8
+        })
+    }
+}

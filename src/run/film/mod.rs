@@ -1,0 +1,130 @@
+//! Films and pictures as files: H.264 in MP4, GIF, PNG.
+//!
+//! A film is drawn by one thread and encoded by another, so that both cores of a small machine work.
+
+mod caption;
+mod gif;
+mod mp4;
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::{self, JoinHandle};
+
+use anyhow::{Context, Result, bail, ensure};
+
+use self::caption::Captions;
+use self::gif::GifFilm;
+use self::mp4::Mp4Film;
+use super::OutputFile;
+
+/// Pictures that may wait for the encoder.
+const WAITING: usize = 4;
+
+/// What a film file is made for.
+#[derive(Clone, Copy, Debug)]
+pub struct FilmFormat {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Frames per second.
+    pub fps: u32,
+    /// The most frames it can have.
+    pub longest: usize,
+}
+
+/// A film being written; it is there once it is finished.
+pub struct FilmWriter {
+    path: PathBuf,
+    frames: SyncSender<Frame>,
+    /// Buffers of frames that have been encoded, to be used again.
+    spare: Receiver<Vec<u8>>,
+    encoder: JoinHandle<Result<OutputFile>>,
+}
+
+struct Frame {
+    /// `[height, width, 3]`
+    rgb: Vec<u8>,
+    caption: Vec<String>,
+}
+
+/// A kind of film file.
+trait Film {
+    /// Takes the next frame `[height, width, 3]`.
+    fn push(&mut self, rgb: &[u8]) -> Result<()>;
+
+    /// Writes what is still to be written.
+    fn finish(self: Box<Self>) -> Result<OutputFile>;
+}
+
+impl FilmWriter {
+    /// Begins a film, MP4 or GIF by the name of `path`.
+    ///
+    /// # Errors
+    /// Another kind of name, a format that the kind cannot have, a place that cannot be written to.
+    pub fn create(path: &Path, format: FilmFormat) -> Result<Self> {
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
+        let begin: fn(OutputFile, FilmFormat) -> Result<Box<dyn Film>> = match extension.as_str() {
+            "mp4" => |file, format| Ok(Box::new(Mp4Film::new(file, format)?)),
+            "gif" => |file, format| Ok(Box::new(GifFilm::new(file, format))),
+            _ => bail!("{}: the name of a film must end in .mp4 or .gif", path.display()),
+        };
+        let [width, height] = format.size;
+        let even = width.is_multiple_of(2) && height.is_multiple_of(2);
+        ensure!(extension == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
+        let steady = format.fps <= 50;
+        ensure!(extension == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        let file = OutputFile::create(path)?;
+        let (frames, incoming) = sync_channel::<Frame>(WAITING);
+        let (done, spare) = sync_channel(WAITING + 1);
+        let encode = move || {
+            let mut film = begin(file, format)?;
+            let captions = Captions::new(format.size);
+            for mut frame in incoming {
+                captions.draw(&mut frame.rgb, &frame.caption);
+                film.push(&frame.rgb)?;
+                let _ = done.try_send(frame.rgb);
+            }
+            film.finish()
+        };
+        let encoder = thread::Builder::new().name("film".into()).spawn(encode).context("cannot start a thread")?;
+        Ok(Self { path: path.to_owned(), frames, spare, encoder })
+    }
+
+    /// Adds a frame `[height, width, 3]` with these lines of text in its corner. Where the encoder has failed nothing happens:
+    /// [`FilmWriter::failed`] tells, and `finish` why.
+    pub fn push(&mut self, rgb: &[u8], caption: Vec<String>) {
+        let mut buffer = self.spare.try_recv().unwrap_or_default();
+        buffer.clear();
+        buffer.extend_from_slice(rgb);
+        let _ = self.frames.send(Frame { rgb: buffer, caption });
+    }
+
+    /// Whether the encoder has ended early.
+    pub fn failed(&self) -> bool {
+        self.encoder.is_finished()
+    }
+
+    /// Completes the file.
+    ///
+    /// # Errors
+    /// Those of the encoder and of the file, also of earlier frames.
+    pub fn finish(self) -> Result<()> {
+        drop(self.frames);
+        let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
+        encoded.and_then(OutputFile::complete).with_context(|| format!("cannot make the film {}", self.path.display()))
+    }
+}
+
+/// Writes a picture `[height, width, 3]` as PNG.
+///
+/// # Errors
+/// A name that does not end in .png, a place that cannot be written to.
+pub fn write_png(path: &Path, [width, height]: [u32; 2], rgb: &[u8]) -> Result<()> {
+    let named = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
+    ensure!(named, "{}: the name of a picture must end in .png", path.display());
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_compression(png::Compression::High);
+    encoder.write_header()?.write_image_data(rgb)?;
+    super::write_whole(path, &bytes)
+}

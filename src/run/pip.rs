@@ -1,0 +1,48 @@
+//! Fetches wheels with pip, by package name and hash. Apart because the build script uses it too: it knows only the standard
+//! library.
+
+use std::path::Path;
+use std::process::Command;
+use std::{fs, io};
+
+/// Downloads the wheel `package` (as `name==version`) with this sha256 and unpacks it into `folder`, which is made anew.
+///
+/// `selection` are pip's options that choose between the wheels of a package.
+///
+/// # Errors
+/// No python3 or pip, a package that cannot be reached or has another hash, a folder that cannot be written to.
+pub fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder: &Path) -> Result<(), String> {
+    let told = |error: io::Error| format!("{}: {error}", folder.display());
+    let _ = fs::remove_dir_all(folder);
+    fs::create_dir_all(folder).map_err(told)?;
+    let requirement = folder.join("requirement.txt");
+    fs::write(&requirement, format!("{package} --hash=sha256:{hash}\n")).map_err(told)?;
+    let pip = "-m pip download --quiet --disable-pip-version-check --retries 2 --no-deps --only-binary=:all: --require-hashes";
+    python(
+        Command::new("python3")
+            .args(pip.split_whitespace())
+            .args(selection)
+            .arg("-r")
+            .arg(&requirement)
+            .arg("-d")
+            .arg(folder),
+    )?;
+    let wheel = fs::read_dir(folder)
+        .map_err(told)?
+        .flatten()
+        .map(|entry| entry.path())
+        .find(|path| path.extension().is_some_and(|e| e == "whl"))
+        .ok_or("pip reported success but left no wheel")?;
+    python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(folder))
+}
+
+fn python(command: &mut Command) -> Result<(), String> {
+    let output = command.output().map_err(|e| format!("python3 could not be started ({e})"))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    let last: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).rev().take(3).collect();
+    let last: Vec<&str> = last.into_iter().rev().collect();
+    Err(format!("python3 -m pip said: {}", last.join(" / ")))
+}

@@ -1,0 +1,37 @@
+//! The task in a scene that is to be looked at: the real hand's meshes, a camera, a quality.
+
+use std::sync::Arc;
+
+use anyhow::Result;
+
+use crate::cli::Shot;
+use crate::config::EnvConfig;
+use crate::env::Task;
+use crate::run;
+use crate::sim::{Look, Quality, mesh_files};
+
+/// Loads the task as `shot` wants to see it. Meshes that cannot be had are said to be missing, and the primitives are shown.
+///
+/// # Errors
+/// As [`Task::new`].
+pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
+    let own_scene = config.model_file().is_some();
+    let meshes = if shot.plain || own_scene {
+        Vec::new()
+    } else {
+        run::hand_meshes(&mesh_files()).unwrap_or_else(|error| {
+            run::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
+            Vec::new()
+        })
+    };
+    let quality = shot.quality.unwrap_or(quality);
+    let mut look = Look { meshes, size: shot.size.unwrap_or(size), camera: shot.camera, quality };
+    Task::new_to_see(config, &look).or_else(|error| {
+        if look.meshes.is_empty() {
+            return Err(error);
+        }
+        run::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
+        look.meshes.clear();
+        Task::new_to_see(config, &look)
+    })
+}
