@@ -103,7 +103,7 @@ fn show(args: &PlayArgs, config: &Config, loaded: Option<&Loaded>) -> Result<boo
     };
     let window = match Window::open(&task, names, first) {
         Err(error) if !args.window => {
-            run::say(&format!("note: {error:#}; playing on without one, as with --headless"));
+            run::say(&format!("note: {error:#}\n  Playing on as with --headless."));
             return Ok(false);
         }
         window => window?,

@@ -30,5 +30,33 @@ pub fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
         cause = error.source();
     }
     causes.dedup();
-    anyhow!("{}", causes.join(": "))
+    anyhow!("{}", without_place(&causes.join(": ")))
+}
+
+/// Leaves out where in winit's source an error arose, which winit writes before what it is.
+fn without_place(text: &str) -> String {
+    let place = text.split_once("os error at ").and_then(|(before, rest)| Some((before, rest.split_once(".rs:")?.1)));
+    match place.and_then(|(before, rest)| Some((before, rest.split_once(": ")?.1))) {
+        Some((before, what)) => format!("{before}{what}"),
+        None => text.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_is_an_error_that_says_what_it_said() {
+        let panicking: fn() -> Result<(), std::fmt::Error> = || panic!("Library {} could not be loaded.", "libx.so");
+        assert_eq!(attempt(panicking).unwrap_err().to_string(), "Library libx.so could not be loaded.");
+        assert_eq!(attempt(|| Ok::<_, std::fmt::Error>(3)).unwrap(), 3);
+    }
+
+    #[test]
+    fn places_in_the_source_of_libraries_are_left_out() {
+        let text = "event loop failed: os error at /somewhere/winit/src/linux/mod.rs:788: Failed to open connection";
+        assert_eq!(without_place(text), "event loop failed: Failed to open connection");
+        assert_eq!(without_place("glutin operation failed"), "glutin operation failed");
+    }
 }

@@ -90,16 +90,15 @@ impl Panel {
     fn take_keys(&mut self, ui: &Ui) {
         let controls = &mut self.controls;
         ui.input(|input| {
-            controls.paused ^= input.key_pressed(Key::Space);
-            controls.steps += u32::from(input.key_pressed(Key::ArrowRight));
+            // A slow machine sees several presses at once.
+            let odd = |key| input.num_presses(key) % 2 == 1;
+            controls.paused ^= odd(Key::Space);
+            controls.steps += input.num_presses(Key::ArrowRight) as u32;
             controls.reset |= input.key_pressed(Key::R);
             controls.new_goal |= input.key_pressed(Key::G);
-            let pace = |key, factor: f64| if input.key_pressed(key) { factor } else { 1.0 };
-            let speed = controls.speed * pace(Key::ArrowUp, 2.0) * pace(Key::ArrowDown, 0.5);
-            controls.speed = speed.clamp(*SPEEDS.start(), *SPEEDS.end());
-            if input.key_pressed(Key::P) {
-                controls.choice = (controls.choice + 1) % self.choices.len();
-            }
+            let doublings = input.num_presses(Key::ArrowUp) as i32 - input.num_presses(Key::ArrowDown) as i32;
+            controls.speed = (controls.speed * 2f64.powi(doublings)).clamp(*SPEEDS.start(), *SPEEDS.end());
+            controls.choice = (controls.choice + input.num_presses(Key::P)) % self.choices.len();
         });
         // A single step of a scene that runs would not be seen.
         controls.paused |= controls.steps > 0;

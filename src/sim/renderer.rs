@@ -10,8 +10,10 @@ use super::graphics::{attempt, described};
 use super::{Scene, Simulation};
 
 /// What to do about a renderer that cannot be had.
-const HELP: &str = "pictures without a display are drawn with EGL; on Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri. \
-                    `play --headless` needs no picture";
+const HELP: &str = "
+  Pictures are drawn with EGL, which needs no display and no graphics card.
+  On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri
+  Without pictures: `play --headless` scores.";
 
 /// Draws simulations of one scene. It belongs to the thread that made it.
 pub struct Renderer {
@@ -26,7 +28,7 @@ impl Renderer {
     /// No EGL, with the packages that bring it.
     pub fn new(scene: &Scene) -> Result<Self> {
         let build = || MjRenderer::builder().camera(MjvCamera::new_free(&scene.model)).build(&scene.model);
-        let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}; {HELP}"))?;
+        let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?;
         Ok(Self { renderer, data: MjData::new(scene.model.clone()) })
     }
 

@@ -11,9 +11,10 @@ use super::panel::Panel;
 use super::{Controls, Readout, Scene, Simulation};
 
 /// What to do about a window that cannot be had.
-const HELP: &str = "a window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL; on Debian and Ubuntu: apt install libgl1 \
-                    libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0. Without one: `play --headless` scores, `play --video \
-                    film.mp4` films, `view --screenshot picture.png` draws";
+const HELP: &str = "
+  A window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL.
+  On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0
+  Without a window: `play --headless` scores, `play --video film.mp4` films, `view --screenshot picture.png` draws.";
 
 /// An open window.
 pub struct Viewer {
@@ -29,7 +30,7 @@ impl Viewer {
     /// No display or a missing library, with the packages that bring them.
     pub fn open(scene: &Scene, title: &str, choices: Vec<&'static str>, first: usize) -> Result<Self> {
         let build = || MjViewer::builder().window_name(title.to_owned()).build_passive(&scene.model);
-        let mut viewer = attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}; {HELP}"))?;
+        let mut viewer = attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
         let panel = Rc::new(RefCell::new(Panel::new(choices, first)));
         let shown = panel.clone();
         viewer.add_ui_callback(move |ui, _| shown.borrow_mut().show(ui));

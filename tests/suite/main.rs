@@ -6,8 +6,12 @@
 mod architecture;
 mod bad_input;
 mod binary;
+#[cfg(feature = "video")]
+mod pictures;
 mod point_mass;
 mod pool;
 mod scene;
 mod support;
 mod task;
+#[cfg(feature = "viewer")]
+mod window;

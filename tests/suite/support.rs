@@ -56,7 +56,8 @@ pub fn program(folder: &Path, args: &[&str]) -> Output {
 /// The program in `folder`, not started yet.
 pub fn command(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_shadow-repose"));
-    command.current_dir(folder).args(args);
+    // A window of a test would open on the user's own display.
+    command.current_dir(folder).args(args).env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY");
     command
 }
 
@@ -78,4 +79,36 @@ pub fn stderr(output: &Output) -> String {
 pub fn succeeded(output: Output) -> Output {
     assert!(output.status.success(), "{:?}\n{}", output.status, stderr(&output));
     output
+}
+
+/// Says that something cannot be tested here; where CI has installed what it needs, that is a failure. Always false.
+pub fn must_be_possible(what: &str) -> bool {
+    assert!(std::env::var_os("SHADOW_REPOSE_SEES").is_none(), "not possible here: {what}");
+    eprintln!("not tested: {what}");
+    false
+}
+
+/// How many of the cube's colours (red, orange, yellow, green, blue) a picture `[height, width, 3]` has in plenty.
+pub fn colours_of_the_cube(rgb: &[u8]) -> usize {
+    let mut found = [0; 5];
+    for pixel in rgb.chunks_exact(3) {
+        let [r, g, b] = [0, 1, 2].map(|i| f64::from(pixel[i]));
+        let (most, least) = (r.max(g).max(b), r.min(g).min(b));
+        if most < 60.0 || least > 0.35 * most {
+            continue;
+        }
+        let range = most - least;
+        let hue = if most == r {
+            60.0 * (g - b) / range
+        } else if most == g {
+            120.0 + 60.0 * (b - r) / range
+        } else {
+            240.0 + 60.0 * (r - g) / range
+        };
+        let hues = [-12.0..12.0, 18.0..38.0, 42.0..62.0, 90.0..160.0, 200.0..240.0];
+        if let Some(colour) = hues.iter().position(|hues| hues.contains(&hue)) {
+            found[colour] += 1;
+        }
+    }
+    found.iter().filter(|&&pixels| pixels * 500 > rgb.len() / 3).count()
 }

@@ -1,0 +1,273 @@
+//! Pictures and films, as a user asks for them. All are drawn without a display.
+
+use std::fs::{self, File};
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use openh264::decoder::Decoder;
+use openh264::formats::YUVSource;
+use shadow_repose::env::{ACTION_SIZE, Env, Repose, Task};
+use shadow_repose::sim::{Camera, Look, Quality, mesh_files};
+use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
+use shiguredo_mp4::boxes::SampleEntry;
+use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
+
+use crate::support::{colours_of_the_cube, command, env_config, must_be_possible, program, started, stderr, succeeded};
+
+/// Whether pictures can be drawn here: a machine without EGL is told of, and where CI has installed it that is a failure.
+fn can_draw() -> bool {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--screenshot", "x.png"];
+    let output = program(folder.path(), &args);
+    let said = stderr(&output);
+    assert!(output.status.success() || said.contains("apt install libegl1"), "{said}");
+    output.status.success() || must_be_possible("pictures: EGL is missing")
+}
+
+/// Width, height and pixels of a PNG file.
+fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
+    let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
+    let mut rgb = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut rgb).unwrap();
+    assert_eq!(info.color_type, png::ColorType::Rgb);
+    ([info.width, info.height], rgb)
+}
+
+/// Two seconds of a hand that moves, as a film of this name.
+fn film(folder: &Path, more: &[&str]) {
+    let mut args =
+        vec!["play", "--policy", "zero", "--set", "env.max_episode_seconds=2", "--plain", "--size", "160x120"];
+    args.extend(more);
+    let output = succeeded(program(folder, &args));
+    let leftovers =
+        fs::read_dir(folder).unwrap().filter(|e| e.as_ref().unwrap().path().extension().unwrap() == "partial");
+    assert_eq!(leftovers.count(), 0);
+    assert!(!stderr(&output).contains("Warning"), "the encoder does not talk: {}", stderr(&output));
+}
+
+/// Luminance of every frame of an MP4 file, its size, and its duration in seconds.
+fn decode_mp4(path: &Path) -> (Vec<Vec<u8>>, [usize; 2], f64) {
+    let bytes = fs::read(path).unwrap();
+    let at = |name: &[u8]| bytes.windows(4).position(|window| window == name).unwrap();
+    assert!(at(b"moov") < at(b"mdat"), "the index comes first");
+    let mut demuxer = Mp4FileDemuxer::new();
+    while let Some(wanted) = demuxer.required_input() {
+        demuxer.handle_input(Input { position: wanted.position, data: &bytes[wanted.position as usize..] });
+    }
+    let track = &demuxer.tracks().unwrap()[0];
+    let duration = track.duration as f64 / f64::from(track.timescale.get());
+    let (mut decoder, mut frames, mut size) = (Decoder::new().unwrap(), Vec::new(), [0, 0]);
+    while let Some(sample) = demuxer.next_sample().unwrap() {
+        if let Some(SampleEntry::Avc1(entry)) = sample.sample_entry {
+            size = [entry.visual.width.into(), entry.visual.height.into()];
+            for set in entry.avcc_box.sps_list.iter().chain(&entry.avcc_box.pps_list) {
+                decoder.decode(&[&[0, 0, 0, 1], set.as_slice()].concat()).unwrap();
+            }
+        }
+        let data = &bytes[sample.data_offset as usize..][..sample.data_size];
+        let stream = length_prefixed_to_annexb(data, LengthSize::FourBytes).unwrap();
+        let frame = decoder.decode(&stream).unwrap().expect("each sample is a frame");
+        assert_eq!([frame.dimensions().0, frame.dimensions().1], size);
+        frames.push(frame.y().to_vec());
+    }
+    (frames, size, duration)
+}
+
+#[test]
+fn a_picture_needs_no_display_and_shows_the_cube_in_its_colours() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    for quality in ["fast", "high"] {
+        let args = ["view", "--plain", "--size", "320x240", "--quality", quality, "--screenshot"];
+        succeeded(program(folder.path(), &[&args[..], &["near.png"]].concat()));
+        succeeded(program(folder.path(), &[&args[..], &["far.png", "--camera", "150,-27,10"]].concat()));
+        let (size, near) = picture(&folder.path().join("near.png"));
+        assert_eq!(size, [320, 240]);
+        assert!(near.iter().map(|&c| u64::from(c)).sum::<u64>() / near.len() as u64 > 60, "not black");
+        assert!(colours_of_the_cube(&near) >= 3, "{}", colours_of_the_cube(&near));
+        let (_, far) = picture(&folder.path().join("far.png"));
+        assert_eq!(colours_of_the_cube(&far), 0, "from far away there is hardly a cube");
+    }
+}
+
+#[test]
+fn an_mp4_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    film(folder.path(), &["--video", "film.mp4"]);
+    let (frames, size, duration) = decode_mp4(&folder.path().join("film.mp4"));
+    assert_eq!((frames.len(), size, duration), (100, [160, 120], 2.0));
+    assert_ne!(frames[0], frames[40], "something moves");
+    film(folder.path(), &["--video", "slow.mp4", "--fps", "30", "--episodes", "2"]);
+    let (frames, _, duration) = decode_mp4(&folder.path().join("slow.mp4"));
+    assert_eq!((frames.len(), duration), (120, 4.0));
+}
+
+#[test]
+fn a_gif_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    film(folder.path(), &["--video", "film.gif", "--fps", "30"]);
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let mut decoder = options.read_info(File::open(folder.path().join("film.gif")).unwrap()).unwrap();
+    assert_eq!((decoder.width(), decoder.height()), (160, 120));
+    let (mut frames, mut hundredths, mut colours) = (0, 0, 0);
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        if frames == 0 {
+            assert_eq!((frame.width, frame.height), (160, 120), "the first frame is whole");
+            let rgb: Vec<u8> = frame.buffer.chunks_exact(4).flat_map(|pixel| pixel[..3].to_vec()).collect();
+            colours = colours_of_the_cube(&rgb);
+        }
+        frames += 1;
+        hundredths += frame.delay;
+    }
+    assert_eq!((frames, hundredths), (60, 200));
+    assert!(colours >= 2, "the palette has the colours of the cube");
+}
+
+#[test]
+fn a_film_shows_the_episodes_that_are_scored() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["play", "--policy", "random", "--episodes", "3", "--seed", "5", "--json", "--trace"];
+    let scored = succeeded(program(folder.path(), &[&args[..], &["scored"]].concat()));
+    let filmed = ["filmed", "--plain", "--video", "film.mp4", "--size", "64x64"];
+    let filmed = succeeded(program(folder.path(), &[&args[..], &filmed].concat()));
+    assert_eq!(scored.stdout, filmed.stdout);
+    let read = |name| fs::read(folder.path().join(name)).unwrap();
+    assert_eq!(read("scored"), read("filmed"));
+}
+
+#[test]
+fn an_interrupted_film_shows_what_was_played() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["play", "--policy", "random", "--plain", "--video", "film.mp4", "--size", "64x64", "--episodes", "200"];
+    let child = command(folder.path(), &args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let partial = folder.path().join("film.mp4.partial");
+    let begun = Instant::now();
+    // Frames come after the space that is kept for the index.
+    while fs::metadata(&partial).map_or(0, |facts| facts.len()) < 200 * 501 * 16 + 20_000 {
+        assert!(begun.elapsed() < Duration::from_secs(120), "the film grows");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
+    let (frames, ..) = decode_mp4(&folder.path().join("film.mp4"));
+    assert!(frames.len() > 10);
+    assert!(!partial.exists());
+}
+
+#[test]
+fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
+    let tetrahedron = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n".to_vec();
+    let look = Look {
+        meshes: vec![tetrahedron; mesh_files().len()],
+        size: [320, 240],
+        camera: Some(Camera { azimuth: 10.0, elevation: -80.0, distance: 2.0 }),
+        quality: Quality::Fast,
+    };
+    let config = env_config(&[]);
+    let (plain, dressed) = (Task::new(&config).unwrap(), Task::new_to_see(&config, &look).unwrap());
+    let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) = (started(&plain), started(&dressed));
+    for step in 0..400 {
+        let action: Vec<f32> = (0..ACTION_SIZE).map(|i| ((step * (i + 3)) as f32 * 0.07).sin()).collect();
+        let transitions = [&mut plain, &mut dressed].map(|(env, observation)| env.step(&action, observation));
+        assert_eq!(transitions[0], transitions[1]);
+        assert_eq!(plain.1, dressed.1);
+    }
+    assert_eq!(plain.0.simulation().qpos(), dressed.0.simulation().qpos());
+}
+
+#[test]
+fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
+    let look = Look {
+        meshes: vec![b"rubbish".to_vec(); mesh_files().len()],
+        size: [64, 64],
+        camera: None,
+        quality: Quality::Fast,
+    };
+    let refusal = Task::new_to_see(&env_config(&[]), &look).err().unwrap().to_string();
+    assert!(refusal.contains(".obj"), "{refusal}");
+}
+
+#[test]
+fn without_the_network_the_primitives_are_shown_and_it_is_said() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["view", "--quality", "fast", "--size", "64x64", "--screenshot", "x.png"];
+    let mut command = command(folder.path(), &args);
+    // Without a program named python3 nothing can be fetched.
+    let output =
+        command.env("XDG_CACHE_HOME", folder.path().join("cache")).env("PATH", folder.path()).output().unwrap();
+    let said = stderr(&succeeded(output));
+    assert!(said.contains("primitives are shown instead") && said.contains("python3 could not be started"), "{said}");
+    assert!(folder.path().join("x.png").exists());
+    let cache: Vec<_> = fs::read_dir(folder.path().join("cache/shadow-repose")).into_iter().flatten().collect();
+    assert!(cache.is_empty(), "nothing half is left");
+}
+
+#[test]
+fn without_egl_the_packages_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for args in [["view", "--plain", "--screenshot", "x.png"], ["play", "--policy=zero", "--plain", "--video=x.mp4"]] {
+        let mut command = command(folder.path(), &args);
+        let output = command.env("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent").output().unwrap();
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        for part in ["cannot draw", "apt install libegl1 libgl1-mesa-dri", "play --headless"] {
+            assert!(said.contains(part), "{said}");
+        }
+        assert!(!said.contains("panicked"), "{said}");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+}
+
+#[test]
+fn pictures_and_films_that_cannot_be_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |args: &[&str], code: i32, part: &str| {
+        let output = program(folder.path(), args);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(code), "{args:?} {said}");
+        assert!(said.contains(part) && !said.contains("panicked"), "{args:?} {said}");
+    };
+    refused(&["view", "--screenshot", "x.png", "--size", "640"], 2, "as 640x480");
+    refused(&["view", "--screenshot", "x.png", "--size", "8x8"], 2, "from 16 to 3840");
+    refused(&["view", "--screenshot", "x.png", "--camera", "1,2"], 2, "three numbers");
+    refused(&["view", "--screenshot", "x.png", "--camera", "1,2,-3"], 2, "from 0.05 to 10");
+    refused(&["view", "--screenshot", "x.png", "--quality", "best"], 2, "fast or high");
+    refused(&["play", "--fps", "20"], 2, "--video");
+    refused(&["play", "--window", "--video", "x.mp4"], 2, "--window");
+    if !can_draw() {
+        return;
+    }
+    let film = ["play", "--policy", "zero", "--plain", "--set", "env.max_episode_seconds=0.1", "--video"];
+    let refused_film = |more: &[&str], part: &str| refused(&[&film[..], more].concat(), 1, part);
+    refused_film(&["x.avi"], "must end in .mp4 or .gif");
+    refused_film(&["x"], "must end in .mp4 or .gif");
+    refused_film(&["x.mp4", "--size", "65x64"], "must be even");
+    refused_film(&["x.gif", "--fps", "60"], "at most 50");
+    refused_film(&["missing/x.mp4"], "missing/x.mp4");
+    symlink("/dev/full", folder.path().join("full.mp4")).unwrap();
+    refused_film(&["full.mp4"], "full.mp4");
+    refused(&["view", "--plain", "--screenshot", "x.jpg"], 1, "must end in .png");
+    refused(&["view", "--plain", "--screenshot", "missing/x.png"], 1, "missing/x.png");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "only the link");
+}
