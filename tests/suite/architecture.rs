@@ -30,6 +30,10 @@ fn outside_worlds_are_fenced() {
         ("indicatif", "run"),
         ("tensorboard_", "run"),
         ("ctrlc", "run"),
+        ("egui::", "sim"),
+        ("openh264", "run"),
+        ("shiguredo_mp4", "run"),
+        ("png::", "run"),
     ];
     // What a folder must not know.
     let blind = [
