@@ -82,6 +82,7 @@ pub fn succeeded(output: Output) -> Output {
 }
 
 /// Says that something cannot be tested here; where CI has installed what it needs, that is a failure. Always false.
+#[cfg(any(feature = "video", feature = "viewer"))]
 pub fn must_be_possible(what: &str) -> bool {
     assert!(std::env::var_os("SHADOW_REPOSE_SEES").is_none(), "not possible here: {what}");
     eprintln!("not tested: {what}");
@@ -89,6 +90,7 @@ pub fn must_be_possible(what: &str) -> bool {
 }
 
 /// How many of the cube's colours (red, orange, yellow, green, blue) a picture `[height, width, 3]` has in plenty.
+#[cfg(any(feature = "video", feature = "viewer"))]
 pub fn colours_of_the_cube(rgb: &[u8]) -> usize {
     let mut found = [0; 5];
     for pixel in rgb.chunks_exact(3) {
