@@ -33,18 +33,19 @@ impl Film {
     pub fn create(path: &Path, task: &Task, fps: u32, episodes: u64) -> Result<Self> {
         let config = task.config();
         let seconds = f64::from(config.max_episode_steps()) * config.ctrl_dt;
-        let longest = (seconds * f64::from(fps)).ceil() as u64 + 1;
+        let longest = ((seconds * f64::from(fps)).ceil() as u64).saturating_add(1);
+        let all = episodes.saturating_mul(longest);
         let renderer = Renderer::new(task.scene())?;
-        let format = FilmFormat { size: renderer.size(), fps, longest: (episodes * longest) as usize };
+        let format = FilmFormat { size: renderer.size(), fps, longest: all as usize };
         let writer = FilmWriter::create(path, format)?;
-        let bar = Bar::new(episodes * longest, "frames");
+        let bar = Bar::new(all, "frames");
         Ok(Self { renderer, writer, fps, frames: 0, all_frames: 0, longest, bar, begun: Instant::now() })
     }
 
     /// Adds the frames that are due at this moment: frame k of an episode shows it k / fps seconds after its start.
     ///
     /// # Errors
-    /// OpenGL's; that the encoder or the file failed, of which [`Film::finish`] tells more.
+    /// OpenGL's; that the encoder or the file failed, of which [`Film::abandon`] tells more.
     pub fn observe(&mut self, moment: &Moment) -> Result<()> {
         let env = moment.env;
         if moment.step.is_none() {
@@ -70,6 +71,11 @@ impl Film {
             self.bar.say(format!("{} goals in episode {}", env.episode().goals, moment.episode));
         }
         Ok(())
+    }
+
+    /// Gives the film up, leaving what was there before; why it failed, if it was the film.
+    pub fn abandon(self) -> Option<anyhow::Error> {
+        self.writer.abandon()
     }
 
     /// Completes the file; returns what to say about it.

@@ -31,6 +31,11 @@ impl Film {
     }
 
     /// Cannot be called.
+    pub fn abandon(self) -> Option<anyhow::Error> {
+        match self {}
+    }
+
+    /// Cannot be called.
     ///
     /// # Errors
     /// None.

@@ -120,10 +120,10 @@ fn film(
     args: &PlayArgs,
     mut trace: Option<&mut Trace>,
 ) -> Result<Option<Score>> {
+    let interrupted = run::on_interrupt()?;
     let task = task_to_see(&config.env, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
-    let interrupted = run::on_interrupt()?;
     let mut played = Vec::new();
     for first in all.first..all.first + all.count {
         let one = Episodes { first, count: 1, ..all };
@@ -136,8 +136,7 @@ fn film(
         match result {
             Ok(Some(stats)) => played.extend(stats),
             Ok(None) => break,
-            // Where the film failed, its end knows more.
-            Err(error) => return Err(film.finish().err().unwrap_or(error)),
+            Err(error) => return Err(film.abandon().unwrap_or(error)),
         }
     }
     run::say(&format!("{}: {}", path.display(), film.finish()?));

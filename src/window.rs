@@ -53,6 +53,9 @@ impl Window {
             if asked.reset {
                 tally.goals += player.env().episode().goals;
                 episode += 1;
+                if episode - episodes.first >= episodes.count {
+                    return Ok(tally.to_string());
+                }
                 player.start(episodes, episode);
             }
             if asked.new_goal {
@@ -194,10 +197,10 @@ mod tests {
     #[test]
     fn a_pause_lets_single_steps_through_and_does_not_catch_up_afterwards() {
         let mut pace = Pace::new(1e-3);
-        sleep(Duration::from_millis(20));
+        pace.last -= Duration::from_secs(10);
         assert_eq!(pace.steps_due(&controls(true, 1.0, 3)), 3);
         assert_eq!(pace.steps_due(&controls(true, 1.0, 0)), 0);
-        assert!(pace.steps_due(&controls(false, 1.0, 0)) < 20, "the pause is not played");
+        assert!(pace.steps_due(&controls(false, 1.0, 0)) < 200, "the pause is not played");
     }
 
     #[test]

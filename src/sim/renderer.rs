@@ -47,6 +47,8 @@ impl Renderer {
     /// A simulation of another scene.
     pub fn draw(&mut self, simulation: &Simulation) -> Result<&[u8]> {
         simulation.data.copy_visual_to(&mut self.data).expect("a simulation of the same scene");
+        // A mocap body that was put elsewhere after the step, the next goal, is not there yet.
+        self.data.kinematics();
         self.renderer.sync_data(&mut self.data).map_err(|error| described(&error))?;
         self.renderer.render().map_err(|error| described(&error))?;
         Ok(self.renderer.rgb_flat().expect("colours are switched on"))

@@ -49,14 +49,14 @@ impl Viewer {
     /// OpenGL's.
     pub fn show(&mut self, simulation: &mut Simulation, readout: Readout) -> Result<Controls> {
         let data = &mut simulation.data;
-        let time = data.time();
-        let positions = data.qpos().to_vec();
+        // A mocap body that was put elsewhere after the step, the next goal, is not there yet.
+        data.step1();
+        let (time, goals) = (data.time(), data.mocap_quat().to_vec());
         self.viewer.sync_data(data);
-        let was_reset = data.time() < time;
-        if data.qpos() != positions {
-            // Something was moved by hand: bring the bodies along.
-            data.step1();
-        }
+        // The window's own reset goes back to the model's defaults, of which the task knows nothing.
+        let was_reset = data.time() < time || data.mocap_quat() != goals;
+        // What was moved by hand brings its bodies along.
+        data.step1();
         self.panel.borrow_mut().readout = readout;
         self.viewer.render().map_err(|error| described(&error))?;
         let mut panel = self.panel.borrow_mut();

@@ -263,6 +263,7 @@ fn pictures_and_films_that_cannot_be_are_refused() {
     refused_film(&["x.avi"], "must end in .mp4 or .gif");
     refused_film(&["x"], "must end in .mp4 or .gif");
     refused_film(&["x.mp4", "--size", "65x64"], "must be even");
+    refused_film(&["x.mp4", "--episodes", "1000000"], "at most 2000000");
     refused_film(&["x.gif", "--fps", "60"], "at most 50");
     refused_film(&["missing/x.mp4"], "missing/x.mp4");
     symlink("/dev/full", folder.path().join("full.mp4")).unwrap();

@@ -45,11 +45,20 @@ impl Display {
 
     /// Presses keys in the window.
     fn press(&self, keys: &[&str]) {
-        let mut xdotool = Command::new("xdotool");
-        xdotool.env("DISPLAY", &self.name).args(["search", "--sync", "--name", "shadow-repose", "windowfocus"]);
+        let mut xdotool = Command::new("timeout");
+        xdotool.env("DISPLAY", &self.name).args([
+            "60",
+            "xdotool",
+            "search",
+            "--sync",
+            "--name",
+            "shadow-repose",
+            "windowfocus",
+        ]);
         // The window takes the focus a little later.
         xdotool.args(["sleep", "0.5", "key", "--delay", "200"]).args(keys);
-        assert!(xdotool.status().unwrap().success(), "{keys:?}");
+        // A window that a key closes is an error to xdotool; what the keys did is for the caller to see.
+        xdotool.stderr(Stdio::null()).status().unwrap();
     }
 
     /// The pixels `[height, width, 3]` of the screen, without the panels beside the scene.
@@ -83,7 +92,7 @@ impl Display {
     #[track_caller]
     fn wait_for_rest(&self) -> Vec<u8> {
         self.wait("the scene stands still", |scene| {
-            sleep(Duration::from_millis(700));
+            sleep(Duration::from_millis(1500));
             self.scene() == scene
         })
     }
@@ -96,13 +105,27 @@ impl Drop for Display {
     }
 }
 
-const WAVE: [&str; 8] = ["view", "--plain", "--quality", "fast", "--actions", "wave", "--seed", "3"];
+/// Far from any end of an episode, however slow the machine is.
+const WAVE: [&str; 12] = [
+    "view",
+    "--plain",
+    "--quality",
+    "fast",
+    "--actions",
+    "wave",
+    "--seed",
+    "3",
+    "--set",
+    "env.max_episode_seconds=9000",
+    "--set",
+    "env.fall_dist=9",
+];
 
 #[test]
 fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     let Some(display) = Display::open() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let child = display.start(folder.path(), &WAVE);
+    let mut child = display.start(folder.path(), &WAVE);
     display.wait("the cube is to be seen", |scene| colours_of_the_cube(scene) >= 2);
     let before = display.scene();
     display.wait("the hand moves", |scene| scene != before);
@@ -110,18 +133,23 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     display.press(&["space"]);
     let paused = display.wait_for_rest();
     display.press(&["Right", "Right", "Right", "Right", "Right", "Right", "Right", "Right"]);
+    display.wait("single steps move the hand", |scene| scene != paused);
     let stepped = display.wait_for_rest();
-    assert_ne!(paused, stepped, "single steps move the hand");
     display.press(&["g"]);
+    display.wait("a new goal is shown while time stands still", |scene| scene != stepped);
     let goal = display.wait_for_rest();
-    assert_ne!(stepped, goal, "a new goal is shown while time stands still");
     display.press(&["r"]);
+    display.wait("a reset is shown while time stands still", |scene| scene != goal);
     let reset = display.wait_for_rest();
-    assert_ne!(goal, reset, "a reset is shown while time stands still");
     display.press(&["space"]);
     display.wait("the hand moves on", |scene| scene != reset);
 
     display.press(&["ctrl+q"]);
+    let begun = Instant::now();
+    while child.try_wait().unwrap().is_none() && begun.elapsed() < PATIENCE {
+        sleep(Duration::from_millis(100));
+    }
+    let _ = child.kill();
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(stderr(&output).contains(" steps, 0 episodes to their end"), "{}", stderr(&output));

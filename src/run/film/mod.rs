@@ -20,6 +20,9 @@ use super::OutputFile;
 /// Pictures that may wait for the encoder.
 const WAITING: usize = 4;
 
+/// The most frames of a film: the index of an MP4 is kept in memory, and room for it in the file.
+const MOST_FRAMES: usize = 2_000_000;
+
 /// What a film file is made for.
 #[derive(Clone, Copy, Debug)]
 pub struct FilmFormat {
@@ -72,6 +75,8 @@ impl FilmWriter {
         ensure!(extension == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
         let steady = format.fps <= 50;
         ensure!(extension == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        let fits = format.longest <= MOST_FRAMES;
+        ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; take fewer or shorter episodes", format.longest);
         let file = OutputFile::create(path)?;
         let (frames, incoming) = sync_channel::<Frame>(WAITING);
         let (done, spare) = sync_channel(WAITING + 1);
@@ -101,6 +106,13 @@ impl FilmWriter {
     /// Whether the encoder has ended early.
     pub fn failed(&self) -> bool {
         self.encoder.is_finished()
+    }
+
+    /// Gives the film up, leaving what was there before; why the encoder failed, if it did.
+    pub fn abandon(self) -> Option<anyhow::Error> {
+        drop(self.frames);
+        let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
+        encoded.err().map(|error| error.context(format!("cannot make the film {}", self.path.display())))
     }
 
     /// Completes the file.
