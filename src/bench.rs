@@ -192,7 +192,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
-    pool.reset(0, rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
+    pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
     let mut turn = |pool: &mut EnvPool<Recorder>, steps: usize| {
         for rows in &mut rows {
             rows.actions = (0..steps * rows.rewards.len() * ACTION_SIZE).map(|_| draw()).collect();
@@ -235,7 +235,7 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
             observations: &mut rows.observations,
             final_observations: &mut rows.final_observations,
         };
-        envs.step(&rows.actions[step * size..][..size], buffers);
+        envs.step(&rows.actions[step * size..][..size], buffers).expect("environments do not panic");
     });
     start.elapsed().as_secs_f64()
 }
@@ -263,7 +263,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let (mut ppo, mut pool) = agent(task, config)?;
     let mut rollout = ppo.rollout(&pool.block_sizes());
     let mut scratch = Scratch::new(&pool, &ppo);
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     collect(&mut pool, &ppo, &mut rollout, 0, &mut scratch, &AtomicBool::new(false))?;
     let size = rollout.samples() / config.ppo.minibatches;
     let flops = flops_per_sample(ppo.policy());
@@ -278,13 +278,13 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
     let (mut ppo, mut pool) = agent(task, config)?;
     let mut rollout = ppo.rollout(&pool.block_sizes());
     let mut scratch = Scratch::new(&pool, &ppo);
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     let begun = Instant::now();
     let mut seconds = Vec::new();
     for iteration in 0..=END_TO_END.1 as u64 {
         let start = Instant::now();
         collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false))?;
-        ppo.update(&mut rollout, iteration)?;
+        ppo.update(&mut rollout, iteration, &AtomicBool::new(false))?;
         rollout.carry_over();
         seconds.push(start.elapsed().as_secs_f64());
         if begun.elapsed().as_secs_f64() > END_TO_END.0 {

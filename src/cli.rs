@@ -1,6 +1,7 @@
 //! The command line: its shape and its help, no logic.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -71,8 +72,17 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DIR", conflicts_with = "name")]
     pub run_dir: Option<PathBuf>,
     /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "set", "seed", "name", "run_dir"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
+    /// How many of the newest checkpoints to keep
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    pub keep: usize,
+    /// Save and exit with 0 after this time, as 3h50m
+    #[arg(long, value_name = "TIME", value_parser = time)]
+    pub stop_after: Option<Duration>,
+    /// Write the last steps of every episode whose physics diverged, for replay
+    #[arg(long)]
+    pub dump_diverged: bool,
 }
 
 /// `play`
@@ -193,6 +203,11 @@ fn camera(text: &str) -> Result<Camera, String> {
         }
         _ => Err("must be three numbers, as 150,-27,0.66".into()),
     }
+}
+
+fn time(text: &str) -> Result<Duration, String> {
+    let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
+    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time, as 3h50m, 90m or 30s".into())
 }
 
 fn quality(text: &str) -> Result<Quality, String> {

@@ -45,10 +45,10 @@ struct Collecting<'a, E: Env> {
 }
 
 /// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile:
-/// then blocks have come to different steps, and the pool must be reset before it collects again.
+/// then blocks have come to different steps, and the pool must be restored before it collects again.
 ///
 /// # Errors
-/// Only if candle cannot allocate.
+/// A panic in an environment, with its number; otherwise only if candle cannot allocate.
 pub fn collect<E: Env>(
     pool: &mut EnvPool<E>,
     ppo: &Ppo,
@@ -79,7 +79,7 @@ impl<E: Env> Collecting<'_, E> {
         acting.act(&mut step, &mut self.noise, work)?;
         let buffers =
             StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };
-        self.envs.step(step.actions, buffers);
+        self.envs.step(step.actions, buffers)?;
         step.dones.iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
         let truncated = ends.iter().map(|&end| end == Some(End::Truncated));
         acting.settle(step.rewards, truncated, final_observations, work)?;

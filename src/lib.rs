@@ -15,6 +15,8 @@
 //! | [`train`] | the training, from top to bottom |
 //! | [`mod@collect`] | environments stepping under the policy: the only place where the two meet |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
+//! | [`dump`] | what led to a diverged state, as JSON |
+//! | [`load`] | checkpoints and policies from files that nobody vouches for |
 //! | [`play`], [`trace`] | a policy plays: scores as table and JSON; episodes as JSON lines |
 //! | [`mod@view`] | the scene without a policy |
 //! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
@@ -52,10 +54,12 @@ pub mod bench;
 pub mod cli;
 pub mod collect;
 pub mod config;
+pub mod dump;
 pub mod env;
 pub mod evaluate;
 #[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
 pub mod film;
+pub mod load;
 pub mod play;
 pub mod ppo;
 pub mod quat;

@@ -10,11 +10,12 @@ use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs};
 use crate::config::{Config, Override};
-use crate::env::{ACTION_SIZE, OBSERVATION_SIZE, RewardTerms, Score, Task};
+use crate::env::{RewardTerms, Score, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::film::Film;
-use crate::ppo::{Checkpoint, Policy};
-use crate::run;
+use crate::load;
+use crate::ppo::Policy;
+use crate::run::{self, Requests};
 use crate::scenery::task_to_see;
 use crate::sim::Quality;
 use crate::trace::Trace;
@@ -47,15 +48,19 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     let checkpoint = loaded.as_ref().map(|loaded| loaded.path.display().to_string());
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
+    let mut requests = Requests::default();
     let mut trace = output.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
     let played = match &args.video {
-        Some(path) => film(path, &config, &actor, args, trace.as_mut())?,
+        Some(path) => {
+            requests = Requests::listen()?;
+            film(path, &config, &actor, args, &requests, trace.as_mut())?
+        }
         None => {
             let never = AtomicBool::new(false);
             score(&Task::new(&config.env)?, &actor, episodes(args, 256), &never, trace.as_mut())?
         }
     };
-    let Some(score) = played else { return Ok(Outcome::Interrupted) };
+    let Some(score) = played else { return Ok(Outcome::Stopped(requests.exit_code())) };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
@@ -118,16 +123,16 @@ fn film(
     config: &Config,
     actor: &Actor,
     args: &PlayArgs,
+    requests: &Requests,
     mut trace: Option<&mut Trace>,
 ) -> Result<Option<Score>> {
-    let interrupted = run::on_interrupt()?;
     let task = task_to_see(&config.env, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
     let mut played = Vec::new();
     for first in all.first..all.first + all.count {
         let one = Episodes { first, count: 1, ..all };
-        let result = evaluate(&task, actor, one, &interrupted, &mut |moment| {
+        let result = evaluate(&task, actor, one, requests.stop(), &mut |moment| {
             if let Some(trace) = &mut trace {
                 trace.record(&moment);
             }
@@ -163,11 +168,8 @@ impl Loaded {
             None => run::newest_checkpoint()?,
         };
         let overrides = of_the_task(overrides)?;
-        let context = || format!("cannot play {}", path.display());
-        let checkpoint = Checkpoint::parse(&run::read_bytes(&path)?).with_context(context)?;
-        let config = Config::from_text(&path, &checkpoint.config, overrides)?;
-        let mut policy = Policy::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0)?;
-        policy.restore(checkpoint).with_context(context)?;
+        let (checkpoint, config) = load::load(&path, overrides)?;
+        let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play {}", path.display()))?;
         Ok(Self { path, config, policy })
     }
 }

@@ -1,7 +1,8 @@
 //! Randomness without state: a generator is named by (seed, purpose, index).
 //!
 //! No generator is carried from one iteration or episode to the next, so whoever knows the three names can draw the same
-//! numbers again, on any thread, in any order, after any interruption.
+//! numbers again, on any thread, in any order, after any interruption. Within an episode, how far a generator has come is
+//! part of what is saved.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -16,6 +17,29 @@ pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     key[8..8 + purpose.len()].copy_from_slice(purpose.as_bytes());
     let mut rng = Rng::from_seed(key);
     rng.set_stream(index);
+    rng
+}
+
+/// Key, stream and position of a generator: all there is to know of it.
+pub type Position = [u64; 6];
+
+/// Where a generator is; at most 2⁶⁴ words from its start.
+pub fn position(rng: &Rng) -> Position {
+    let seed = rng.get_seed();
+    let (words, _) = seed.as_chunks::<8>();
+    let [a, b, c, d] = [0, 1, 2, 3].map(|i| u64::from_le_bytes(words[i]));
+    [a, b, c, d, rng.get_stream(), rng.get_word_pos() as u64]
+}
+
+/// The generator that is there.
+pub fn at([key @ .., stream, word]: Position) -> Rng {
+    let mut seed = [0; 32];
+    for (bytes, word) in seed.chunks_exact_mut(8).zip(key) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    let mut rng = Rng::from_seed(seed);
+    rng.set_stream(stream);
+    rng.set_word_pos(u128::from(word));
     rng
 }
 
@@ -36,6 +60,19 @@ mod tests {
         assert_ne!(first, draw(2, "episode", 2));
         assert_ne!(first, draw(1, "noise", 2));
         assert_ne!(first, draw(1, "episode", 3));
+    }
+
+    #[test]
+    fn a_generator_goes_on_from_where_it_was() {
+        let mut rng = stream(3, "episode", 1 << 40);
+        for _ in 0..37 {
+            rng.random::<u32>();
+            let mut again = at(position(&rng));
+            assert_eq!(again.clone().random::<[u64; 40]>(), rng.clone().random::<[u64; 40]>());
+            assert_eq!(position(&again), position(&rng));
+            again.random::<u32>();
+            assert_ne!(position(&again), position(&rng));
+        }
     }
 
     #[test]

@@ -10,6 +10,8 @@ use shadow_repose::ppo::Ppo;
 
 struct Watching;
 
+static NEVER: AtomicBool = AtomicBool::new(false);
+
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
 // SAFETY: all is left to the system's allocator.
@@ -37,11 +39,11 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let mut pool = EnvPool::new(0, (0..envs).map(|_| Repose::new(&task)).collect());
     let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     let mut iterate = |iteration| {
         LARGEST.store(0, Ordering::Relaxed);
-        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
-        ppo.update(&mut rollout, iteration).unwrap();
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &NEVER).unwrap();
+        ppo.update(&mut rollout, iteration, &NEVER).unwrap().unwrap();
         rollout.carry_over();
         LARGEST.load(Ordering::Relaxed)
     };

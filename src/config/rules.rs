@@ -64,6 +64,10 @@ impl Config {
         let sizes_fit = !ppo.hidden.is_empty() && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
         let hidden = format!("{:?}", ppo.hidden);
         rules.check(sizes_fit, "ppo.hidden", hidden, "hold one or more sizes from 1 to 16384");
+        let weights =
+            ppo.hidden.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
+        let hidden = format!("{:?}", ppo.hidden);
+        rules.check(weights <= 1 << 25, "ppo.hidden", hidden, "have at most 2^25 weights between them");
         rules.positive("ppo.learning_rate", ppo.learning_rate);
         let [low, high] = ppo.learning_rate_range;
         let range = format!("[{low}, {high}]");

@@ -1,6 +1,8 @@
 //! What a finished episode leaves behind, and the score of many of them.
 
-use super::RewardTerms;
+use anyhow::{Result, ensure};
+
+use super::{EnvState, RewardTerms, SavedEnv};
 
 /// The sums over one episode.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -19,6 +21,66 @@ pub struct EpisodeStats {
     pub dropped: bool,
     /// The physics diverged.
     pub diverged: bool,
+}
+
+impl EpisodeStats {
+    /// How many numbers it saves.
+    pub(super) const NUMBERS: usize = 6;
+
+    pub(super) fn save(&self, state: &mut EnvState) {
+        state.numbers.push(self.rot_dist_sum);
+        state.numbers.extend(self.reward.values());
+        state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
+        state.counters.extend([self.dropped, self.diverged].map(u64::from));
+    }
+
+    /// # Errors
+    /// Counters that no episode has.
+    pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
+        let [rot_dist_sum] = state.numbers()?;
+        let reward = RewardTerms::from(state.numbers()?);
+        let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
+        let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
+        ensure!(possible, "an episode of {length} steps with {goals} goals and {in_tolerance} steps in tolerance");
+        let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);
+        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped: dropped != 0, diverged: diverged != 0 })
+    }
+}
+
+/// Sums since they were last taken, across episodes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Recent {
+    /// Control steps.
+    pub steps: u64,
+    /// Rewards by term.
+    pub reward: RewardTerms,
+    /// Steps on which the physics diverged.
+    pub diverged: u64,
+}
+
+impl Recent {
+    /// How many numbers it saves.
+    pub(super) const NUMBERS: usize = 5;
+
+    pub(super) fn save(&self, state: &mut EnvState) {
+        state.numbers.extend(self.reward.values());
+        state.counters.extend([self.steps, self.diverged]);
+    }
+
+    pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
+        let reward = RewardTerms::from(state.numbers()?);
+        let [steps, diverged] = state.counters()?;
+        ensure!(diverged <= steps && steps < 1 << 60, "{diverged} of {steps} steps diverged");
+        Ok(Self { steps, reward, diverged })
+    }
+}
+
+impl std::ops::AddAssign for Recent {
+    fn add_assign(&mut self, other: Self) {
+        self.steps += other.steps;
+        self.reward += other.reward;
+        self.diverged += other.diverged;
+    }
 }
 
 /// Means over finished episodes; `NaN` where there is nothing to take a mean of.
@@ -64,7 +126,6 @@ impl Score {
         let margin = 1.96 * (variance / n).sqrt();
         let mut total = RewardTerms::default();
         episodes.iter().for_each(|e| total += e.reward);
-        let [rotation, distance, action, bonus, fall] = total.values().map(|term| term / n);
         Self {
             episodes: episodes.len(),
             env_steps: steps as u64,
@@ -76,7 +137,7 @@ impl Score {
             drop_rate: count(&|e| e.dropped) as f64 / n,
             length: steps / n,
             episode_return: total.total() / n,
-            reward: RewardTerms { rotation, distance, action, bonus, fall },
+            reward: total.values().map(|term| term / n).into(),
             diverged,
         }
     }

@@ -7,12 +7,18 @@ mod hand;
 mod pool;
 mod repose;
 mod reward;
+mod state;
+mod tail;
 
-pub use episode::{EpisodeStats, Score};
+pub use episode::{EpisodeStats, Recent, Score};
 pub use hand::{ACTION_SIZE, Hand, OBSERVATION_SIZE};
-pub use pool::{EnvBlock, EnvPool, StepBuffers};
-pub use repose::{Recent, Repose, StepDetails, Task};
+pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message};
+pub use repose::{Diverged, Repose, StepDetails, Task};
 pub use reward::RewardTerms;
+pub use state::{EnvState, SavedEnv};
+pub use tail::Tail;
+
+use anyhow::Result;
 
 use crate::rng::Rng;
 
@@ -56,4 +62,17 @@ pub trait Env: Send {
 
     /// The episode so far.
     fn episode(&self) -> Self::Episode;
+}
+
+/// An environment that can be saved in the middle of an episode.
+pub trait Resumable: Env {
+    /// Adds to `state` all that its future depends on, always as many numbers and counters.
+    fn save(&self, state: &mut EnvState);
+
+    /// Takes what it has saved from the front of `state`, and writes the observation to act on next; the future is then bit
+    /// for bit that of the environment that saved it.
+    ///
+    /// # Errors
+    /// Numbers that it cannot have saved.
+    fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()>;
 }

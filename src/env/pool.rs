@@ -3,9 +3,13 @@
 //! Environment i reads and writes its own row of each array and owns everything else that it needs, and the randomness of an
 //! episode depends on its number alone; so the results do not depend on which thread steps which block when.
 
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use anyhow::{Context, Result, bail, ensure};
 use rayon::prelude::*;
 
-use super::{End, Env, Transition};
+use super::{End, Env, EnvState, Resumable, Transition};
 use crate::rng;
 use crate::schedule::block_sizes;
 
@@ -18,6 +22,8 @@ pub struct EnvPool<E: Env> {
 pub struct EnvBlock<E: Env> {
     slots: Vec<Slot<E>>,
     seed: u64,
+    /// The number of its first environment.
+    first: usize,
     /// The number of environments in the whole pool: so far apart are the numbers of an environment's episodes.
     stride: u64,
     finished: Vec<E::Episode>,
@@ -45,7 +51,12 @@ impl<E: Env> EnvPool<E> {
     pub fn new(seed: u64, envs: Vec<E>) -> Self {
         let (sizes, stride) = (block_sizes(envs.len()), envs.len() as u64);
         let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
-        let block = |size| EnvBlock { slots: slots.by_ref().take(size).collect(), seed, stride, finished: Vec::new() };
+        let mut first = 0;
+        let block = |size| {
+            let slots = slots.by_ref().take(size).collect();
+            first += size;
+            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new() }
+        };
         Self { blocks: sizes.into_iter().map(block).collect() }
     }
 
@@ -79,14 +90,12 @@ impl<E: Env> EnvPool<E> {
         &mut self.blocks
     }
 
-    /// Starts an episode in every environment, at random ages so that they do not all end together.
-    ///
-    /// Episodes are numbered from `first_episode` on: those before it are not played again. Writes the `observations`
-    /// `[n, O]` of each block.
-    pub fn reset(&mut self, first_episode: u64, observations: Vec<&mut [f32]>) {
+    /// Starts the first episode of every environment, at random ages so that they do not all end together. Writes the
+    /// `observations` `[n, O]` of each block.
+    pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = self.observation_size();
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
-        (first_episode..).zip(slots).for_each(|(episode, slot)| slot.next_episode = episode);
+        (0..).zip(slots).for_each(|(episode, slot)| slot.next_episode = episode);
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
             for (slot, row) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)) {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
@@ -101,15 +110,47 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// A number beyond those of all episodes that were begun; a pool that is reset with it repeats none of them.
-    pub fn next_episode(&self) -> u64 {
-        let slots = self.blocks.iter().flat_map(|block| &block.slots);
-        slots.map(|slot| slot.next_episode).max().expect("a pool has at least one environment")
-    }
-
     /// The environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
         self.blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env)
+    }
+}
+
+impl<E: Resumable> EnvPool<E> {
+    /// The state of every environment. Episodes that ended and were not taken yet are not part of it.
+    pub fn save(&self) -> EnvState {
+        let mut state = EnvState::default();
+        for slot in self.blocks.iter().flat_map(|block| &block.slots) {
+            state.counters.push(slot.next_episode);
+            slot.env.save(&mut state);
+        }
+        state
+    }
+
+    /// Goes on from the state of a pool of as many environments, bit for bit, and writes the `observations` `[n, O]` of each
+    /// block to act on next.
+    ///
+    /// # Errors
+    /// A state that no such pool can have saved.
+    pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
+        let size = self.observation_size();
+        let mut rows = state.rows(self.len())?;
+        let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
+        for (i, (slot, row)) in
+            slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
+        {
+            let mut state = rows.next().expect("a row for each environment");
+            let restore = || {
+                let [next_episode] = state.counters()?;
+                ensure!(next_episode < 1 << 60, "an episode with the number {next_episode}");
+                slot.next_episode = next_episode;
+                slot.env.restore(&mut state, row)?;
+                state.finish()
+            };
+            restore().with_context(|| format!("environment {i}"))?;
+        }
+        self.blocks.iter_mut().for_each(|block| block.finished.clear());
+        Ok(())
     }
 }
 
@@ -125,7 +166,10 @@ impl<E: Env> EnvBlock<E> {
     }
 
     /// Steps every environment with its row of `actions` `[n, A]`, and starts a new episode where one ended.
-    pub fn step(&mut self, actions: &[f32], buffers: StepBuffers) {
+    ///
+    /// # Errors
+    /// A panic in an environment, with its number; the pool cannot be stepped any further.
+    pub fn step(&mut self, actions: &[f32], buffers: StepBuffers) -> Result<()> {
         let env = &self.slots[0].env;
         let (size, action_size) = (env.observation_size(), env.action_size());
         assert_eq!(actions.len(), self.len() * action_size, "actions of a block");
@@ -135,18 +179,31 @@ impl<E: Env> EnvBlock<E> {
         let rows = buffers.observations.chunks_exact_mut(size).zip(buffers.final_observations.chunks_exact_mut(size));
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
-        for ((slot, action), ((reward, end), (row, final_row))) in slots.zip(results) {
-            let transition: Transition = slot.env.step(action, row);
-            (*reward, *end) = (transition.reward, transition.end);
-            if let Some(end) = transition.end {
-                if end == End::Truncated {
-                    final_row.copy_from_slice(row);
+        for (i, ((slot, action), ((reward, end), (row, final_row)))) in slots.zip(results).enumerate() {
+            let step = || {
+                let transition: Transition = slot.env.step(action, row);
+                (*reward, *end) = (transition.reward, transition.end);
+                if let Some(end) = transition.end {
+                    if end == End::Truncated {
+                        final_row.copy_from_slice(row);
+                    }
+                    self.finished.push(slot.env.episode());
+                    slot.start(self.seed, self.stride, row);
                 }
-                self.finished.push(slot.env.episode());
-                slot.start(self.seed, self.stride, row);
+            };
+            // What a panic leaves half done is not used again.
+            if let Err(panic) = catch_unwind(AssertUnwindSafe(step)) {
+                bail!("environment {} panicked: {}", self.first + i, panic_message(&*panic));
             }
         }
+        Ok(())
     }
+}
+
+/// What a panic said.
+pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }
 
 impl<E: Env> Slot<E> {

@@ -5,9 +5,13 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 
-use super::{ACTION_SIZE, End, Env, EpisodeStats, Hand, OBSERVATION_SIZE, RewardTerms, Transition};
+use super::tail::{Recorder, Tail};
+use super::{
+    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Hand, OBSERVATION_SIZE, Recent, Resumable, RewardTerms, SavedEnv,
+    Transition,
+};
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
@@ -69,25 +73,17 @@ pub struct Repose {
     episode: EpisodeStats,
     recent: Recent,
     last: StepDetails,
+    recorder: Recorder,
+    diverged: Option<Diverged>,
 }
 
-/// Sums since they were last taken, across episodes.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Recent {
-    /// Control steps.
-    pub steps: u64,
-    /// Rewards by term.
-    pub reward: RewardTerms,
-    /// Steps on which the physics diverged.
-    pub diverged: u64,
-}
-
-impl std::ops::AddAssign for Recent {
-    fn add_assign(&mut self, other: Self) {
-        self.steps += other.steps;
-        self.reward += other.reward;
-        self.diverged += other.diverged;
-    }
+/// How an episode came to its end in a state that cannot be used.
+#[derive(Clone, Debug)]
+pub struct Diverged {
+    /// Its length in control steps, the last one included.
+    pub length: u32,
+    /// Its last steps.
+    pub tail: Tail,
 }
 
 /// What happened in the last step.
@@ -120,6 +116,8 @@ impl Repose {
             episode: EpisodeStats::default(),
             recent: Recent::default(),
             last: StepDetails::default(),
+            recorder: Recorder::default(),
+            diverged: None,
         }
     }
 
@@ -169,6 +167,11 @@ impl Repose {
     /// The sums since the last call.
     pub fn take_recent(&mut self) -> Recent {
         std::mem::take(&mut self.recent)
+    }
+
+    /// The last episode that diverged since the last call.
+    pub fn take_diverged(&mut self) -> Option<Diverged> {
+        self.diverged.take()
     }
 
     fn draw_rotation(&mut self) -> Quat {
@@ -309,6 +312,7 @@ impl Env for Repose {
         (self.age, self.held) = (0, 0);
         self.episode = EpisodeStats::default();
         self.last = StepDetails::default();
+        self.recorder.clear();
         self.sim.refresh();
         self.observe(observation);
     }
@@ -319,6 +323,7 @@ impl Env for Repose {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         self.actuate(action);
+        self.recorder.record(&self.sim, action);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls; whoever looks should find what was sent.
@@ -344,7 +349,10 @@ impl Env for Repose {
         self.recent.steps += 1;
         self.recent.reward += reward;
         self.recent.diverged += u64::from(diverged);
-        if !diverged {
+        if diverged {
+            let length = self.episode.length;
+            self.diverged = self.recorder.tail().map(|tail| Diverged { length, tail });
+        } else {
             self.episode.rot_dist_sum += rot_dist;
             self.hold(rot_dist <= self.task.config.success_tolerance);
         }
@@ -360,5 +368,38 @@ impl Env for Repose {
 
     fn episode(&self) -> EpisodeStats {
         self.episode
+    }
+}
+
+impl Resumable for Repose {
+    fn save(&self, state: &mut EnvState) {
+        state.numbers.extend(self.sim.state().numbers());
+        state.numbers.extend(self.goal);
+        state.numbers.extend(self.previous_action.map(f64::from));
+        state.numbers.extend(self.targets);
+        state.counters.extend(rng::position(&self.rng));
+        state.counters.extend([self.age, self.held].map(u64::from));
+        self.episode.save(state);
+        self.recent.save(state);
+    }
+
+    fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
+        self.sim.restore(state.numbers_but::<{ 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS + Recent::NUMBERS }>()?)?;
+        self.goal = state.numbers()?;
+        self.previous_action = state.numbers()?.map(|x| x as f32);
+        self.targets = state.numbers()?;
+        self.rng = rng::at(state.counters()?);
+        let [age, held] = state.counters()?;
+        let config = &self.task.config;
+        let possible =
+            age < u64::from(config.max_episode_steps()) && held < u64::from(config.max_consecutive_successes);
+        ensure!(possible, "an episode at step {age} that has held its goal for {held} steps");
+        (self.age, self.held) = (age as u32, held as u32);
+        self.episode = EpisodeStats::saved(state)?;
+        self.recent = Recent::saved(state)?;
+        self.last = StepDetails::default();
+        self.recorder.clear();
+        self.observe(observation);
+        Ok(())
     }
 }

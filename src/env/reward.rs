@@ -47,6 +47,13 @@ impl RewardTerms {
     }
 }
 
+/// In the order of [`RewardTerms::NAMES`].
+impl From<[f64; 5]> for RewardTerms {
+    fn from([rotation, distance, action, bonus, fall]: [f64; 5]) -> Self {
+        Self { rotation, distance, action, bonus, fall }
+    }
+}
+
 impl AddAssign for RewardTerms {
     fn add_assign(&mut self, other: Self) {
         self.rotation += other.rotation;

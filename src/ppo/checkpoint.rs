@@ -1,20 +1,23 @@
-//! A checkpoint as bytes: safetensors whose metadata carry the whole configuration and the progress of the run.
+//! What a checkpoint holds of a learner, and what a policy alone: weights, normaliser, optimizer, learning rate; with the whole
+//! configuration and the progress of the run, and with whatever else the training needs to go on.
 //!
-//! Reading is strict: the tensors must be those of the policy that the configuration describes, no more and no fewer, of
-//! the same shapes and finite.
+//! Reading is strict: the arrays must be those that the configuration describes, no more and no fewer, of the same shapes.
 
-use std::collections::{BTreeMap, HashMap};
-
-use anyhow::{Context, Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
 use super::backend::Moments;
+use super::format::{Array, Content};
+use super::policy::parameter_shapes;
 use super::{Normalizer, Policy, Ppo};
+use crate::config::PpoConfig;
 
-/// The value of the metadata key `format`.
-const FORMAT: &str = "shadow-repose checkpoint 1";
+/// The text `format` of a file.
+const FORMAT: &str = "shadow-repose checkpoint 2";
+
+/// Of what a policy alone does without, the part that every learner has.
+const LEARNING_RATE: &str = "learning_rate";
 
 /// How far a run has come.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -24,225 +27,231 @@ pub struct Progress {
     pub iteration: u64,
     /// Control steps over all environments.
     pub env_steps: u64,
-    /// The number of the first training episode that was not yet begun.
-    pub next_episode: u64,
     /// Goals per episode and rotation error (rad) of the best evaluation.
     pub best: Option<[f64; 2]>,
 }
 
-/// A checkpoint that has been read but not yet laid into a policy.
+/// A checkpoint, or a policy alone, outside of any learner.
+#[derive(Clone, Debug)]
 pub struct Checkpoint {
     /// The configuration of the run, as TOML.
     pub config: String,
     /// How far the run had come.
     pub progress: Progress,
-    learner: Learner,
-    tensors: BTreeMap<String, Stored>,
-}
-
-/// What the optimizer needs besides tensors.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Learner {
-    learning_rate: f64,
-    adam_steps: u64,
-}
-
-enum Stored {
-    F32(Vec<usize>, Vec<f32>),
-    F64(Vec<usize>, Vec<f64>),
+    content: Content,
 }
 
 impl Checkpoint {
-    /// Reads a checkpoint from the bytes of a file.
+    /// Reads the bytes of a file.
     ///
     /// # Errors
     /// Bytes that are no whole checkpoint of this program.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
-        let (_, header) = SafeTensors::read_metadata(bytes)
-            .map_err(|error| anyhow!("not a whole safetensors file ({error}); it may be cut off"))?;
-        let metadata = header.metadata().as_ref().context("no metadata: not a checkpoint of this program")?;
-        let entry = |key: &str| metadata.get(key).with_context(|| format!("its metadata lack `{key}`"));
-        let format = entry("format")?;
+        let mut content = Content::parse(bytes)?;
+        let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata lack `{key}`"));
+        let format = text("format")?;
         ensure!(format == FORMAT, "its format is `{format}`, this program reads `{FORMAT}`");
-        let files = SafeTensors::deserialize(bytes).map_err(|error| anyhow!("damaged: {error}"))?;
-        let mut tensors = BTreeMap::new();
-        for (name, view) in files.iter() {
-            tensors.insert(name.to_owned(), Stored::read(&view).with_context(|| format!("tensor `{name}`"))?);
+        let config = text("config")?;
+        let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
+        if let Some(key) = content.texts.keys().next() {
+            bail!("its metadata hold an unknown `{key}`");
         }
-        Ok(Self {
-            config: entry("config")?.clone(),
-            progress: serde_json::from_str(entry("progress")?).context("its metadata `progress`")?,
-            learner: serde_json::from_str(entry("learner")?).context("its metadata `learner`")?,
-            tensors,
-        })
+        Ok(Self { config, progress, content })
     }
 
-    fn take(&mut self, name: &str, shape: &[usize]) -> Result<Stored> {
-        let stored = self.tensors.remove(name).with_context(|| format!("tensor `{name}` is missing"))?;
-        let found = stored.shape();
-        ensure!(found == shape, "tensor `{name}` has the shape {found:?}, expected {shape:?}");
-        Ok(stored)
+    /// The bytes of a file.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+        let mut content = self.content.clone();
+        for (key, text) in
+            [("format", FORMAT), ("config", &self.config), ("progress", &serde_json::to_string(&self.progress)?)]
+        {
+            content.texts.insert(key.into(), text.into());
+        }
+        content.to_bytes()
     }
 
-    fn take_tensor(&mut self, name: &str, shape: &[usize]) -> Result<Tensor> {
-        match self.take(name, shape)? {
-            Stored::F32(shape, values) => Ok(Tensor::from_vec(values, shape, &Device::Cpu)?),
-            Stored::F64(..) => bail!("tensor `{name}` must be of type F32"),
+    /// What playing needs of it.
+    pub fn policy_alone(&self) -> Self {
+        let Self { config, progress, content } = self;
+        let needed =
+            |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
+        let arrays = content.arrays.iter().filter(|(name, _)| needed(name));
+        let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
+        Self { config: config.clone(), progress: *progress, content: Content { arrays, ..Content::default() } }
+    }
+
+    /// Adds an array.
+    pub fn insert(&mut self, name: &str, array: Array) {
+        self.content.arrays.insert(name.to_owned(), array);
+    }
+
+    /// The shape of an array, if it is there.
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.content.arrays.get(name).map(Array::shape)
+    }
+
+    fn take(&mut self, name: &str) -> Result<Array> {
+        self.content.arrays.remove(name).with_context(|| format!("tensor `{name}` is missing"))
+    }
+
+    /// Takes out doubles of any shape.
+    ///
+    /// # Errors
+    /// The array is missing or of another type.
+    pub fn take_doubles(&mut self, name: &str) -> Result<Vec<f64>> {
+        match self.take(name)? {
+            Array::F64(_, values) => Ok(values),
+            _ => bail!("tensor `{name}` must be of type F64"),
         }
     }
 
-    fn take_doubles(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
-        match self.take(name, &[size])? {
-            Stored::F64(_, values) => Ok(values),
-            Stored::F32(..) => bail!("tensor `{name}` must be of type F64"),
+    /// Takes out whole numbers of any shape.
+    ///
+    /// # Errors
+    /// The array is missing or of another type.
+    pub fn take_counters(&mut self, name: &str) -> Result<Vec<u64>> {
+        match self.take(name)? {
+            Array::U64(_, values) => Ok(values),
+            _ => bail!("tensor `{name}` must be of type U64"),
         }
+    }
+
+    fn take_vector(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
+        let values = self.take_doubles(name)?;
+        ensure!(values.len() == size, "tensor `{name}` has {} numbers, expected {size}", values.len());
+        Ok(values)
+    }
+
+    fn take_tensor(&mut self, name: &str) -> Result<Tensor> {
+        match self.take(name)? {
+            Array::F32(shape, values) => Ok(Tensor::from_vec(values, shape, &Device::Cpu)?),
+            _ => bail!("tensor `{name}` must be of type F32"),
+        }
+    }
+
+    /// Makes sure that it holds the parameters of the policy that `config` describes, before anything is allocated by what
+    /// `config` says.
+    ///
+    /// # Errors
+    /// A tensor that is missing, or of another shape.
+    pub fn expect_policy(&self, config: &PpoConfig, observation_size: usize, action_size: usize) -> Result<()> {
+        for (name, shape) in parameter_shapes(config, observation_size, action_size) {
+            let found = self.shape(&name).with_context(|| format!("tensor `{name}` is missing"))?;
+            ensure!(found == shape, "tensor `{name}` has the shape {found:?}, expected {shape:?}");
+        }
+        Ok(())
     }
 
     fn take_policy(&mut self, policy: &mut Policy) -> Result<()> {
         for (name, var) in policy.parameters() {
-            var.set(&self.take_tensor(name, var.dims())?)?;
+            var.set(&self.take_tensor(name)?)?;
         }
         let size = policy.observation_size();
-        let count = self.take_doubles("normalizer.count", 1)?[0];
+        let count = self.take_vector("normalizer.count", 1)?[0];
         policy.normalizer = Normalizer {
-            mean: self.take_doubles("normalizer.mean", size)?,
-            variance: self.take_doubles("normalizer.variance", size)?,
+            mean: self.take_vector("normalizer.mean", size)?,
+            variance: self.take_vector("normalizer.variance", size)?,
             count,
         };
         let sound = count >= 0.0 && policy.normalizer.variance.iter().all(|&v| v >= 0.0);
         ensure!(sound, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
         Ok(())
     }
-}
 
-impl Policy {
-    /// Takes over weights and normaliser of a checkpoint.
+    /// Makes sure that everything was taken out.
     ///
     /// # Errors
-    /// A tensor that is missing, of another shape or type, not finite, or not one of a checkpoint of this policy.
-    pub fn restore(&mut self, mut checkpoint: Checkpoint) -> Result<()> {
-        checkpoint.take_policy(self)?;
-        checkpoint.tensors.retain(|name, _| !name.starts_with("adam."));
-        checkpoint.finish()
-    }
-}
-
-impl Ppo {
-    /// The policy and all that is needed to go on training it, with the configuration (TOML) and the progress of the run.
-    ///
-    /// # Errors
-    /// Weights that are not finite.
-    pub fn save(&self, config: &str, progress: &Progress) -> Result<Vec<u8>> {
-        let mut tensors = Vec::new();
-        let moments = self.backend.moments(&self.policy)?;
-        for ((name, var), [mean, square]) in self.policy.parameters().iter().zip(&moments.tensors) {
-            tensors.push((name.clone(), Stored::of(var.as_tensor())?));
-            tensors.push((format!("adam.mean.{name}"), Stored::of(mean)?));
-            tensors.push((format!("adam.square.{name}"), Stored::of(square)?));
-        }
-        let normalizer = &self.policy.normalizer;
-        for (name, values) in
-            [("mean", &normalizer.mean), ("variance", &normalizer.variance), ("count", &vec![normalizer.count])]
-        {
-            tensors.push((format!("normalizer.{name}"), Stored::F64(vec![values.len()], values.clone())));
-        }
-        for (name, stored) in &tensors {
-            ensure!(stored.is_finite(), "`{name}` is not finite and is not saved");
-        }
-        let learner = Learner { learning_rate: self.learning_rate, adam_steps: moments.steps };
-        let metadata = HashMap::from([
-            ("format".to_owned(), FORMAT.to_owned()),
-            ("config".to_owned(), config.to_owned()),
-            ("progress".to_owned(), serde_json::to_string(progress)?),
-            ("learner".to_owned(), serde_json::to_string(&learner)?),
-        ]);
-        let bytes: Vec<(String, Vec<u8>, Stored)> =
-            tensors.into_iter().map(|(name, stored)| (name, stored.bytes(), stored)).collect();
-        let mut views = Vec::new();
-        for (name, bytes, stored) in &bytes {
-            views.push((name, TensorView::new(stored.dtype(), stored.shape().to_vec(), bytes)?));
-        }
-        Ok(safetensors::serialize(views, Some(metadata))?)
-    }
-
-    /// Goes on from a checkpoint.
-    ///
-    /// # Errors
-    /// As [`Policy::restore`].
-    pub fn restore(&mut self, mut checkpoint: Checkpoint) -> Result<()> {
-        checkpoint.take_policy(&mut self.policy)?;
-        let mut tensors = Vec::new();
-        for (name, var) in self.policy.parameters() {
-            let mean = checkpoint.take_tensor(&format!("adam.mean.{name}"), var.dims())?;
-            let square = checkpoint.take_tensor(&format!("adam.square.{name}"), var.dims())?;
-            tensors.push([mean, square]);
-        }
-        let Learner { learning_rate, adam_steps } = checkpoint.learner;
-        ensure!(learning_rate.is_finite() && learning_rate > 0.0, "its learning rate is {learning_rate}");
-        checkpoint.finish()?;
-        self.backend.restore(Moments { tensors, steps: adam_steps })?;
-        self.learning_rate = learning_rate;
-        Ok(())
-    }
-}
-
-impl Checkpoint {
-    fn finish(self) -> Result<()> {
-        match self.tensors.keys().next() {
+    /// Something is left, by its name.
+    pub fn finish(self) -> Result<()> {
+        match self.content.arrays.keys().next() {
             Some(name) => bail!("tensor `{name}` is not one of this policy"),
             None => Ok(()),
         }
     }
 }
 
-impl Stored {
-    fn of(tensor: &Tensor) -> Result<Self> {
-        Ok(Self::F32(tensor.dims().to_vec(), tensor.flatten_all()?.to_vec1()?))
+impl Policy {
+    /// The policy of a checkpoint, or of a policy alone.
+    ///
+    /// # Errors
+    /// A tensor that is missing, of another shape or type, or not one of this policy.
+    pub fn load(
+        config: &PpoConfig,
+        observation_size: usize,
+        action_size: usize,
+        checkpoint: &Checkpoint,
+    ) -> Result<Self> {
+        checkpoint.expect_policy(config, observation_size, action_size)?;
+        let mut policy = Self::new(config, observation_size, action_size, 0)?;
+        let mut alone = checkpoint.policy_alone();
+        alone.take_policy(&mut policy)?;
+        alone.finish()?;
+        Ok(policy)
     }
+}
 
-    fn read(view: &TensorView) -> Result<Self> {
-        let shape = view.shape().to_vec();
-        let stored = match view.dtype() {
-            Dtype::F32 => {
-                let (words, _) = view.data().as_chunks::<4>();
-                Self::F32(shape, words.iter().map(|word| f32::from_le_bytes(*word)).collect())
-            }
-            Dtype::F64 => {
-                let (words, _) = view.data().as_chunks::<8>();
-                Self::F64(shape, words.iter().map(|word| f64::from_le_bytes(*word)).collect())
-            }
-            other => bail!("has the type {other:?}, expected F32 or F64"),
+impl Ppo {
+    /// The policy and all that is needed to go on learning, with the configuration (TOML) and the progress of the run.
+    ///
+    /// # Errors
+    /// Only if candle cannot allocate.
+    pub fn checkpoint(&self, config: &str, progress: Progress) -> Result<Checkpoint> {
+        let mut checkpoint = Checkpoint { config: config.to_owned(), progress, content: Content::default() };
+        let floats = |tensor: &Tensor| -> Result<Array> {
+            Ok(Array::F32(tensor.dims().to_vec(), tensor.flatten_all()?.to_vec1()?))
         };
-        ensure!(stored.is_finite(), "holds a number that is not finite");
-        Ok(stored)
+        let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
+        let moments = self.backend.moments(&self.policy)?;
+        for ((name, var), [mean, square]) in self.policy.parameters().iter().zip(&moments.tensors) {
+            checkpoint.insert(name, floats(var.as_tensor())?);
+            checkpoint.insert(&format!("adam.mean.{name}"), floats(mean)?);
+            checkpoint.insert(&format!("adam.square.{name}"), floats(square)?);
+        }
+        checkpoint.insert("adam.steps", Array::U64(vec![1], vec![moments.steps]));
+        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate]));
+        let normalizer = &self.policy.normalizer;
+        checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
+        checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
+        checkpoint.insert("normalizer.count", vector(&[normalizer.count]));
+        Ok(checkpoint)
     }
 
-    fn bytes(&self) -> Vec<u8> {
-        match self {
-            Self::F32(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
-            Self::F64(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+    /// Goes on from a checkpoint, and takes out of it what it needs.
+    ///
+    /// # Errors
+    /// A policy alone; a tensor that is missing, or of another shape or type, or with values that it cannot have.
+    pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
+        ensure!(
+            checkpoint.shape(LEARNING_RATE).is_some(),
+            "it holds a policy alone, which can be played but not trained on"
+        );
+        let [observation_size, action_size] = [self.policy.observation_size(), self.policy.action_size()];
+        checkpoint.expect_policy(&self.config, observation_size, action_size)?;
+        checkpoint.take_policy(&mut self.policy)?;
+        let mut tensors = Vec::new();
+        for (name, var) in self.policy.parameters() {
+            let mut moment = |kind: &str| {
+                let name = format!("adam.{kind}.{name}");
+                let moment = checkpoint.take_tensor(&name)?;
+                let (found, expected) = (moment.dims(), var.dims());
+                ensure!(found == expected, "tensor `{name}` has the shape {found:?}, expected {expected:?}");
+                Ok((name, moment))
+            };
+            let (_, mean) = moment("mean")?;
+            let (name, square) = moment("square")?;
+            ensure!(square.flatten_all()?.min(0)?.to_scalar::<f32>()? >= 0.0, "tensor `{name}` has a negative value");
+            tensors.push([mean, square]);
         }
-    }
-
-    fn dtype(&self) -> Dtype {
-        match self {
-            Self::F32(..) => Dtype::F32,
-            Self::F64(..) => Dtype::F64,
-        }
-    }
-
-    fn shape(&self) -> &[usize] {
-        match self {
-            Self::F32(shape, _) | Self::F64(shape, _) => shape,
-        }
-    }
-
-    fn is_finite(&self) -> bool {
-        match self {
-            Self::F32(_, values) => values.iter().all(|x| x.is_finite()),
-            Self::F64(_, values) => values.iter().all(|x| x.is_finite()),
-        }
+        let steps = checkpoint.take_counters("adam.steps")?;
+        ensure!(steps.len() == 1 && steps[0] < 1 << 60, "tensor `adam.steps` is no number of steps");
+        let learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
+        ensure!(learning_rate > 0.0, "its learning rate is {learning_rate}");
+        self.backend.restore(Moments { tensors, steps: steps[0] })?;
+        self.learning_rate = learning_rate;
+        Ok(())
     }
 }
 
@@ -252,26 +261,28 @@ mod tests {
     use crate::config::{Backend, Config};
     use crate::ppo::Rollout;
 
-    fn learner_with(backend: Backend, hidden: &[usize], seed: u64) -> Ppo {
+    fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.hidden) = (backend, hidden.to_vec());
-        Ppo::new(&config, 3, 2, seed).unwrap()
+        config
     }
 
-    fn learner(hidden: &[usize], seed: u64) -> Ppo {
-        learner_with(Backend::Fused, hidden, seed)
+    fn learner(hidden: &[usize]) -> Ppo {
+        Ppo::new(&config(Backend::Fused, hidden), 3, 2, 0).unwrap()
     }
 
-    fn refusal(bytes: &[u8], into: &mut Ppo) -> String {
-        match Checkpoint::parse(bytes).and_then(|checkpoint| into.restore(checkpoint)) {
-            Ok(()) => panic!("must be refused"),
-            Err(error) => format!("{error:#}"),
-        }
+    fn saved(ppo: &Ppo) -> Checkpoint {
+        ppo.checkpoint("[env]", Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) }).unwrap()
+    }
+
+    fn refusal(mut checkpoint: Checkpoint, into: &mut Ppo) -> String {
+        let restored = into.restore(&mut checkpoint).and_then(|()| checkpoint.finish());
+        format!("{:#}", restored.expect_err("must be refused"))
     }
 
     /// A learner that has taken a step of its optimizer.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
-        let mut ppo = learner_with(backend, &[8], seed);
+        let mut ppo = Ppo::new(&config(backend, &[8]), 3, 2, seed).unwrap();
         ppo.policy.normalizer.update(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]);
         ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], 3, 2);
@@ -286,60 +297,68 @@ mod tests {
     fn what_is_saved_is_what_is_restored_by_either_backend() {
         for [backend, other] in [[Backend::Fused, Backend::Candle], [Backend::Candle, Backend::Fused]] {
             let from = learnt(backend, 1);
-            let progress = Progress { iteration: 7, env_steps: 99, next_episode: 5, best: Some([1.5, 0.25]) };
-            let bytes = from.save("[env]", &progress).unwrap();
+            let bytes = saved(&from).to_bytes().unwrap();
             for mut to in [learnt(backend, 2), learnt(other, 3)] {
-                let checkpoint = Checkpoint::parse(&bytes).unwrap();
+                let mut checkpoint = Checkpoint::parse(&bytes).unwrap();
+                let progress = Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) };
                 assert_eq!((checkpoint.config.as_str(), checkpoint.progress), ("[env]", progress));
-                to.restore(checkpoint).unwrap();
+                to.restore(&mut checkpoint).unwrap();
+                checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
                 assert_eq!(to.learning_rate, 0.123);
                 assert!(from.backend.moments(&from.policy).unwrap().tensors.iter().flatten().any(|moment| {
                     moment.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().any(|&x| x != 0.0)
                 }));
-                // The order of the metadata is not fixed.
-                let saved = to.save("[env]", &progress).unwrap();
-                let tensors = |bytes| SafeTensors::deserialize(bytes).unwrap();
-                for (name, tensor) in tensors(&bytes).iter() {
-                    assert!(tensors(&saved).tensor(name).unwrap().data() == tensor.data(), "{name} differs");
-                }
+                assert_eq!(saved(&to).content, saved(&from).content);
             }
         }
     }
 
     #[test]
-    fn other_shapes_and_names_are_refused_by_name() {
-        let bytes = learner(&[8], 0).save("", &Progress::default()).unwrap();
-        let wider = refusal(&bytes, &mut learner(&[9], 0));
-        assert!(wider.contains("`actor.0.weight` has the shape [8, 3], expected [9, 3]"), "{wider}");
-        let deeper = refusal(&bytes, &mut learner(&[8, 2], 0));
-        assert!(deeper.contains("`actor.2.weight` is missing"), "{deeper}");
-        let mut more = Checkpoint::parse(&bytes).unwrap();
-        more.tensors.insert("actor.9.weight".into(), Stored::F32(vec![1], vec![0.0]));
-        let more = learner(&[8], 0).restore(more).unwrap_err().to_string();
-        assert!(more.contains("`actor.9.weight` is not one of this policy"), "{more}");
-    }
-
-    #[test]
-    fn cut_off_and_foreign_files_are_refused() {
-        let bytes = learner(&[8], 0).save("", &Progress::default()).unwrap();
-        for length in [0, 7, 8, 100, bytes.len() / 2, bytes.len() - 1] {
-            assert!(refusal(&bytes[..length], &mut learner(&[8], 0)).contains("cut off"));
+    fn a_policy_alone_plays_and_cannot_be_trained_on() {
+        let from = learnt(Backend::Fused, 1);
+        let alone = saved(&from).policy_alone();
+        let bytes = alone.to_bytes().unwrap();
+        assert!(bytes.len() < saved(&from).to_bytes().unwrap().len() * 2 / 3);
+        let read = Checkpoint::parse(&bytes).unwrap();
+        let policy = Policy::load(&config(Backend::Fused, &[8]), 3, 2, &read).unwrap();
+        assert_eq!(policy.normalizer, from.policy.normalizer);
+        for ((_, a), (_, b)) in policy.parameters().iter().zip(from.policy.parameters()) {
+            let numbers = |var: &Tensor| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            assert_eq!(numbers(a), numbers(b));
         }
-        let foreign = safetensors::serialize(Vec::<(String, TensorView)>::new(), None).unwrap();
-        assert!(refusal(&foreign, &mut learner(&[8], 0)).contains("not a checkpoint of this program"));
+        assert!(refusal(read, &mut learner(&[8])).contains("policy alone"));
     }
 
     #[test]
-    fn weights_that_are_not_finite_are_neither_saved_nor_loaded() {
-        let mut ppo = learner(&[8], 0);
-        let bytes = ppo.save("", &Progress::default()).unwrap();
-        let weight = ppo.policy.parameters()[0].1.flatten_all().unwrap().to_vec1::<f32>().unwrap()[0].to_le_bytes();
-        let at = bytes.windows(4).position(|w| w == weight).unwrap();
-        let mut damaged = bytes.clone();
-        damaged[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-        assert!(refusal(&damaged, &mut learner(&[8], 0)).contains("not finite"));
+    fn other_shapes_and_names_are_refused_by_name() {
+        let checkpoint = saved(&learner(&[8]));
+        let wider = refusal(checkpoint.clone(), &mut learner(&[9]));
+        assert!(wider.contains("`actor.0.weight` has the shape [8, 3], expected [9, 3]"), "{wider}");
+        let deeper = refusal(checkpoint.clone(), &mut learner(&[8, 2]));
+        assert!(deeper.contains("`actor.1.weight` has the shape [2, 8]") || deeper.contains("is missing"), "{deeper}");
+        let mut more = checkpoint.clone();
+        more.insert("actor.9.weight", Array::F32(vec![1], vec![0.0]));
+        let refused = refusal(more.clone(), &mut learner(&[8]));
+        assert!(refused.contains("`actor.9.weight` is not one of this policy"), "{refused}");
+        assert!(Policy::load(&config(Backend::Fused, &[8]), 3, 2, &more).is_err());
+        let mut negative = checkpoint;
+        negative.insert("adam.square.log_std", Array::F32(vec![2], vec![0.0, -1.0]));
+        assert!(refusal(negative, &mut learner(&[8])).contains("`adam.square.log_std` has a negative value"));
+    }
+
+    #[test]
+    fn a_policy_that_the_configuration_only_claims_is_not_allocated() {
+        let checkpoint = saved(&learner(&[8]));
+        // Terabytes, if they were.
+        let claimed = config(Backend::Fused, &[1 << 20, 1 << 20, 1 << 20]);
+        assert!(Policy::load(&claimed, 3, 2, &checkpoint).is_err());
+    }
+
+    #[test]
+    fn weights_that_are_not_finite_are_not_saved() {
+        let mut ppo = learner(&[8]);
         ppo.policy.normalizer.mean[0] = f64::NAN;
-        assert!(ppo.save("", &Progress::default()).unwrap_err().to_string().contains("normalizer.mean"));
+        assert!(saved(&ppo).to_bytes().unwrap_err().to_string().contains("normalizer.mean"));
     }
 }

@@ -7,6 +7,7 @@
 mod acting;
 mod backend;
 mod checkpoint;
+mod format;
 mod fused;
 mod gae;
 mod measure;
@@ -16,6 +17,7 @@ mod reference;
 mod rollout;
 
 use std::f64::consts::{E, TAU};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail, ensure};
 use rand::seq::SliceRandom;
@@ -23,6 +25,7 @@ use rayon::prelude::*;
 
 pub use acting::Acting;
 pub use checkpoint::{Checkpoint, Progress};
+pub use format::{Array, sealed};
 pub use fused::Workspace;
 pub use gae::gae;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
@@ -114,16 +117,17 @@ impl Ppo {
     }
 
     /// Learns from a rollout that this policy has collected, then takes its observations into the normaliser, which stays
-    /// the same during collection and update: so the first minibatch still sees the very policy that acted.
+    /// the same during collection and update: so the first minibatch still sees the very policy that acted. `None` if `stop`
+    /// was set meanwhile; then the learner must be restored before it is used again.
     ///
     /// # Errors
     /// A loss, gradient or weight that is not finite; the policy must not be used or saved then.
-    pub fn update(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
+    pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         // On a worker thread: from outside, each of the many short parallel parts would put this one to sleep and wake it.
-        rayon::scope(|_| self.learn(rollout, iteration))
+        rayon::scope(|_| self.learn(rollout, iteration, stop))
     }
 
-    fn learn(&mut self, rollout: &mut Rollout, iteration: u64) -> Result<UpdateStats> {
+    fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         let explained_variance = self.prepare(rollout);
         self.backend.begin(&self.policy, rollout)?;
         let size = rollout.samples() / self.config.minibatches;
@@ -133,24 +137,27 @@ impl Ppo {
         for epoch in 0..self.config.epochs {
             order.shuffle(&mut shuffle);
             for (part, samples) in order.chunks_exact(size).enumerate() {
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(None);
+                }
                 let first = (epoch, part) == (0, 0);
                 let losses = self
                     .minibatch_step(rollout, samples, first)
-                    .with_context(|| format!("iteration {iteration}, epoch {epoch}, minibatch {part}"))?;
+                    .with_context(|| format!("epoch {epoch}, minibatch {part}"))?;
                 if first {
                     (stats.first_kl, stats.first_ratio_error) = (losses.kl, losses.ratio_error);
                 }
                 stats.add(&losses);
             }
         }
-        self.check_weights().with_context(|| format!("iteration {iteration}"))?;
+        self.check_weights()?;
         stats.average((self.config.epochs * self.config.minibatches) as f64);
         let std = self.policy.std()?;
         stats.std = std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64;
         (stats.explained_variance, stats.learning_rate) = (explained_variance, self.learning_rate);
         let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
         self.policy.normalizer.update(&seen);
-        Ok(stats)
+        Ok(Some(stats))
     }
 
     /// Sets the returns and the advantages, which get mean 0 and standard deviation 1; returns the explained variance.

@@ -51,19 +51,20 @@ impl Policy {
     pub fn new(config: &PpoConfig, observation_size: usize, action_size: usize, seed: u64) -> Result<Self> {
         let mut rng = rng::stream(seed, "weights", 0);
         let mut parameters = Vec::new();
-        for (net, outputs, last_scale) in [("actor", action_size, LAST_ACTOR_LAYER), ("critic", 1, 1.0)] {
-            let mut inputs = observation_size;
-            for (layer, &size) in config.hidden.iter().chain([&outputs]).enumerate() {
-                let bound = 1.0 / (inputs as f32).sqrt();
-                let scale = if layer == config.hidden.len() { last_scale } else { 1.0 };
-                let weight = uniform(&mut rng, bound * scale, &[size, inputs])?;
-                parameters.push((format!("{net}.{layer}.weight"), weight));
-                parameters.push((format!("{net}.{layer}.bias"), uniform(&mut rng, bound, &[size])?));
-                inputs = size;
-            }
+        let mut bound = 0.0;
+        for (name, shape) in parameter_shapes(config, observation_size, action_size) {
+            let var = match shape[..] {
+                [_, inputs] => {
+                    bound = 1.0 / (inputs as f32).sqrt();
+                    let last = name == format!("actor.{}.weight", config.hidden.len());
+                    uniform(&mut rng, if last { bound * LAST_ACTOR_LAYER } else { bound }, &shape)?
+                }
+                // The bias of the weights before it.
+                _ if name != LOG_STD => uniform(&mut rng, bound, &shape)?,
+                _ => Var::from_tensor(&Tensor::full(config.init_std.ln() as f32, shape, &Device::Cpu)?)?,
+            };
+            parameters.push((name, var));
         }
-        let log_std = Tensor::full(config.init_std.ln() as f32, action_size, &Device::Cpu)?;
-        parameters.push(("log_std".into(), Var::from_tensor(&log_std)?));
         Ok(Self {
             parameters,
             normalizer: Normalizer::new(observation_size),
@@ -141,6 +142,25 @@ impl Policy {
     pub fn std(&self) -> Result<Vec<f32>> {
         Ok(self.log_std().as_detached_tensor().exp()?.to_vec1()?)
     }
+}
+
+/// The name of the logarithm of the standard deviations.
+const LOG_STD: &str = "log_std";
+
+/// Names and shapes of a policy's parameters, in order: actor, critic, each layer by layer, weights `[outputs, inputs]`
+/// before biases; the logarithm of the standard deviations.
+pub fn parameter_shapes(config: &PpoConfig, observation_size: usize, action_size: usize) -> Vec<(String, Vec<usize>)> {
+    let mut shapes = Vec::new();
+    for (net, outputs) in [("actor", action_size), ("critic", 1)] {
+        let mut inputs = observation_size;
+        for (layer, &size) in config.hidden.iter().chain([&outputs]).enumerate() {
+            shapes.push((format!("{net}.{layer}.weight"), vec![size, inputs]));
+            shapes.push((format!("{net}.{layer}.bias"), vec![size]));
+            inputs = size;
+        }
+    }
+    shapes.push((LOG_STD.into(), vec![action_size]));
+    shapes
 }
 
 impl FrozenPolicy<'_> {

@@ -1,8 +1,8 @@
 //! TensorBoard event files, from the parts of tensorboard-rs that return their errors.
 
-use std::fs::File;
-use std::io::BufWriter;
-use std::path::Path;
+use std::fs::{self, File, OpenOptions};
+use std::io::{BufReader, BufWriter, ErrorKind, Read};
+use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result};
@@ -11,8 +11,17 @@ use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
 use tensorboard_proto::summary::{Summary, Summary_Value};
 use tensorboard_rs::record_writer::RecordWriter;
 
+/// How the names of event files begin and end.
+const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
+
+/// No event of ours is larger; what claims to be is damaged.
+const LARGEST: u64 = 1 << 20;
+
 /// An event file that is being written.
 pub struct EventFile {
+    path: PathBuf,
+    /// The same as the writer's.
+    file: File,
     writer: RecordWriter<BufWriter<File>>,
 }
 
@@ -23,10 +32,17 @@ impl EventFile {
     /// # Errors
     /// A file that cannot be written.
     pub fn create(folder: &Path, first_step: u64) -> Result<Self> {
-        let seconds = now() as u64;
-        let path = folder.join(format!("events.out.tfevents.{seconds:010}.{:07}.shadow-repose", std::process::id()));
-        let file = File::create_new(&path).with_context(|| format!("cannot create {}", path.display()))?;
-        let mut events = Self { writer: RecordWriter::new(BufWriter::new(file)) };
+        let [begin, end] = NAME;
+        let mut seconds = now() as u64;
+        let (path, file) = loop {
+            let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
+            match File::create_new(&path) {
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => seconds += 1,
+                file => break (path.clone(), file.with_context(|| format!("cannot create {}", path.display()))?),
+            }
+        };
+        let writer = RecordWriter::new(BufWriter::new(file.try_clone()?));
+        let mut events = Self { path, file, writer };
         let mut version = Event::new();
         version.set_file_version("brain.Event:2".into());
         events.write(version, 0)?;
@@ -58,9 +74,60 @@ impl EventFile {
     fn write(&mut self, mut event: Event, step: u64) -> Result<()> {
         event.set_wall_time(now());
         event.set_step(step as i64);
-        self.writer.write(&event.write_to_bytes()?)?;
-        self.writer.flush()?;
-        Ok(())
+        let bytes = event.write_to_bytes()?;
+        let written = self.writer.write(&bytes).and_then(|()| self.writer.flush());
+        written.with_context(|| format!("cannot write {}", self.path.display()))
+    }
+
+    /// Makes sure that all events are on the disk, where they can be found.
+    ///
+    /// # Errors
+    /// A file that cannot be written, or was deleted.
+    pub fn sync(&self) -> Result<()> {
+        let synced = fs::metadata(&self.path).and_then(|_| self.file.sync_data());
+        synced.with_context(|| format!("cannot write {}", self.path.display()))
+    }
+}
+
+/// Cuts off, in every event file of `folder`, what comes after `last_step`, and what a crash left half written: so no reader
+/// finds a step twice.
+///
+/// # Errors
+/// A file that cannot be read or written.
+pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
+    let [begin, end] = NAME;
+    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+    for entry in entries.flatten() {
+        if entry.file_name().to_str().is_some_and(|name| name.starts_with(begin) && name.ends_with(end)) {
+            let path = entry.path();
+            let cut = || {
+                let file = OpenOptions::new().read(true).write(true).open(&path)?;
+                let kept = length_up_to(&file, last_step)?;
+                if kept < file.metadata()?.len() { file.set_len(kept) } else { Ok(()) }
+            };
+            cut().with_context(|| format!("cannot shorten {}", path.display()))?;
+        }
+    }
+    Ok(())
+}
+
+/// The bytes of the whole events up to `last_step`; steps do not go back within a file.
+fn length_up_to(file: &File, last_step: u64) -> std::io::Result<u64> {
+    let (mut reader, mut length) = (BufReader::new(file), 0);
+    loop {
+        // A record: length, its checksum, the event, its checksum.
+        let (mut header, mut event) = ([0; 12], Vec::new());
+        let whole = match reader.read_exact(&mut header) {
+            Err(error) if error.kind() == ErrorKind::UnexpectedEof => return Ok(length),
+            result => result.map(|()| u64::from_le_bytes(*header.first_chunk().expect("8 of 12 bytes")))?,
+        };
+        if whole > LARGEST || reader.by_ref().take(whole + 4).read_to_end(&mut event)? as u64 != whole + 4 {
+            return Ok(length);
+        }
+        match Event::parse_from_bytes(&event[..whole as usize]) {
+            Ok(event) if event.get_step() <= last_step as i64 => length += 16 + whole,
+            _ => return Ok(length),
+        }
     }
 }
 
@@ -73,20 +140,42 @@ fn now() -> f64 {
 mod tests {
     use super::*;
 
+    fn read(path: &Path) -> Vec<Event> {
+        let bytes = fs::read(path).unwrap();
+        let (mut rest, mut found) = (&bytes[..], Vec::new());
+        while !rest.is_empty() {
+            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            found.push(Event::parse_from_bytes(&rest[12..12 + length]).unwrap());
+            rest = &rest[16 + length..];
+        }
+        found
+    }
+
+    #[test]
+    fn steps_after_the_checkpoint_and_half_written_events_are_cut_off() {
+        let place = tempfile::tempdir().unwrap();
+        let mut events = EventFile::create(place.path(), 0).unwrap();
+        (1..=4).for_each(|step| events.scalars(10 * step, &[("a", step as f64)]).unwrap());
+        let path = events.path.clone();
+        let half = [fs::read(&path).unwrap(), vec![9; 30]].concat();
+        fs::write(&path, half).unwrap();
+        for (last, expected) in [(40, 4), (25, 2)] {
+            cut_off_after(place.path(), last).unwrap();
+            let steps: Vec<i64> = read(&path)[2..].iter().map(Event::get_step).collect();
+            assert_eq!(steps, (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>());
+        }
+        // A second file of the same second and program.
+        let more = EventFile::create(place.path(), 21).unwrap();
+        assert_ne!(more.path, path);
+    }
+
     #[test]
     fn an_event_file_holds_its_version_the_first_step_and_the_values_that_are_known() {
         let place = tempfile::tempdir().unwrap();
         let mut events = EventFile::create(place.path(), 7).unwrap();
         events.scalars(9, &[("reward/fall", 0.25), ("eval/goals", f64::NAN)]).unwrap();
         let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
-        let bytes = std::fs::read(path).unwrap();
-        let (mut rest, mut found) = (&bytes[..], Vec::new());
-        // A record: length, its checksum, the event, its checksum.
-        while !rest.is_empty() {
-            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
-            found.push(Event::parse_from_bytes(&rest[12..12 + length]).unwrap());
-            rest = &rest[16 + length..];
-        }
+        let found = read(&path);
         assert_eq!(found.len(), 3);
         assert_eq!(found[0].get_file_version(), "brain.Event:2");
         assert_eq!(

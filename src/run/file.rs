@@ -1,25 +1,72 @@
 //! Files that are read whole, and written whole or not at all.
 
 use std::fs::{self, File};
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
+
+/// How the name of a file ends that is not complete yet.
+pub const PARTIAL: &str = "partial";
+
+/// A text of settings takes a few KiB.
+const LARGEST_TEXT: u64 = 1 << 22;
+
+/// The largest policy that the settings allow, its optimizer, and 65536 hands take less.
+const LARGEST_BYTES: u64 = 1 << 30;
 
 /// The text of a file.
 ///
 /// # Errors
-/// A file that cannot be read or is not UTF-8.
+/// A file that cannot be read, is not UTF-8, or is too large for a text of settings.
 pub fn read_text(path: &Path) -> Result<String> {
-    fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+    let context = || format!("cannot read {}", path.display());
+    let mut text = String::new();
+    let file = File::open(path).with_context(context)?;
+    file.take(LARGEST_TEXT + 1).read_to_string(&mut text).with_context(context)?;
+    ensure!(text.len() as u64 <= LARGEST_TEXT, "{}: larger than {LARGEST_TEXT} bytes", path.display());
+    Ok(text)
 }
 
-/// The bytes of a file.
+/// The bytes of a regular file.
 ///
 /// # Errors
-/// A file that cannot be read.
+/// A file that cannot be read, or is larger than any of ours.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    fs::read(path).with_context(|| format!("cannot read {}", path.display()))
+    let context = || format!("cannot read {}", path.display());
+    let facts = fs::metadata(path).with_context(context)?;
+    ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
+    let size = facts.len();
+    ensure!(size <= LARGEST_BYTES, "{}: {size} bytes are more than any file of this program has", path.display());
+    fs::read(path).with_context(context)
+}
+
+/// Gives a file another name as well, in place of whatever has it. Where the file system knows no second names, it is a copy.
+///
+/// # Errors
+/// A place that cannot be written to.
+pub fn name_also(path: &Path, name: &Path) -> Result<()> {
+    let partial = partial(name);
+    // Of an earlier attempt.
+    let _ = fs::remove_file(&partial);
+    if fs::hard_link(path, &partial).is_err() {
+        return write_whole(name, &read_bytes(path)?);
+    }
+    let named = fs::rename(&partial, name).and_then(|()| sync_folder(name));
+    named.with_context(|| format!("cannot write {}", name.display()))
+}
+
+fn partial(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".");
+    name.push(PARTIAL);
+    PathBuf::from(name)
+}
+
+/// A new name in a folder is on the disk once the folder is.
+fn sync_folder(path: &Path) -> io::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    File::open(folder)?.sync_all()
 }
 
 /// Writes a file so that whoever looks finds the whole old one or the whole new one.
@@ -46,11 +93,7 @@ impl OutputFile {
     /// A place that cannot be written to.
     pub fn create(path: &Path) -> Result<Self> {
         let special = fs::metadata(path).is_ok_and(|facts| !facts.is_file());
-        let partial = (!special).then(|| {
-            let mut name = path.as_os_str().to_owned();
-            name.push(".partial");
-            PathBuf::from(name)
-        });
+        let partial = (!special).then(|| partial(path));
         let file = File::create(partial.as_deref().unwrap_or(path));
         let file = file.with_context(|| format!("cannot write {}", path.display()))?;
         Ok(Self { path: path.to_owned(), partial, file })
@@ -75,6 +118,7 @@ impl OutputFile {
             if let Some(partial) = &self.partial {
                 self.file.sync_all()?;
                 fs::rename(partial, &self.path)?;
+                sync_folder(&self.path)?;
             }
             Ok::<(), std::io::Error>(())
         };
@@ -134,6 +178,30 @@ mod tests {
         drop(OutputFile::create(&path).unwrap());
         assert_eq!(fs::read(&path).unwrap(), b"old");
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn files_that_never_end_or_are_too_large_are_refused_unread() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("sparse");
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        assert!(read_bytes(&path).unwrap_err().to_string().contains("more than any file"));
+        assert!(read_text(&path).unwrap_err().to_string().contains("larger than"));
+        assert!(read_bytes(Path::new("/dev/zero")).unwrap_err().to_string().contains("not a regular file"));
+        assert!(read_text(Path::new("/dev/zero")).unwrap_err().to_string().contains("larger than"));
+    }
+
+    #[test]
+    fn a_second_name_replaces_what_had_it() {
+        let place = tempfile::tempdir().unwrap();
+        let [one, two, latest] = ["one", "two", "latest"].map(|name| place.path().join(name));
+        for path in [&one, &two] {
+            write_whole(path, path.file_name().unwrap().as_encoded_bytes()).unwrap();
+            name_also(path, &latest).unwrap();
+            assert_eq!(fs::read(&latest).unwrap(), fs::read(path).unwrap());
+        }
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 3);
+        assert_eq!(fs::read(&one).unwrap(), b"one");
     }
 
     #[test]

@@ -1,12 +1,13 @@
 //! The folder of a run and what lies in it.
 
-use std::fs;
-use std::io::ErrorKind;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 
+use super::checkpoints::Checkpoints;
 use super::file::write_whole;
 
 /// Where runs go when nothing else is said.
@@ -14,15 +15,22 @@ const RUNS: &str = "runs/shadow-hand-repose";
 
 const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
+const POLICY: &str = "policy.safetensors";
+const LOCK: &str = "run.lock";
+/// Files in the folder `diverged`; whoever has so many needs no more to find the cause, but may need the disk.
+const MOST_DUMPS: usize = 1000;
 pub(super) const METRICS: &str = "metrics.csv";
-const CHECKPOINTS: &str = "checkpoints";
-const LATEST: &str = "latest";
-const BEST: &str = "best";
 
-/// `config.toml`, `version.txt`, `metrics.csv`, event files, `checkpoints/{latest,best}.safetensors`.
+/// `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
 #[derive(Clone, Debug)]
 pub struct RunFolder {
     path: PathBuf,
+}
+
+/// A run folder that no other training uses. The system gives it free when the program ends, however it ends.
+#[derive(Debug)]
+pub struct Locked {
+    _file: File,
 }
 
 impl RunFolder {
@@ -30,22 +38,46 @@ impl RunFolder {
     ///
     /// # Errors
     /// A folder that already holds a run, or cannot be written to.
-    pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<Self> {
+    pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
         let path = match path {
             Some(path) => path.to_owned(),
             None => create_unused(name)?,
         };
-        let checkpoints = path.join(CHECKPOINTS);
-        let begun = fs::read_dir(&checkpoints).is_ok_and(|mut entries| entries.next().is_some());
-        let written = [CONFIG, VERSION, METRICS].iter().any(|file| path.join(file).exists());
+        let run = Self { path };
+        run.expect_empty()?;
+        run.checkpoints().create_folder().context("cannot create the run folder")?;
+        let lock = run.lock()?;
+        // Another training may have begun and ended meanwhile.
+        run.expect_empty()?;
+        Ok((run, lock))
+    }
+
+    fn expect_empty(&self) -> Result<()> {
+        let written = [CONFIG, VERSION, METRICS].iter().any(|file| self.path.join(file).exists());
         ensure!(
-            !begun && !written,
+            !self.checkpoints().begun() && !written,
             "{} already holds a run; go on with it by --resume, or name another folder",
-            path.display()
+            self.path.display()
         );
-        fs::create_dir_all(&checkpoints)
-            .with_context(|| format!("cannot create the run folder {}", checkpoints.display()))?;
-        Ok(Self { path })
+        Ok(())
+    }
+
+    /// A run folder among the temporary files, where its own cannot be written to.
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn for_now() -> Result<Self> {
+        for attempt in 0..100 {
+            let path = std::env::temp_dir().join(format!("shadow-repose-{}-{attempt}", std::process::id()));
+            match fs::create_dir(&path) {
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+                result => {
+                    result.with_context(|| format!("cannot create {}", path.display()))?;
+                    return Ok(Self { path });
+                }
+            }
+        }
+        bail!("{} is full of folders of this program", std::env::temp_dir().display())
     }
 
     /// The folder of an existing run that `place` is, or that the checkpoint `place` lies in.
@@ -58,13 +90,42 @@ impl RunFolder {
             place.to_owned()
         } else {
             let place = place.canonicalize().with_context(|| format!("cannot read {}", place.display()))?;
-            let checkpoints = place.parent().filter(|parent| parent.ends_with(CHECKPOINTS));
-            match checkpoints.and_then(Path::parent) {
-                Some(run) => run.to_owned(),
-                None => bail!("{} does not lie in the {CHECKPOINTS} folder of a run", place.display()),
+            let run = place.parent().and_then(Path::parent);
+            match run.map(|run| (run, Checkpoints::of(run))) {
+                Some((run, checkpoints)) if place.parent() == Some(checkpoints.folder()) => run.to_owned(),
+                _ => bail!("{} does not lie in the checkpoints folder of a run", place.display()),
             }
         };
         Ok(Self { path })
+    }
+
+    /// Keeps every other training out of it for as long as the result lives, and removes what a crash left half written.
+    ///
+    /// # Errors
+    /// Another training uses it, or it cannot be written to.
+    pub fn lock(&self) -> Result<Locked> {
+        let path = self.path.join(LOCK);
+        let context = || format!("cannot write {}", path.display());
+        let mut file =
+            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).with_context(context)?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let _ = file.take(100).read_to_string(&mut holder);
+                bail!("{} is being trained in by another program{holder}", self.path.display());
+            }
+            // Some network file systems have no locks: then there is nothing to keep anyone out with.
+            Err(TryLockError::Error(_)) => {}
+        }
+        file.set_len(0).and_then(|()| write!(file, ": process {}", std::process::id())).with_context(context)?;
+        self.checkpoints().clean()?;
+        Ok(Locked { _file: file })
+    }
+
+    /// Whether there is a lock; also of a training that has ended.
+    pub fn has_lock(&self) -> bool {
+        self.path.join(LOCK).exists()
     }
 
     /// Where it is.
@@ -72,27 +133,42 @@ impl RunFolder {
         &self.path
     }
 
-    /// The checkpoint to go on from by default.
-    pub fn latest(&self) -> PathBuf {
-        self.checkpoint(LATEST)
+    /// Its checkpoints.
+    pub fn checkpoints(&self) -> Checkpoints {
+        Checkpoints::of(&self.path)
     }
 
-    /// The checkpoint that scored best.
-    pub fn best(&self) -> PathBuf {
-        self.checkpoint(BEST)
+    /// The best policy, or the latest where none was scored yet, alone.
+    pub fn policy(&self) -> PathBuf {
+        self.path.join(POLICY)
     }
 
-    fn checkpoint(&self, name: &str) -> PathBuf {
-        self.path.join(CHECKPOINTS).join(format!("{name}.safetensors"))
+    /// Writes what led to a diverged state, unless there are very many of these already.
+    ///
+    /// # Errors
+    /// A folder that cannot be written to.
+    pub fn dump(&self, name: &str, text: &str) -> Result<()> {
+        let folder = self.path.join("diverged");
+        fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        if fs::read_dir(&folder).is_ok_and(|entries| entries.count() >= MOST_DUMPS) {
+            return Ok(());
+        }
+        write_whole(&folder.join(name), text.as_bytes())
     }
 
-    /// Writes the configuration and the facts about the program.
+    /// Writes the configuration and the facts about the program, if they are not there.
     ///
     /// # Errors
     /// A folder that cannot be written to.
     pub fn describe(&self, config: &str, version: &str) -> Result<()> {
-        write_whole(&self.path.join(CONFIG), config.as_bytes())?;
-        write_whole(&self.path.join(VERSION), version.as_bytes())
+        fs::create_dir_all(&self.path).with_context(|| format!("cannot create {}", self.path.display()))?;
+        for (name, text) in [(CONFIG, config), (VERSION, version)] {
+            let path = self.path.join(name);
+            if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
+                write_whole(&path, text.as_bytes())?;
+            }
+        }
+        Ok(())
     }
 }
 
@@ -106,7 +182,8 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
         return Ok(place.to_owned());
     }
     let run = RunFolder::containing(place)?;
-    let found = [run.best(), run.latest()].into_iter().find(|path| path.exists());
+    let checkpoints = run.checkpoints();
+    let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
@@ -118,7 +195,7 @@ pub fn newest_checkpoint() -> Result<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
     // By the time of the latest checkpoint, so that a run that was resumed counts as new.
     let newest = runs
-        .filter_map(|run| Some((modified(&run.latest())?, resolve_checkpoint(&run.path).ok()?)))
+        .filter_map(|run| Some((modified(&run.checkpoints().latest())?, resolve_checkpoint(&run.path).ok()?)))
         .max()
         .map(|(_, checkpoint)| checkpoint);
     newest.with_context(|| {
@@ -160,22 +237,44 @@ mod tests {
     fn a_folder_that_holds_a_run_is_not_taken_again() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("run");
-        RunFolder::create(Some(&path), None).unwrap().describe("a = 1", "1").unwrap();
+        RunFolder::create(Some(&path), None).unwrap().0.describe("a = 1", "1").unwrap();
         let refusal = RunFolder::create(Some(&path), None).unwrap_err().to_string();
         assert!(refusal.contains("already holds a run"), "{refusal}");
         assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), "a = 1");
     }
 
     #[test]
+    fn a_second_training_in_a_folder_is_refused_until_the_first_ends() {
+        let place = tempfile::tempdir().unwrap();
+        let (run, first) = RunFolder::create(Some(place.path()), None).unwrap();
+        let refusal = run.lock().unwrap_err().to_string();
+        assert!(refusal.contains(&format!("another program: process {}", std::process::id())), "{refusal}");
+        drop(first);
+        run.lock().unwrap();
+    }
+
+    #[test]
+    fn what_a_crash_left_half_written_is_removed() {
+        let place = tempfile::tempdir().unwrap();
+        let (run, _) = RunFolder::create(Some(place.path()), None).unwrap();
+        let half = run.checkpoints().folder().join("iteration-00000020.safetensors.partial");
+        fs::write(&half, "half").unwrap();
+        assert!(run.checkpoints().newest_first().is_empty());
+        run.lock().unwrap();
+        assert!(!half.exists());
+    }
+
+    #[test]
     fn a_run_folder_means_its_best_checkpoint_and_before_there_is_one_its_latest() {
         let place = tempfile::tempdir().unwrap();
-        let run = RunFolder::create(Some(place.path()), None).unwrap();
+        let (run, _) = RunFolder::create(Some(place.path()), None).unwrap();
         assert!(resolve_checkpoint(place.path()).is_err());
-        write_whole(&run.latest(), b"latest").unwrap();
-        assert_eq!(resolve_checkpoint(place.path()).unwrap(), run.latest());
-        write_whole(&run.best(), b"best").unwrap();
-        assert_eq!(resolve_checkpoint(place.path()).unwrap(), run.best());
-        assert_eq!(RunFolder::containing(&run.latest()).unwrap().path(), place.path().canonicalize().unwrap());
+        let checkpoints = run.checkpoints();
+        write_whole(&checkpoints.latest(), b"latest").unwrap();
+        assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.latest());
+        write_whole(&checkpoints.best(), b"best").unwrap();
+        assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.best());
+        assert_eq!(RunFolder::containing(&checkpoints.latest()).unwrap().path(), place.path().canonicalize().unwrap());
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The outside of a run: its folder, its logs, the terminal, signals. Knows neither environments nor learning.
 
+mod checkpoints;
 mod events;
 mod file;
 #[cfg(feature = "video")]
@@ -7,14 +8,16 @@ mod film;
 mod folder;
 mod interrupt;
 mod meshes;
+mod metrics;
 mod pip;
 mod report;
 
+pub use checkpoints::Checkpoints;
 pub use file::{OutputFile, read_bytes, read_text, write_whole};
 #[cfg(feature = "video")]
 pub use film::{FilmFormat, FilmWriter, write_png};
-pub use folder::{RunFolder, newest_checkpoint, resolve_checkpoint};
-pub use interrupt::{INTERRUPTED, on_interrupt};
+pub use folder::{Locked, RunFolder, newest_checkpoint, resolve_checkpoint};
+pub use interrupt::Requests;
 pub use meshes::hand_meshes;
 pub use report::{Bar, Report, Status};
 

@@ -1,18 +1,19 @@
 //! What a training tells: event file, `metrics.csv`, and a progress bar, or plain lines where there is no terminal.
 //!
-//! A log that cannot be written is a warning, never the end of a training.
+//! A log that cannot be written is a warning, never the end of a training: what is lost is counted, and at the next checkpoint
+//! it is tried again.
 
-use std::fs::{File, OpenOptions};
-use std::io::{IsTerminal, Write};
-use std::path::Path;
+use std::fs;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::events::EventFile;
-use super::file::{read_text, write_whole};
+use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
+use super::metrics::Metrics;
 use super::say;
 
 /// Time between two plain lines.
@@ -23,15 +24,58 @@ const SHOWN_SHARE: f64 = 0.1;
 
 /// Where a training tells how it goes.
 pub struct Report {
-    events: Option<EventFile>,
-    metrics: Option<File>,
-    columns: Vec<String>,
+    folder: PathBuf,
+    header: String,
+    events: Log<EventFile>,
+    metrics: Log<Metrics>,
+    /// Of the last iteration that was logged.
+    iteration: u64,
+    env_steps: u64,
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
     shown: Shown,
     total_steps: u64,
     /// When this session began, and the steps made before it.
     begun: (Instant, u64),
+}
+
+/// A log, or none while it cannot be written.
+struct Log<W> {
+    name: &'static str,
+    writer: Option<W>,
+    /// The last iteration could not be written.
+    failing: bool,
+    /// Iterations that it lacks.
+    lost: u64,
+}
+
+impl<W> Log<W> {
+    fn new(name: &'static str) -> Self {
+        Self { name, writer: None, failing: false, lost: 0 }
+    }
+
+    /// Writes an iteration if it can; what there is to say of it.
+    fn write(&mut self, write: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
+        let written = self.writer.as_mut().map(write);
+        match written {
+            Some(Ok(())) if std::mem::take(&mut self.failing) => {
+                Some(format!("{} is written again; it lacks {} iterations so far", self.name, self.lost))
+            }
+            Some(Ok(())) => None,
+            failed => {
+                self.lost += 1;
+                self.take_error(failed)
+            }
+        }
+    }
+
+    /// Gives the log up where it was found to be unwritable; a warning if that is new.
+    fn take_error(&mut self, result: Option<Result<()>>) -> Option<String> {
+        let error = result?.err()?;
+        self.writer = None;
+        let known = std::mem::replace(&mut self.failing, true);
+        (!known).then(|| format!("{} is not written for now: {error:#}", self.name))
+    }
 }
 
 /// What is shown of an iteration; `NaN` where nothing is known.
@@ -57,13 +101,16 @@ struct Shown {
 
 impl Report {
     /// Opens the logs in `folder`, for metrics with these names, behind the first `iterations` rows of earlier sessions.
-    pub fn open(folder: &Path, tags: &[&str], iterations: u64, env_steps: u64, total_steps: u64) -> Self {
-        let columns: Vec<String> = ["iteration", "env_steps"].iter().chain(tags).map(|&name| name.to_owned()).collect();
+    pub fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64, total_steps: u64) -> Self {
+        let columns: Vec<&str> = ["iteration", "env_steps"].iter().chain(tags).copied().collect();
         let terminal = std::io::stderr().is_terminal();
         let mut report = Self {
-            events: None,
-            metrics: None,
-            columns,
+            folder: folder.to_owned(),
+            header: columns.join(","),
+            events: Log::new("the event file"),
+            metrics: Log::new(METRICS),
+            iteration,
+            env_steps,
             bar: terminal.then(|| progress_bar(env_steps, total_steps)),
             last_line: None,
             shown: Shown { steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
@@ -71,37 +118,47 @@ impl Report {
             begun: (Instant::now(), env_steps),
         };
         // Later steps of a session that did not come to its checkpoint are made again.
-        match EventFile::create(folder, env_steps + u64::from(iterations > 0)) {
-            Ok(events) => report.events = Some(events),
-            Err(error) => report.warn(&format!("no event file is written: {error:#}")),
+        match cut_off_after(folder, env_steps).and_then(|()| report.open_events()) {
+            Ok(events) => report.events.writer = Some(events),
+            Err(error) => {
+                report.events.failing = true;
+                report.warn(&format!("no event file is written for now: {error:#}"));
+            }
         }
-        match open_metrics(&folder.join(METRICS), &report.columns, iterations) {
+        match report.open_metrics() {
             Ok((metrics, dropped)) => {
-                report.metrics = Some(metrics);
+                report.metrics.writer = Some(metrics);
                 if dropped > 0 {
-                    report.say(&format!("{dropped} rows of {METRICS} after iteration {iterations} are dropped"));
+                    report.say(&format!("{dropped} rows of {METRICS} after iteration {iteration} are dropped"));
                 }
             }
-            Err(error) => report.warn(&format!("no metrics are written: {error:#}")),
+            Err(error) => {
+                report.metrics.failing = true;
+                report.warn(&format!("no {METRICS} is written for now: {error:#}"));
+            }
         }
         report
     }
 
+    fn open_events(&self) -> Result<EventFile> {
+        EventFile::create(&self.folder, self.env_steps + u64::from(self.iteration > 0))
+    }
+
+    fn open_metrics(&self) -> Result<(Metrics, u64)> {
+        Metrics::open(&self.folder.join(METRICS), &self.header, self.iteration)
+    }
+
     /// Logs the values of an iteration, in the order of the tags, and shows the status.
     pub fn iteration(&mut self, iteration: u64, values: &[(&str, f64)], status: &Status) {
-        if let Some(Err(error)) = self.events.as_mut().map(|events| events.scalars(status.env_steps, values)) {
-            self.events = None;
-            self.warn(&format!("the event file is not written any more: {error:#}"));
-        }
-        if let Some(mut metrics) = self.metrics.take() {
-            let cell = |&(_, value): &(&str, f64)| if value.is_nan() { String::new() } else { value.to_string() };
-            let cells: Vec<String> = values.iter().map(cell).collect();
-            let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
-            match metrics.write_all(row.as_bytes()) {
-                Ok(()) => self.metrics = Some(metrics),
-                Err(error) => self.warn(&format!("metrics.csv is not written any more: {error}")),
-            }
-        }
+        (self.iteration, self.env_steps) = (iteration, status.env_steps);
+        let cell = |&(_, value): &(&str, f64)| if value.is_nan() { String::new() } else { value.to_string() };
+        let cells: Vec<String> = values.iter().map(cell).collect();
+        let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
+        let warnings = [
+            self.events.write(|events| events.scalars(status.env_steps, values)),
+            self.metrics.write(|metrics| metrics.row(&row)),
+        ];
+        warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
         self.shown.take(status);
         let text = self.shown.text(self.time_left(status.env_steps));
         if let Some(bar) = &self.bar {
@@ -111,6 +168,35 @@ impl Report {
         {
             self.last_line = Some(Instant::now());
             say(&format!("{} of {} steps  {text}", status.env_steps, self.total_steps));
+        }
+    }
+
+    /// Brings all that was logged onto the disk, before a checkpoint says that it is there; opens again what could not be
+    /// written.
+    pub fn sync(&mut self) {
+        let synced = self.metrics.writer.as_mut().map(Metrics::sync);
+        let events = self.events.writer.as_ref().map(EventFile::sync);
+        let warnings = [self.metrics.take_error(synced), self.events.take_error(events)];
+        warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
+        // The whole folder may have been deleted.
+        let _ = fs::create_dir_all(&self.folder);
+        if self.metrics.writer.is_none() {
+            self.metrics.writer = self.open_metrics().ok().map(|(metrics, _)| metrics);
+        }
+        if self.events.writer.is_none() {
+            self.events.writer = self.open_events().ok();
+        }
+    }
+
+    /// Says what the logs lack, and ends the progress bar as it is.
+    pub fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.abandon();
+        }
+        for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
+            if lost > 0 {
+                say(&format!("warning: {name} lacks {lost} iterations of this session, which could not be written"));
+            }
         }
     }
 
@@ -132,13 +218,6 @@ impl Report {
     /// Prints a warning above the progress bar.
     pub fn warn(&self, text: &str) {
         self.say(&format!("warning: {text}"));
-    }
-
-    /// Leaves the progress bar as it is and ends it.
-    pub fn finish(&self) {
-        if let Some(bar) = &self.bar {
-            bar.abandon();
-        }
     }
 }
 
@@ -212,28 +291,6 @@ fn progress_bar(done: u64, total: u64) -> ProgressBar {
     bar
 }
 
-/// Keeps the header and the rows of the first `iterations` of an existing file, drops the rest, and opens it for more; the
-/// file and the number of rows dropped.
-fn open_metrics(path: &Path, columns: &[String], iterations: u64) -> Result<(File, usize)> {
-    let header = columns.join(",");
-    let (mut kept, mut dropped) = (format!("{header}\n"), 0);
-    if let Ok(text) = read_text(path) {
-        let done = |row: &&str| {
-            let number = row.split(',').next().and_then(|cell| cell.parse::<u64>().ok());
-            number.is_some_and(|number| number <= iterations) && row.matches(',').count() == columns.len() - 1
-        };
-        let rows: Vec<&str> = text.lines().skip(1).collect();
-        for row in rows.iter().copied().filter(done) {
-            kept.push_str(row);
-            kept.push('\n');
-        }
-        dropped = rows.len() + 1 - kept.lines().count();
-    }
-    write_whole(path, kept.as_bytes())?;
-    let file = OpenOptions::new().append(true).open(path);
-    Ok((file.with_context(|| format!("cannot append to {}", path.display()))?, dropped))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -258,9 +315,31 @@ mod tests {
     }
 
     #[test]
-    fn logs_that_cannot_be_opened_do_not_end_the_training() {
+    fn logs_that_cannot_be_written_are_counted_and_tried_again() {
         let place = tempfile::tempdir().unwrap();
-        let mut report = Report::open(&place.path().join("gone"), &["a"], 0, 0, 100);
+        let folder = place.path().join("gone");
+        let mut report = Report::open(&folder, &["a"], 0, 0, 100);
         report.iteration(1, &[("a", 1.0)], &status(10));
+        assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
+        report.sync();
+        report.iteration(2, &[("a", 2.0)], &status(20));
+        assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
+        // Deleted in the middle: found at the next checkpoint.
+        fs::remove_dir_all(&folder).unwrap();
+        report.iteration(3, &[("a", 3.0)], &status(30));
+        report.sync();
+        report.iteration(4, &[("a", 4.0)], &status(40));
+        assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
+    }
+
+    #[test]
+    fn a_full_disk_is_a_warning() {
+        let place = tempfile::tempdir().unwrap();
+        std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
+        let mut report = Report::open(place.path(), &["a"], 0, 0, 100);
+        report.iteration(1, &[("a", 1.0)], &status(10));
+        report.sync();
+        assert_eq!((report.metrics.lost, report.events.lost), (1, 0));
     }
 }

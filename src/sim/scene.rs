@@ -106,6 +106,16 @@ impl Scene {
         Simulation::new(self.model.clone())
     }
 
+    /// A number that is another one for a scene that differs in anything.
+    ///
+    /// # Errors
+    /// Only if MuJoCo cannot write the scene into memory.
+    pub fn fingerprint(&self) -> Result<u64> {
+        let mut bytes = vec![0; self.model.size()];
+        self.model.save_to_buffer(&mut bytes)?;
+        Ok(crc32fast::hash(&bytes).into())
+    }
+
     /// Number of controls.
     pub fn controls(&self) -> usize {
         self.model.nu() as usize

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
 
 use super::{Body, Mocap, Scene};
@@ -17,9 +18,16 @@ pub enum Physics {
     Diverged,
 }
 
-/// All that the next step depends on.
+/// All that the next step depends on, in the order of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulationState(Box<[f64]>);
+
+impl SimulationState {
+    /// As numbers.
+    pub fn numbers(&self) -> &[f64] {
+        &self.0
+    }
+}
 
 /// MuJoCo's name for that.
 const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
@@ -100,6 +108,20 @@ impl Simulation {
     /// A copy of the state.
     pub fn state(&self) -> SimulationState {
         SimulationState(self.data.state(EVERYTHING))
+    }
+
+    /// Goes on from the numbers of a state, with bodies up to date: the next step is bit for bit that of the simulation that
+    /// the state was taken from.
+    ///
+    /// # Errors
+    /// A state of another scene.
+    pub fn restore(&mut self, numbers: &[f64]) -> Result<()> {
+        let size = self.data.model().state_size(EVERYTHING);
+        ensure!(numbers.len() == size, "a state of {} numbers, but the scene's has {size}", numbers.len());
+        self.data.reset();
+        self.data.set_state(numbers, EVERYTHING)?;
+        self.refresh();
+        Ok(())
     }
 
     /// Position (m) and orientation of a body's frame in the world.

@@ -4,6 +4,8 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
+use shadow_repose::ppo::{Array, Checkpoint};
+
 use crate::support::{program, stderr, succeeded, train};
 
 /// Fails unless the program exits with `code` and says each of `parts` on stderr.
@@ -75,7 +77,8 @@ fn files_that_are_missing_or_no_configurations_are_named() {
     refused(folder.path(), &["play"], 1, &["train one first"]);
     fs::create_dir(folder.path().join("empty")).unwrap();
     refused(folder.path(), &["play", "--ckpt", "empty"], 1, &["empty holds no checkpoint"]);
-    refused(folder.path(), &["train", "--resume", "empty"], 1, &["empty"]);
+    refused(folder.path(), &["train", "--resume", "empty"], 1, &["empty holds no checkpoint"]);
+    assert_eq!(fs::read_dir(folder.path().join("empty")).unwrap().count(), 0);
 }
 
 #[test]
@@ -86,28 +89,72 @@ fn checkpoints_that_are_damaged_or_of_something_else_are_refused() {
     let write = |name: &str, bytes: &[u8]| fs::write(folder.path().join(name), bytes).unwrap();
     write("cut.safetensors", &good[..good.len() - 100]);
     write("text.safetensors", b"hello");
-    // The same bytes, but its configuration asks for a wider net.
-    let text = b"hidden = [16, 8]";
-    let at = good.windows(text.len()).position(|w| w == text).expect("the configuration lies in the file");
-    let mut wider = good.clone();
-    wider[at..at + text.len()].copy_from_slice(b"hidden = [17, 8]");
-    write("wider.safetensors", &wider);
-    refused(folder.path(), &["play", "--ckpt", "cut.safetensors"], 1, &["cannot play cut.safetensors", "cut off"]);
-    refused(folder.path(), &["play", "--ckpt", "text.safetensors"], 1, &["text.safetensors"]);
-    refused(folder.path(), &["play", "--ckpt", "/dev/null"], 1, &["cannot play /dev/null"]);
-    refused(
-        folder.path(),
-        &["play", "--ckpt", "wider.safetensors"],
-        1,
-        &["`actor.0.weight`", "[16, 157]", "[17, 157]"],
-    );
-    fs::write(folder.path().join("run/checkpoints/latest.safetensors"), &good[..50]).unwrap();
-    refused(
-        folder.path(),
-        &["train", "--resume", "run", "--total-steps", "999"],
-        1,
-        &["cannot resume from", "cut off"],
-    );
+    let mut flipped = good.clone();
+    flipped[good.len() - 77] ^= 4;
+    write("flipped.safetensors", &flipped);
+    // Whole, but its configuration asks for a wider net.
+    let mut wider = Checkpoint::parse(&good).unwrap();
+    wider.config = wider.config.replace("hidden = [16, 8]", "hidden = [17, 8]");
+    write("wider.safetensors", &wider.to_bytes().unwrap());
+    for (file, parts) in [
+        ("cut.safetensors", &["cannot use cut.safetensors", "cut off"][..]),
+        ("text.safetensors", &["text.safetensors"]),
+        ("flipped.safetensors", &["damaged", "checksum"]),
+        ("wider.safetensors", &["`actor.0.weight`", "[16, 157]", "[17, 157]"]),
+        ("/dev/zero", &["cannot read /dev/zero", "not a regular file"]),
+    ] {
+        refused(folder.path(), &["play", "--ckpt", file], 1, parts);
+    }
+    refused(folder.path(), &["train", "--resume", "cut.safetensors"], 1, &["does not lie in the checkpoints folder"]);
+}
+
+#[test]
+fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    succeeded(program(folder.path(), &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let path = folder.path().join("run/checkpoints/latest.safetensors");
+    let good = Checkpoint::parse(&fs::read(&path).unwrap()).unwrap();
+    let rows = |name: &str| good.shape(name).unwrap().to_vec();
+    let [numbers, counters] = ["envs.numbers", "envs.counters"].map(rows);
+    let huge = Array::U64(counters.clone(), vec![u64::MAX; counters[0] * counters[1]]);
+    let short = Array::F64(vec![numbers[0], 3], vec![0.5; numbers[0] * 3]);
+    let set = |name: &'static str, array: &Array| {
+        let mut bad = good.clone();
+        bad.insert(name, array.clone());
+        bad
+    };
+    let config = |from: &str, to: &str| {
+        let mut bad = good.clone();
+        bad.config = good.config.replace(from, to);
+        assert_ne!(bad.config, good.config, "{from}");
+        bad
+    };
+    let mut behind = good.clone();
+    behind.progress.iteration = u64::MAX;
+    for (bad, part) in [
+        (set("envs.counters", &huge), "environment 0"),
+        (set("envs.numbers", &short), "environment 0"),
+        (set("envs.numbers", &Array::F64(vec![1], vec![0.0])), "no states of 16 environments"),
+        (set("learning_rate", &Array::F64(vec![1], vec![-1.0])), "its learning rate is -1"),
+        (set("adam.steps", &Array::U64(vec![1], vec![u64::MAX])), "`adam.steps`"),
+        (set("normalizer.variance", &Array::F64(vec![157], vec![-1.0; 157])), "`normalizer.variance`"),
+        (set("log_std", &Array::F64(vec![20], vec![1.0; 20])), "`log_std` must be of type F32"),
+        (set("extra", &Array::U64(vec![1], vec![1])), "`extra` is not one of this policy"),
+        (config("num_envs = 16", "num_envs = 32"), "cannot have made 128 steps"),
+        (config("hidden = [16, 8]", "hidden = [16384, 16384, 8]"), "at most 2^25 weights"),
+        (config("model = \"builtin\"", "model = \"/etc/passwd\""), "no path in a file is followed"),
+        (config("ctrl_dt = 0.01", "ctrl_dt = 1e300"), "ctrl_dt"),
+        (behind, "cannot have made"),
+    ] {
+        fs::write(&path, bad.to_bytes().unwrap()).unwrap();
+        let checkpoint = path.display().to_string();
+        refused(
+            folder.path(),
+            &["train", "--resume", &checkpoint, "--total-steps", "999"],
+            1,
+            &["latest.safetensors", part],
+        );
+    }
 }
 
 #[test]
@@ -173,7 +220,9 @@ fn usage_errors_exit_with_2() {
         &["train", "--set", "ppo.gamma"],
         &["train", "--total-steps", "many"],
         &["train", "--resume", "run", "--seed", "1"],
-        &["train", "--resume", "run", "--set", "ppo.gamma=1"],
+        &["train", "--keep", "0"],
+        &["train", "--stop-after", "soon"],
+        &["train", "--stop-after", "0s"],
         &["train", "--name", "a", "--run-dir", "b"],
         &["play", "--policy", "clever"],
         &["play", "--policy", "zero", "--ckpt", "x"],
@@ -184,6 +233,7 @@ fn usage_errors_exit_with_2() {
         refused(folder.path(), args, 2, &["--help"]);
     }
     refused(folder.path(), &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"], 1, &["only the task"]);
+    refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["only env.model"]);
     refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }

@@ -2,12 +2,12 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use serde_json::Value;
+use shadow_repose::ppo::Checkpoint;
 
-use crate::support::{command, program, stderr, succeeded, train};
+use crate::support::{command, metrics, names, program, stderr, succeeded, train, weights};
 
 /// A folder with a finished run of two iterations in `run`.
 fn trained(more: &[&str]) -> tempfile::TempDir {
@@ -18,35 +18,8 @@ fn trained(more: &[&str]) -> tempfile::TempDir {
     folder
 }
 
-fn names(folder: &Path) -> Vec<String> {
-    let mut names: Vec<String> =
-        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
-}
-
-/// The metrics without the columns of times.
-fn metrics(run: &Path) -> Vec<Vec<String>> {
-    let text = fs::read_to_string(run.join("metrics.csv")).unwrap();
-    let header: Vec<&str> = text.lines().next().unwrap().split(',').collect();
-    let kept = |row: &str| {
-        let cells = row.split(',').zip(&header).filter(|(_, name)| !name.starts_with("time/"));
-        cells.map(|(cell, _)| cell.to_owned()).collect()
-    };
-    text.lines().map(kept).collect()
-}
-
 fn json(output: &std::process::Output) -> Value {
     serde_json::from_slice(&output.stdout).expect("stdout is one JSON object and nothing else")
-}
-
-/// The tensors of a checkpoint.
-fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
-    let bytes = fs::read(path).unwrap();
-    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-    let mut found: Vec<_> = tensors.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();
-    found.sort();
-    found
 }
 
 #[test]
@@ -55,9 +28,12 @@ fn a_training_leaves_its_files_and_nothing_else() {
     assert_eq!(names(folder.path()), ["run"], "no MUJOCO_LOG.TXT, nothing beside the run");
     let run = folder.path().join("run");
     let found = names(&run);
-    assert_eq!(found.len(), 5, "{found:?}");
-    assert!(found.iter().any(|name| name.starts_with("events.out.tfevents.")));
-    assert_eq!(names(&run.join("checkpoints")), ["best.safetensors", "latest.safetensors"]);
+    assert!(found[2].starts_with("events.out.tfevents."), "{found:?}");
+    let expected = ["checkpoints", "config.toml", "metrics.csv", "policy.safetensors", "run.lock", "version.txt"];
+    assert_eq!([&found[..2], &found[3..]].concat(), expected);
+    let checkpoints =
+        ["best", "iteration-00000000", "iteration-00000002", "latest"].map(|name| format!("{name}.safetensors"));
+    assert_eq!(names(&run.join("checkpoints")), checkpoints);
     assert!(fs::read_to_string(run.join("version.txt")).unwrap().contains("mujoco 3.17.0"));
     let config: toml::Table = fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap();
     assert_eq!(config["env"]["num_envs"].as_integer(), Some(16));
@@ -220,14 +196,11 @@ fn a_run_that_died_before_its_first_checkpoint_is_resumed_from_its_start() {
 fn the_best_policy_of_a_run_is_not_given_up_when_an_older_checkpoint_is_resumed() {
     let folder = trained(&[]);
     let run = folder.path().join("run");
-    // A best checkpoint that nothing can beat, with the progress of the run.
+    // A best checkpoint that nothing can beat.
     let best = run.join("checkpoints/best.safetensors");
-    let bytes = fs::read(&best).unwrap();
-    let text = String::from_utf8_lossy(&bytes);
-    let from = text.find("best\\\":[").expect("the progress lies in the metadata") + 8;
-    let to = from + text[from..].find(',').unwrap();
-    let mut unbeatable = bytes.clone();
-    unbeatable[from..to].copy_from_slice(format!("{:0>1$}", "9", to - from).replacen('0', "9", to - from).as_bytes());
+    let mut unbeatable = Checkpoint::parse(&fs::read(&best).unwrap()).unwrap();
+    unbeatable.progress.best = Some([9.0, 0.0]);
+    let unbeatable = unbeatable.to_bytes().unwrap();
     fs::write(&best, &unbeatable).unwrap();
     succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512"]));
     assert!(fs::read(&best).unwrap() == unbeatable);
@@ -253,14 +226,24 @@ fn an_interrupted_training_saves_exits_with_130_and_can_be_resumed() {
 }
 
 #[test]
-fn an_own_scene_is_trained_on_and_played_from_another_folder() {
+fn an_own_scene_is_trained_on_and_used_again_only_when_it_is_named() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("own.xml"), crate::support::SCENE).unwrap();
     let args = train(&["--total-steps", "128", "--run-dir", "run", "--set", "env.model=own.xml"]);
     succeeded(program(folder.path(), &args));
     let run = folder.path().join("run").display().to_string();
     let elsewhere = tempfile::tempdir().unwrap();
-    succeeded(program(elsewhere.path(), &["play", "--ckpt", &run, "--episodes", "2", "--json"]));
+    let model = format!("env.model={}/own.xml", folder.path().canonicalize().unwrap().display());
+    for args in [
+        &["play", "--ckpt", &run, "--episodes", "2", "--json"][..],
+        &["train", "--resume", &run, "--total-steps", "256"],
+    ] {
+        let refused = program(elsewhere.path(), args);
+        assert_eq!(refused.status.code(), Some(1));
+        assert!(stderr(&refused).contains(&format!("say --set {model}")), "{}", stderr(&refused));
+        let named = succeeded(program(elsewhere.path(), &[args, &["--set", &model]].concat()));
+        assert!(!stderr(&named).contains("warning"), "{}", stderr(&named));
+    }
 }
 
 #[test]

@@ -12,6 +12,7 @@ mod point_mass;
 mod pool;
 mod scene;
 mod support;
+mod survival;
 mod task;
 #[cfg(feature = "viewer")]
 mod window;

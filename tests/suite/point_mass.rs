@@ -12,10 +12,14 @@ use crate::support::config;
 
 const STEPS: u32 = 20;
 
+static NEVER: AtomicBool = AtomicBool::new(false);
+
 /// A point in the plane that is moved by up to 0.2 a step and should come to the origin.
 struct PointMass {
     position: [f64; 2],
     age: u32,
+    /// Where it panics.
+    trap: Option<u32>,
 }
 
 impl PointMass {
@@ -55,6 +59,7 @@ impl Env for PointMass {
             *x += 0.2 * f64::from(a.clamp(-1.0, 1.0));
         }
         self.age += 1;
+        assert_ne!(self.trap, Some(self.age), "the trap");
         self.write(observation);
         let end =
             if self.distance() > 3.0 { Some(End::Terminated) } else { (self.age >= STEPS).then_some(End::Truncated) };
@@ -71,7 +76,7 @@ fn pool(seed: u64) -> EnvPool<PointMass> {
 }
 
 fn pool_of(envs: usize, seed: u64) -> EnvPool<PointMass> {
-    EnvPool::new(seed, (0..envs).map(|_| PointMass { position: [0.0; 2], age: 0 }).collect())
+    EnvPool::new(seed, (0..envs).map(|_| PointMass { position: [0.0; 2], age: 0, trap: None }).collect())
 }
 
 fn settings() -> PpoConfig {
@@ -83,11 +88,11 @@ fn settings() -> PpoConfig {
 fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
     let (mut pool, mut ppo) = (pool(seed), Ppo::new(settings, 2, 2, seed).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     let mut distances = Vec::new();
     for iteration in 1..=60 {
-        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
-        ppo.update(&mut rollout, iteration).unwrap();
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &NEVER).unwrap();
+        ppo.update(&mut rollout, iteration, &NEVER).unwrap().unwrap();
         rollout.carry_over();
         let finished = pool.take_finished();
         if !finished.is_empty() {
@@ -127,10 +132,10 @@ fn ppo_learns_on_tiles_where_there_are_any() {
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings(), 2, 2, 3).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     for iteration in 1..=5 {
-        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false)).unwrap();
-        let stats = ppo.update(&mut rollout, iteration).unwrap();
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &NEVER).unwrap();
+        let stats = ppo.update(&mut rollout, iteration, &NEVER).unwrap().unwrap();
         rollout.carry_over();
         assert!(stats.first_kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first_kl);
         assert!(stats.first_ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first_ratio_error);
@@ -139,11 +144,11 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
 }
 
 #[test]
-fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
+fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
     let (mut pool, mut ppo) = (pool(0), Ppo::new(&settings(), 2, 2, 0).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
-    collect(&mut pool, &ppo, &mut rollout, 17, &mut scratch, &AtomicBool::new(false)).unwrap();
+    pool.reset(rollout.first_observations_mut());
+    collect(&mut pool, &ppo, &mut rollout, 17, &mut scratch, &NEVER).unwrap();
     rollout.blocks[2].rewards[5] = f32::NAN;
     let answer = |ppo: &Ppo| {
         let (policy, mut means) = (ppo.policy().freeze().unwrap(), [0.0; 2]);
@@ -151,20 +156,37 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_iteration() {
         means
     };
     let before = answer(&ppo);
-    let error = format!("{:#}", ppo.update(&mut rollout, 17).unwrap_err());
-    assert!(error.contains("iteration 17") && error.contains("NaN"), "{error}");
+    let error = format!("{:#}", ppo.update(&mut rollout, 17, &NEVER).unwrap_err());
+    assert!(error.contains("epoch 0, minibatch") && error.contains("NaN"), "{error}");
     assert_eq!(before, answer(&ppo), "nothing is learnt from it");
+}
+
+#[test]
+fn a_panic_in_an_environment_is_an_error_with_its_number_on_any_number_of_threads() {
+    for threads in [1, 2, 8] {
+        let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        threads.install(|| {
+            let (mut pool, ppo) = (pool(0), Ppo::new(&settings(), 2, 2, 0).unwrap());
+            let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+            pool.reset(rollout.first_observations_mut());
+            let trapped = pool.envs_mut().nth(43).unwrap();
+            trapped.trap = Some(if trapped.age + 3 <= STEPS { trapped.age + 3 } else { 3 });
+            let error = collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &NEVER).unwrap_err();
+            let said = format!("{error:#}");
+            assert!(said.contains("environment 43 panicked") && said.contains("the trap"), "{said}");
+        });
+    }
 }
 
 #[test]
 fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
     let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     // One point starts so far out that it is lost at once.
     rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
     pool.envs_mut().next().unwrap().position = [5.0, 5.0];
-    collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(false)).unwrap();
+    collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &NEVER).unwrap();
     let policy = ppo.policy().freeze().unwrap();
     let mut work = policy.workspace(1);
     let (mut truncated, mut terminated) = (0, 0);
@@ -190,7 +212,7 @@ fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
 fn an_interrupted_collection_says_so() {
     let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(0, rollout.first_observations_mut());
+    pool.reset(rollout.first_observations_mut());
     let mut collected =
         |interrupted| collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &AtomicBool::new(interrupted)).unwrap();
     assert!(!collected(true));
@@ -205,11 +227,11 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
             threads.install(|| {
                 let (mut pool, mut ppo) = (pool_of(envs, 5), Ppo::new(&settings(), 2, 2, 5).unwrap());
                 let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-                pool.reset(0, rollout.first_observations_mut());
+                pool.reset(rollout.first_observations_mut());
                 for iteration in 1..=4 {
                     let never = AtomicBool::new(false);
                     assert!(collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &never).unwrap());
-                    ppo.update(&mut rollout, iteration).unwrap();
+                    ppo.update(&mut rollout, iteration, &NEVER).unwrap().unwrap();
                     rollout.carry_over();
                 }
                 let (policy, mut means) = (ppo.policy().freeze().unwrap(), [0.0; 2]);

@@ -36,7 +36,7 @@ impl Block<'_> {
             observations: &mut self.observations,
             final_observations: &mut self.final_observations,
         };
-        self.envs.step(actions, buffers);
+        self.envs.step(actions, buffers).unwrap();
         self.seen.push((self.observations.clone(), self.rewards.clone()));
         for (i, end) in self.ends.iter().enumerate() {
             let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
@@ -64,7 +64,7 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: im
         let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect());
         let sizes = pool.block_sizes();
         let mut observations: Vec<Vec<f32>> = sizes.iter().map(|n| vec![0.0; n * OBSERVATION_SIZE]).collect();
-        pool.reset(0, observations.iter_mut().map(|rows| &mut rows[..]).collect());
+        pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
         let mut first = 0;
         let blocks = pool.blocks_mut().iter_mut().zip(observations).map(|(envs, observations)| {
             let n = envs.len();
@@ -131,4 +131,55 @@ fn an_environment_does_the_same_alone_as_among_others() {
     };
     assert_eq!(first_row(1), first_row(3));
     assert_eq!(first_row(1), first_row(20));
+}
+
+#[test]
+fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
+    let task = task(&["env.max_episode_seconds=0.7"]);
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    threads.install(|| {
+        let new_pool = || EnvPool::new(5, (0..24).map(|_| Repose::new(&task)).collect());
+        let mut pool = new_pool();
+        let rows: Vec<usize> = pool.block_sizes().iter().map(|n| n * OBSERVATION_SIZE).collect();
+        let mut observations: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
+        pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
+        let action = noise();
+        let step = |pool: &mut EnvPool<Repose>, observations: &mut [Vec<f32>], step: usize| {
+            let mut first = 0;
+            let mut seen = Vec::new();
+            for (block, rows) in pool.blocks_mut().iter_mut().zip(observations) {
+                let n = block.len();
+                let actions: Vec<f32> = (0..n * ACTION_SIZE).map(|i| action(step, first + i)).collect();
+                let (mut rewards, mut ends) = (vec![0.0; n], vec![None; n]);
+                let mut last = rows.clone();
+                let buffers = StepBuffers {
+                    rewards: &mut rewards,
+                    ends: &mut ends,
+                    observations: rows,
+                    final_observations: &mut last,
+                };
+                block.step(&actions, buffers).unwrap();
+                first += n * ACTION_SIZE;
+                seen.push((rewards, ends, rows.clone()));
+            }
+            seen
+        };
+        (0..100).for_each(|t| drop(step(&mut pool, &mut observations, t)));
+        pool.take_finished();
+        let state = pool.save();
+        let mut again = new_pool();
+        let mut restored: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
+        again.restore(&state, restored.iter_mut().map(|rows| &mut rows[..]).collect()).unwrap();
+        assert!(restored == observations, "the observations to act on");
+        assert!(again.save() == state);
+        for t in 100..250 {
+            let expected = step(&mut pool, &mut observations, t);
+            assert!(step(&mut again, &mut restored, t) == expected, "step {t}");
+        }
+        let [ended, expected] = [again.take_finished(), pool.take_finished()];
+        assert!(ended == expected && ended.len() > 24, "{} episodes ended", ended.len());
+        let other = EnvPool::new(5, (0..23).map(|_| Repose::new(&task)).collect::<Vec<_>>()).save();
+        let rows = restored.iter_mut().map(|rows| &mut rows[..]).collect();
+        assert!(again.restore(&other, rows).is_err(), "a state of fewer environments");
+    });
 }

@@ -1,6 +1,7 @@
 //! What several tests need.
 
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::Arc;
 
@@ -113,4 +114,32 @@ pub fn colours_of_the_cube(rgb: &[u8]) -> usize {
         }
     }
     found.iter().filter(|&&pixels| pixels * 500 > rgb.len() / 3).count()
+}
+
+/// The names in a folder, sorted.
+pub fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+/// The metrics without the columns of times.
+pub fn metrics(run: &Path) -> Vec<Vec<String>> {
+    let text = fs::read_to_string(run.join("metrics.csv")).unwrap();
+    let header: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    let kept = |row: &str| {
+        let cells = row.split(',').zip(&header).filter(|(_, name)| !name.starts_with("time/"));
+        cells.map(|(cell, _)| cell.to_owned()).collect()
+    };
+    text.lines().map(kept).collect()
+}
+
+/// The tensors of a checkpoint.
+pub fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
+    let bytes = fs::read(path).unwrap();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    let mut found: Vec<_> = tensors.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();
+    found.sort();
+    found
 }

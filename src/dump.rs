@@ -1,0 +1,26 @@
+//! The last steps of an episode whose physics diverged, as JSON: enough to replay them in any MuJoCo.
+
+use serde_json::{Value, json};
+
+use crate::config::EnvConfig;
+use crate::env::Diverged;
+
+/// One object: `state` is that of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first of the steps, `ctrl` the
+/// controls of each step in the model's order, `actions` what the policy asked for.
+pub fn of(diverged: &Diverged, config: &EnvConfig, iteration: u64, env: usize) -> String {
+    let tail = &diverged.tail;
+    let actions: Vec<Value> = tail.actions.iter().map(|action| json!(action.as_slice())).collect();
+    let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
+    let dump = json!({
+        "model": config.model,
+        "sim_dt": config.sim_dt,
+        "ctrl_dt": config.ctrl_dt,
+        "iteration": iteration,
+        "environment": env,
+        "episode_length": diverged.length,
+        "state": tail.start.numbers(),
+        "ctrl": ctrl,
+        "actions": actions,
+    });
+    format!("{dump}\n")
+}

@@ -1,0 +1,244 @@
+//! Named arrays and a few texts as the bytes of a safetensors file, with a checksum over all of it.
+//!
+//! Bytes may come from anywhere. Sizes are checked before anything is allocated by them, numbers must be finite, and what the
+//! checksum does not vouch for is refused.
+
+use std::collections::{BTreeMap, HashMap};
+
+use anyhow::{Context, Result, anyhow, bail, ensure};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+
+/// The metadata key of the checksum.
+const CHECKSUM: &str = "checksum";
+
+/// A header of ours takes a few KiB; the limit keeps a foreign one from filling the memory.
+const LARGEST_HEADER: u64 = 1 << 22;
+
+/// An array of any shape, by rows.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Array {
+    /// Floats.
+    F32(Vec<usize>, Vec<f32>),
+    /// Doubles.
+    F64(Vec<usize>, Vec<f64>),
+    /// Whole numbers.
+    U64(Vec<usize>, Vec<u64>),
+}
+
+/// The content of a file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Content {
+    /// The texts, by their names.
+    pub texts: BTreeMap<String, String>,
+    /// The arrays, by their names.
+    pub arrays: BTreeMap<String, Array>,
+}
+
+impl Content {
+    /// The bytes of a file with this content.
+    ///
+    /// # Errors
+    /// An array with a number that is not finite, or of a shape that does not fit its length.
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+        let mut parts = Vec::new();
+        for (name, array) in &self.arrays {
+            ensure!(array.is_finite(), "`{name}` is not finite and is not saved");
+            parts.push((name, array.bytes(), array));
+        }
+        let mut views = Vec::new();
+        for (name, bytes, array) in &parts {
+            views.push((name.as_str(), TensorView::new(array.dtype(), array.shape().to_vec(), bytes)?));
+        }
+        let mut texts: HashMap<String, String> = self.texts.clone().into_iter().collect();
+        texts.insert(CHECKSUM.into(), checksum(&texts, &views));
+        Ok(safetensors::serialize(views, Some(texts))?)
+    }
+
+    /// Reads the bytes of a file.
+    ///
+    /// # Errors
+    /// Bytes that were not written by [`Content::to_bytes`] or have been changed since.
+    pub fn parse(bytes: &[u8]) -> Result<Self> {
+        let whole = |error| anyhow!("not a whole safetensors file ({error}); it may be cut off");
+        if let Some((length, _)) = bytes.split_first_chunk() {
+            let length = u64::from_le_bytes(*length);
+            ensure!(
+                length <= LARGEST_HEADER,
+                "not a file of this program: its header would have {length} bytes, at most {LARGEST_HEADER} are read"
+            );
+        }
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
+        let mut texts = header.metadata().clone().context("no metadata: not a file of this program")?;
+        let file = SafeTensors::deserialize(bytes).map_err(whole)?;
+        let mut views = file.tensors();
+        views.sort_by(|(a, _), (b, _)| a.cmp(b));
+        let views: Vec<(&str, TensorView)> = views.iter().map(|(name, view)| (name.as_str(), view.clone())).collect();
+        let stored =
+            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or of an older version")?;
+        let found = checksum(&texts, &views);
+        ensure!(stored == found, "damaged: its checksum is {found}, it should be {stored}");
+        let mut arrays = BTreeMap::new();
+        for (name, view) in views {
+            arrays.insert(name.to_owned(), Array::read(&view).with_context(|| format!("tensor `{name}`"))?);
+        }
+        Ok(Self { texts: texts.into_iter().collect(), arrays })
+    }
+}
+
+/// The file with these bytes, with the checksum that fits what is in it now: for tests of what lies behind the checksum.
+///
+/// # Errors
+/// Bytes that are no whole safetensors file.
+pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
+    ensure!(bytes.first_chunk().is_some_and(|length| u64::from_le_bytes(*length) <= LARGEST_HEADER), "no header");
+    let (_, header) = SafeTensors::read_metadata(bytes)?;
+    let mut texts = header.metadata().clone().unwrap_or_default();
+    texts.remove(CHECKSUM);
+    let file = SafeTensors::deserialize(bytes)?;
+    let mut views = file.tensors();
+    views.sort_by(|(a, _), (b, _)| a.cmp(b));
+    let views: Vec<(&str, TensorView)> = views.iter().map(|(name, view)| (name.as_str(), view.clone())).collect();
+    texts.insert(CHECKSUM.into(), checksum(&texts, &views));
+    Ok(safetensors::serialize(views, Some(texts))?)
+}
+
+/// The CRC-32 of all names, texts, types, shapes and numbers: it does not depend on how the header is laid out.
+fn checksum(texts: &HashMap<String, String>, views: &[(&str, TensorView)]) -> String {
+    let mut hasher = crc32fast::Hasher::new();
+    let mut take = |part: &[u8]| {
+        hasher.update(&(part.len() as u64).to_le_bytes());
+        hasher.update(part);
+    };
+    let texts: BTreeMap<&String, &String> = texts.iter().collect();
+    for (key, text) in texts {
+        take(key.as_bytes());
+        take(text.as_bytes());
+    }
+    for (name, view) in views {
+        take(name.as_bytes());
+        take(view.dtype().to_string().as_bytes());
+        view.shape().iter().for_each(|size| take(&(*size as u64).to_le_bytes()));
+        take(view.data());
+    }
+    format!("{:08x}", hasher.finalize())
+}
+
+impl Array {
+    fn read(view: &TensorView) -> Result<Self> {
+        let shape = view.shape().to_vec();
+        let (words, _) = view.data().as_chunks::<4>();
+        let (longs, _) = view.data().as_chunks::<8>();
+        let array = match view.dtype() {
+            Dtype::F32 => Self::F32(shape, words.iter().map(|word| f32::from_le_bytes(*word)).collect()),
+            Dtype::F64 => Self::F64(shape, longs.iter().map(|long| f64::from_le_bytes(*long)).collect()),
+            Dtype::U64 => Self::U64(shape, longs.iter().map(|long| u64::from_le_bytes(*long)).collect()),
+            other => bail!("has the type {other:?}, expected F32, F64 or U64"),
+        };
+        ensure!(array.is_finite(), "holds a number that is infinite or NaN");
+        Ok(array)
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        match self {
+            Self::F32(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Self::F64(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Self::U64(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+        }
+    }
+
+    fn dtype(&self) -> Dtype {
+        match self {
+            Self::F32(..) => Dtype::F32,
+            Self::F64(..) => Dtype::F64,
+            Self::U64(..) => Dtype::U64,
+        }
+    }
+
+    /// The sizes of its dimensions.
+    pub fn shape(&self) -> &[usize] {
+        match self {
+            Self::F32(shape, _) | Self::F64(shape, _) | Self::U64(shape, _) => shape,
+        }
+    }
+
+    fn is_finite(&self) -> bool {
+        match self {
+            Self::F32(_, values) => values.iter().all(|x| x.is_finite()),
+            Self::F64(_, values) => values.iter().all(|x| x.is_finite()),
+            Self::U64(..) => true,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn content() -> Content {
+        let mut content = Content::default();
+        content.texts.insert("config".into(), "a = 1".into());
+        content.arrays.insert("weight".into(), Array::F32(vec![2, 2], vec![1.5, -2.0, 0.0, 4.0]));
+        content.arrays.insert("count".into(), Array::U64(vec![1], vec![u64::MAX]));
+        content.arrays.insert("mean".into(), Array::F64(vec![2], vec![0.1, 0.2]));
+        content
+    }
+
+    fn refusal(bytes: &[u8]) -> String {
+        format!("{:#}", Content::parse(bytes).unwrap_err())
+    }
+
+    /// The place of these bytes in the file.
+    fn find(bytes: &[u8], part: &[u8]) -> usize {
+        bytes.windows(part.len()).position(|window| window == part).expect("it is in the file")
+    }
+
+    #[test]
+    fn what_is_written_is_what_is_read() {
+        assert_eq!(Content::parse(&content().to_bytes().unwrap()).unwrap(), content());
+    }
+
+    #[test]
+    fn every_changed_bit_of_texts_and_numbers_is_found() {
+        let bytes = content().to_bytes().unwrap();
+        let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        for bit in 0..8 * (bytes.len() - header) {
+            let mut changed = bytes.clone();
+            changed[header + bit / 8] ^= 1 << (bit % 8);
+            assert!(refusal(&changed).contains("checksum"));
+        }
+        let mut changed = bytes.clone();
+        changed[find(&bytes, b"a = 1") + 4] = b'2';
+        assert!(refusal(&changed).contains("checksum"));
+    }
+
+    #[test]
+    fn cut_off_and_foreign_files_are_refused() {
+        let bytes = content().to_bytes().unwrap();
+        for length in [0, 7, 8, 100, bytes.len() / 2, bytes.len() - 1] {
+            assert!(refusal(&bytes[..length]).contains("cut off"));
+        }
+        let foreign = safetensors::serialize(Vec::<(String, TensorView)>::new(), None).unwrap();
+        assert!(refusal(&foreign).contains("not a file of this program"));
+    }
+
+    #[test]
+    fn a_header_that_claims_to_be_huge_is_refused_unread() {
+        let mut bytes = content().to_bytes().unwrap();
+        for length in [LARGEST_HEADER + 1, 1 << 40, u64::MAX] {
+            bytes[..8].copy_from_slice(&length.to_le_bytes());
+            assert!(refusal(&bytes).contains("at most"));
+        }
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_are_neither_written_nor_read() {
+        let mut bad = content();
+        bad.arrays.insert("weight".into(), Array::F32(vec![1], vec![f32::NAN]));
+        assert!(bad.to_bytes().unwrap_err().to_string().contains("`weight` is not finite"));
+        let mut bytes = content().to_bytes().unwrap();
+        let at = find(&bytes, &0.2_f64.to_le_bytes());
+        bytes[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
+        assert!(refusal(&bytes).contains("checksum"));
+        assert!(refusal(&sealed(&bytes).unwrap()).contains("tensor `mean`: holds a number that is infinite or NaN"));
+    }
+}

@@ -1,0 +1,152 @@
+//! `metrics.csv`: one row for each iteration, appended; on the disk no later than the checkpoint of its iteration.
+//!
+//! What lies behind the checkpoint that is gone on from is cut off, so rows are neither missing nor there twice.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{BufRead, BufReader, ErrorKind, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+
+/// The table while it is written.
+pub struct Metrics {
+    path: PathBuf,
+    file: File,
+    /// Bytes of the header and of whole rows.
+    length: u64,
+}
+
+impl Metrics {
+    /// Opens or begins the table with this header, behind the rows of the first `iterations`; with the number of rows that
+    /// were cut off. A table with another header is kept under another name.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn open(path: &Path, header: &str, iterations: u64) -> Result<(Self, u64)> {
+        let context = || format!("cannot write {}", path.display());
+        let (mut length, mut dropped) = (0, 0);
+        match File::open(path) {
+            Ok(file) => match rows(file, header, iterations).with_context(context)? {
+                Some(found) => (length, dropped) = found,
+                None => {
+                    fs::rename(path, path.with_extension(format!("before-{iterations}.csv"))).with_context(context)?
+                }
+            },
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(error).with_context(context),
+        }
+        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).with_context(context)?;
+        let mut metrics = Self { path: path.to_owned(), file, length };
+        metrics.repair().with_context(context)?;
+        if length == 0 {
+            metrics.row(&format!("{header}\n"))?;
+        }
+        Ok((metrics, dropped))
+    }
+
+    /// Adds a row, which ends with a line feed.
+    ///
+    /// # Errors
+    /// A file that cannot be written, or was deleted; [`Metrics::repair`] must succeed before the next row.
+    pub fn row(&mut self, row: &str) -> Result<()> {
+        self.file.write_all(row.as_bytes()).with_context(|| format!("cannot write {}", self.path.display()))?;
+        self.length += row.len() as u64;
+        Ok(())
+    }
+
+    /// Cuts off what was written of a row that did not fit.
+    fn repair(&mut self) -> std::io::Result<()> {
+        if self.file.metadata()?.is_file() {
+            self.file.set_len(self.length)?;
+        }
+        self.file.seek(SeekFrom::Start(self.length)).map(drop)
+    }
+
+    /// Makes sure that all rows are on the disk, where they can be found.
+    ///
+    /// # Errors
+    /// A file that cannot be written, or was deleted.
+    pub fn sync(&mut self) -> Result<()> {
+        let synced = fs::metadata(&self.path).and_then(|_| self.repair()).and_then(|()| self.file.sync_data());
+        synced.with_context(|| format!("cannot write {}", self.path.display()))
+    }
+}
+
+/// Bytes of header and rows up to an iteration, and the number of rows after it; `None` where the header is another.
+fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u64, u64)>> {
+    // A device has no rows to keep, and may have no end.
+    if !file.metadata()?.is_file() {
+        return Ok(Some((0, 0)));
+    }
+    let (mut reader, mut line) = (BufReader::new(file), Vec::new());
+    let mut next = |line: &mut Vec<u8>| {
+        line.clear();
+        reader.read_until(b'\n', line)
+    };
+    if next(&mut line)? == 0 {
+        return Ok(Some((0, 0)));
+    }
+    if line.strip_suffix(b"\n") != Some(header.as_bytes()) {
+        return Ok(None);
+    }
+    let (mut length, mut dropped) = (line.len() as u64, 0);
+    while next(&mut line)? > 0 {
+        let number =
+            line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse::<u64>().ok());
+        let whole =
+            line.ends_with(b"\n") && line.iter().filter(|&&byte| byte == b',').count() == header.matches(',').count();
+        if dropped == 0 && whole && number.is_some_and(|number| number <= iterations) {
+            length += line.len() as u64;
+        } else {
+            dropped += 1;
+        }
+    }
+    Ok(Some((length, dropped)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table(rows: &str) -> (tempfile::TempDir, PathBuf) {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("metrics.csv");
+        fs::write(&path, format!("iteration,loss\n{rows}")).unwrap();
+        (place, path)
+    }
+
+    #[test]
+    fn rows_behind_the_checkpoint_and_half_rows_are_cut_off() {
+        for (rows, iterations, dropped, kept) in [
+            ("1,0.5\n2,0.25\n3,0.1\n", 2, 1, "1,0.5\n2,0.25\n"),
+            ("1,0.5\n2,0.25\n3", 3, 1, "1,0.5\n2,0.25\n"),
+            ("1,0.5\n2\n3,0.1\n", 3, 2, "1,0.5\n"),
+            ("", 3, 0, ""),
+        ] {
+            let (_place, path) = table(rows);
+            let (mut metrics, found) = Metrics::open(&path, "iteration,loss", iterations).unwrap();
+            metrics.row("9,9\n").unwrap();
+            assert_eq!(found, dropped);
+            assert_eq!(fs::read_to_string(&path).unwrap(), format!("iteration,loss\n{kept}9,9\n"));
+        }
+    }
+
+    #[test]
+    fn a_table_with_other_columns_is_kept_under_another_name() {
+        let (place, path) = table("1,0.5\n");
+        Metrics::open(&path, "iteration,return", 1).unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,return\n");
+        let old = place.path().join("metrics.before-1.csv");
+        assert_eq!(fs::read_to_string(old).unwrap(), "iteration,loss\n1,0.5\n");
+    }
+
+    #[test]
+    fn a_table_that_was_deleted_is_noticed() {
+        let (_place, path) = table("");
+        let (mut metrics, _) = Metrics::open(&path, "iteration,loss", 0).unwrap();
+        metrics.sync().unwrap();
+        fs::remove_file(&path).unwrap();
+        metrics.row("1,2\n").unwrap();
+        assert!(metrics.sync().is_err());
+    }
+}

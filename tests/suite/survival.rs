@@ -1,0 +1,406 @@
+//! A training that is stopped, killed, or robbed of its disk goes on as if nothing had been.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Lines};
+use std::path::Path;
+use std::process::{Child, ChildStderr, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::RngExt;
+use shadow_repose::rng;
+use shadow_repose::sim::{Physics, Scene};
+
+use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train, weights};
+
+/// What a run has come to: weights, optimizer and environments of its latest checkpoint, its policy, its metrics, its score.
+type Result = (Vec<(String, Vec<u8>)>, Vec<(String, Vec<u8>)>, Vec<Vec<String>>, String);
+
+fn result(folder: &Path, run: &str) -> Result {
+    let run = folder.join(run);
+    let checkpoint = run.join("checkpoints/latest.safetensors").display().to_string();
+    let score = succeeded(program(folder, &["play", "--ckpt", &checkpoint, "--episodes", "3", "--json"])).stdout;
+    let mut score: serde_json::Value = serde_json::from_slice(&score).unwrap();
+    score.as_object_mut().unwrap().remove("checkpoint");
+    (weights(checkpoint.into()), weights(run.join("policy.safetensors")), metrics(&run), score.to_string())
+}
+
+fn resume(folder: &Path, more: &[&str]) -> Output {
+    program(folder, &[&["train", "--resume", "run"], more].concat())
+}
+
+/// A training in `run` that does not end by itself, once it has told of its first iteration.
+fn endless(folder: &Path, more: &[&str]) -> (Child, Lines<BufReader<ChildStderr>>) {
+    let args = train(&[&["--total-steps", "100000000", "--run-dir", "run"], more].concat());
+    begun(command(folder, &args))
+}
+
+fn begun(mut command: Command) -> (Child, Lines<BufReader<ChildStderr>>) {
+    let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    while !lines.next().expect("the training goes on").unwrap().contains("steps/s") {}
+    (child, lines)
+}
+
+fn send(signal: &str, child: &Child) {
+    let sent = Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+}
+
+/// Ends a training by a signal, and gives its exit code and what it said after it.
+fn ended_by(signal: &str, mut child: Child, lines: Lines<BufReader<ChildStderr>>) -> (Option<i32>, String) {
+    send(signal, &child);
+    let rest: Vec<String> = lines.map_while(|line| line.ok()).collect();
+    (child.wait().unwrap().code(), rest.join("\n"))
+}
+
+fn iterations(folder: &Path) -> u64 {
+    metrics(&folder.join("run")).last().unwrap()[0].parse().unwrap_or(0)
+}
+
+/// Episodes with contacts and drops, of which some end in every iteration, and evaluations that are rarer than checkpoints.
+const LONG: &[&str] =
+    &["--set", "env.max_episode_seconds=2", "--set", "run.eval_every=7", "--set", "run.checkpoint_every=3"];
+
+#[test]
+fn twenty_iterations_and_twenty_more_are_forty_bit_for_bit_on_any_threads() {
+    let undisturbed = tempfile::tempdir().unwrap();
+    let total = (40 * 128).to_string();
+    let args = train(&[&["--run-dir", "run", "--threads", "2", "--total-steps", &total], LONG].concat());
+    succeeded(program(undisturbed.path(), &args));
+    let expected = result(undisturbed.path(), "run");
+    assert_eq!(expected.2.len(), 41);
+    for threads in [["1", "8"], ["8", "1"]] {
+        let folder = tempfile::tempdir().unwrap();
+        let half = (20 * 128).to_string();
+        let args = train(&[&["--run-dir", "run", "--threads", threads[0], "--total-steps", &half], LONG].concat());
+        succeeded(program(folder.path(), &args));
+        succeeded(resume(folder.path(), &["--total-steps", &total, "--threads", threads[1]]));
+        assert!(result(folder.path(), "run") == expected, "threads {threads:?}");
+    }
+}
+
+#[test]
+fn other_precision_and_backend_resume_exactly_too() {
+    for setting in ["ppo.precision=bf16-rounded", "ppo.backend=candle"] {
+        let results = [&["512"][..], &["256", "512"]].map(|totals| {
+            let folder = tempfile::tempdir().unwrap();
+            let args = train(&["--run-dir", "run", "--total-steps", totals[0], "--set", setting, "--threads", "2"]);
+            succeeded(program(folder.path(), &args));
+            totals[1..].iter().for_each(|total| drop(succeeded(resume(folder.path(), &["--total-steps", total]))));
+            result(folder.path(), "run")
+        });
+        assert!(results[0] == results[1], "{setting}");
+    }
+}
+
+/// Kills a training `kills` times at random moments, resumes it each time, and compares it with one left in peace.
+fn killed(kills: usize, iterations: u64) {
+    let undisturbed = tempfile::tempdir().unwrap();
+    let total = (iterations * 128).to_string();
+    let args = train(&[&["--run-dir", "run", "--total-steps", &total], LONG].concat());
+    let started = Instant::now();
+    succeeded(program(undisturbed.path(), &args));
+    let whole = started.elapsed().as_secs_f64();
+    let expected = result(undisturbed.path(), "run");
+
+    let folder = tempfile::tempdir().unwrap();
+    let mut noise = rng::stream(kills as u64, "test", 0);
+    let mut args = args;
+    let resume = ["train", "--resume", "run", "--total-steps", &total];
+    let mut hit = 0;
+    for _ in 0..kills {
+        let mut child = command(folder.path(), &args).stderr(Stdio::null()).spawn().unwrap();
+        let patience = 1.5 * whole / kills as f64 + 0.05;
+        std::thread::sleep(Duration::from_secs_f64(patience * noise.random::<f64>()));
+        child.kill().unwrap();
+        hit += usize::from(!child.wait().unwrap().success());
+        let begun = folder.path().join("run/checkpoints/latest.safetensors").exists();
+        if begun {
+            args = resume.to_vec();
+        } else if folder.path().join("run").exists() {
+            // Killed before its first checkpoint: nothing was made yet.
+            fs::remove_dir_all(folder.path().join("run")).unwrap();
+        }
+    }
+    succeeded(program(folder.path(), &args));
+    assert!(hit * 2 > kills, "only {hit} of {kills} were killed in time");
+    assert!(result(folder.path(), "run") == expected, "after {kills} kills");
+    let left = names(&folder.path().join("run/checkpoints"));
+    assert!(left.iter().all(|name| name.ends_with(".safetensors")), "{left:?}");
+    assert_eq!(events(&folder.path().join("run")), events(&undisturbed.path().join("run")));
+}
+
+/// The steps in the event files of a run, in their order, with the number of values of each.
+fn events(run: &Path) -> Vec<(i64, usize)> {
+    let mut files: Vec<String> = names(run).into_iter().filter(|name| name.contains("tfevents")).collect();
+    files.sort();
+    let mut found = Vec::new();
+    for file in files {
+        let bytes = fs::read(run.join(file)).unwrap();
+        let mut rest = &bytes[..];
+        while !rest.is_empty() {
+            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            let event: tensorboard_proto::event::Event =
+                protobuf::Message::parse_from_bytes(&rest[12..12 + length]).unwrap();
+            if event.has_summary() {
+                found.push((event.get_step(), event.get_summary().get_value().len()));
+            }
+            rest = &rest[16 + length..];
+        }
+    }
+    found
+}
+
+#[test]
+fn killed_at_random_moments_and_resumed_it_comes_to_the_same_end() {
+    killed(8, 120);
+}
+
+#[test]
+#[ignore = "minutes: the same with a hundred kills"]
+fn killed_a_hundred_times_and_resumed_it_comes_to_the_same_end() {
+    killed(100, 1500);
+}
+
+#[test]
+fn each_signal_saves_the_last_whole_iteration_and_has_its_exit_code() {
+    for (signal, code) in [("INT", 130), ("TERM", 143), ("HUP", 129)] {
+        let folder = tempfile::tempdir().unwrap();
+        let (child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
+        let (found, said) = ended_by(signal, child, lines);
+        assert_eq!(found, Some(code), "{said}");
+        assert!(said.contains("stopped after") && said.contains("train --resume run"), "{said}");
+        let made = iterations(folder.path());
+        let more = succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+        assert!(!stderr(&more).contains("dropped"), "every row is of an iteration that was saved: {}", stderr(&more));
+        assert_eq!(iterations(folder.path()), made + 1);
+    }
+}
+
+#[test]
+fn a_signal_in_the_middle_of_a_long_update_or_evaluation_is_answered_at_once() {
+    for setting in ["ppo.epochs=100000", "run.eval_episodes=10000"] {
+        let folder = tempfile::tempdir().unwrap();
+        let args = train(&["--run-dir", "run", "--set", setting]);
+        let mut child = command(folder.path(), &args).stderr(Stdio::piped()).spawn().unwrap();
+        std::thread::sleep(Duration::from_millis(700));
+        send("TERM", &child);
+        let asked = Instant::now();
+        assert_eq!(child.wait().unwrap().code(), Some(143), "{setting}");
+        assert!(asked.elapsed() < Duration::from_secs(20), "{setting}: {:?}", asked.elapsed());
+        assert_eq!(metrics(&folder.path().join("run")).len(), 1, "the begun iteration is dropped");
+    }
+}
+
+#[test]
+fn a_training_started_with_nohup_outlives_its_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
+    let mut nohup = Command::new("nohup");
+    nohup.arg(env!("CARGO_BIN_EXE_shadow-repose")).args(args).current_dir(folder.path()).stdin(Stdio::null());
+    let (child, lines) = begun(nohup);
+    send("HUP", &child);
+    std::thread::sleep(Duration::from_millis(100));
+    assert_eq!(ended_by("TERM", child, lines).0, Some(143), "not by SIGHUP");
+}
+
+#[test]
+fn sigusr1_saves_and_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let (child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
+    let saved = || names(&folder.path().join("run/checkpoints")).len();
+    let before = saved();
+    send("USR1", &child);
+    let patience = Instant::now();
+    while saved() == before {
+        assert!(patience.elapsed() < Duration::from_secs(30), "no checkpoint is written");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!(ended_by("TERM", child, lines).0, Some(143));
+}
+
+#[test]
+fn a_time_limit_saves_and_exits_with_0() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--stop-after", "500ms"]);
+    let output = succeeded(program(folder.path(), &args));
+    assert!(stderr(&output).contains("stopped after"), "{}", stderr(&output));
+    let made = iterations(folder.path());
+    assert!(made > 0);
+    succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+}
+
+#[test]
+fn the_newest_checkpoints_are_kept_as_many_as_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "1280", "--run-dir", "run", "--keep", "3", "--set", "run.checkpoint_every=1"]);
+    succeeded(program(folder.path(), &args));
+    let expected = ["best", "iteration-00000008", "iteration-00000009", "iteration-00000010", "latest"];
+    assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
+}
+
+#[test]
+fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "512", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    succeeded(program(folder.path(), &args));
+    let expected = result(folder.path(), "run");
+    let latest = folder.path().join("run/checkpoints/latest.safetensors");
+    // In place, as a disk does it: the same file under both its names.
+    let mut bytes = fs::read(&latest).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&latest, bytes).unwrap();
+    let output = succeeded(resume(folder.path(), &[]));
+    let said = stderr(&output);
+    assert!(said.contains("warning: cannot use") && said.contains("checksum") && said.contains("one before"), "{said}");
+    assert!(said.contains("1 rows of metrics.csv after iteration 3 are dropped"), "{said}");
+    assert!(result(folder.path(), "run") == expected);
+    for name in names(&folder.path().join("run/checkpoints")) {
+        fs::write(folder.path().join("run/checkpoints").join(name), "gone").unwrap();
+    }
+    let output = resume(folder.path(), &[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("error: cannot resume run"), "{}", stderr(&output));
+}
+
+#[test]
+fn two_trainings_in_one_folder_are_refused_and_a_crash_leaves_no_lock() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut child, lines) = endless(folder.path(), &[]);
+    let second = resume(folder.path(), &[]);
+    assert_eq!(second.status.code(), Some(1));
+    let who = format!("another program: process {}", child.id());
+    assert!(stderr(&second).contains(&who), "{}", stderr(&second));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    drop(lines);
+    succeeded(resume(folder.path(), &["--total-steps", "128"]));
+}
+
+#[test]
+fn a_folder_that_is_deleted_meanwhile_is_made_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    let (child, lines) = begun(command(folder.path(), &args));
+    let run = folder.path().join("run");
+    // The training may be writing into it at this very moment.
+    let patience = Instant::now();
+    while fs::remove_dir_all(&run).is_err() && run.exists() {
+        assert!(patience.elapsed() < Duration::from_secs(30));
+    }
+    while !run.join("checkpoints/latest.safetensors").exists() {
+        assert!(patience.elapsed() < Duration::from_secs(30), "no checkpoint is written");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let (code, said) = ended_by("TERM", child, lines);
+    assert_eq!(code, Some(143), "{said}");
+    let made = iterations(folder.path());
+    succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+    assert!(names(&run).contains(&"config.toml".to_owned()));
+}
+
+#[test]
+fn a_state_that_cannot_be_saved_in_its_place_in_the_end_is_saved_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("tmp")).unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1000000"]);
+    let mut training = command(folder.path(), &args);
+    training.env("TMPDIR", folder.path().join("tmp"));
+    let (child, lines) = begun(training);
+    // A file where a folder should be stops everybody, root too.
+    let checkpoints = folder.path().join("run/checkpoints");
+    fs::remove_dir_all(&checkpoints).unwrap();
+    fs::write(&checkpoints, "in the way").unwrap();
+    let (code, said) = ended_by("TERM", child, lines);
+    assert_eq!(code, Some(1), "{said}");
+    let elsewhere = folder.path().join("tmp").join(&names(&folder.path().join("tmp"))[0]).display().to_string();
+    assert!(said.contains(&format!("--resume {elsewhere}")) && said.contains("error: cannot create"), "{said}");
+    let resumed = program(folder.path(), &["train", "--resume", &elsewhere, "--stop-after", "300ms"]);
+    assert!(stderr(&succeeded(resumed)).contains("stopped after"));
+}
+
+/// Runs a shell script with a file system of `size` at `small` in `folder`, of its own and gone with it; none where the
+/// system does not let us.
+fn with_small_disk(folder: &Path, size: &str, script: &str) -> Option<Output> {
+    fs::create_dir(folder.join("small")).unwrap();
+    let unshared = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--user", "--map-root-user", "--mount", "sh", "-c", script]).current_dir(folder);
+        command.env("PROGRAM", env!("CARGO_BIN_EXE_shadow-repose")).env("TMPDIR", folder).output()
+    };
+    let mount = format!("mount -t tmpfs -o size={size} none small && ");
+    let possible = unshared(&format!("{mount} true")).is_ok_and(|output| output.status.success());
+    if !possible {
+        eprintln!("not tested: file systems cannot be mounted here");
+        return None;
+    }
+    Some(unshared(&format!("{mount} {script}")).unwrap())
+}
+
+#[test]
+fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings =
+        train(&["--total-steps", "100000", "--run-dir", "small/run", "--set", "run.checkpoint_every=5"]).join(" ");
+    // The disk is full from early on, and is given room again before a second one comes to its end.
+    let script = format!(
+        "($PROGRAM {settings} 2> said & train=$!
+          until grep -q steps/s said; do sleep 0.01; done
+          cat /dev/zero > small/filler 2> /dev/null
+          wait $train; echo code $?
+          rm small/filler
+          $PROGRAM play --ckpt small/run --episodes 2 --json
+          $PROGRAM train --resume small/run; echo code $?)"
+    );
+    let Some(output) = with_small_disk(folder.path(), "2m", &script) else { return };
+    let said = fs::read_to_string(folder.path().join("said")).unwrap();
+    let printed = String::from_utf8_lossy(&output.stdout);
+    let lines: Vec<&str> = printed.lines().collect();
+    // Full in the end too: that is an error, and the state is elsewhere.
+    assert_eq!(lines[0], "code 1", "{said}");
+    assert!(said.contains("tried again at the next checkpoint") && said.contains("No space left"), "{said}");
+    assert!(said.contains("99968 of 100000") || said.contains("100096 of 100000"), "all steps were made: {said}");
+    assert!(said.contains("instead; go on with"), "{said}");
+    assert!(said.contains("metrics.csv lacks"), "what was lost is counted: {said}");
+    assert!(lines[1].contains("\"episodes\":2"), "the last whole checkpoint plays: {printed}");
+    assert_eq!(lines[2], "code 0", "{}", stderr(&output));
+}
+
+/// The built-in scene with a mass on a spring that pushes instead of pulling: after twenty steps it is too far away.
+fn unstable_scene() -> String {
+    let mass = "<body name=\"unstable\" pos=\"5 5 5\"><joint type=\"slide\" axis=\"0 0 1\" stiffness=\"-10000\"/>\
+                <geom type=\"sphere\" size=\".1\" mass=\"1\" contype=\"0\" conaffinity=\"0\"/></body></worldbody>";
+    SCENE.replace("</worldbody>", mass)
+}
+
+#[test]
+fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("unstable.xml");
+    fs::write(&model, unstable_scene()).unwrap();
+    let mut args = train(&["--total-steps", "5120", "--run-dir", "run", "--dump-diverged"]);
+    args.extend(["--set", "env.max_episode_seconds=5", "--set", "env.model=unstable.xml"]);
+    succeeded(program(folder.path(), &args));
+    let rows = metrics(&folder.path().join("run"));
+    let column = rows[0].iter().position(|name| name == "sim/diverged").unwrap();
+    let diverged: u64 = rows[1..].iter().map(|row| row[column].parse::<u64>().unwrap()).sum();
+    let dumps = names(&folder.path().join("run/diverged"));
+    assert!(diverged > 100 && dumps.len() as u64 == diverged, "{diverged} diverged, {} dumps", dumps.len());
+    let mut simulation = Scene::load(Some(&model), 0.01).unwrap().simulate();
+    for dump in [&dumps[0], &dumps[dumps.len() - 1]] {
+        let text = fs::read_to_string(folder.path().join("run/diverged").join(dump)).unwrap();
+        let dump: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let numbers = |value: &serde_json::Value| -> Vec<f64> {
+            value.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
+        };
+        simulation.restore(&numbers(&dump["state"])).unwrap();
+        let controls = dump["ctrl"].as_array().unwrap();
+        assert!(controls.len() > 15 && dump["actions"].as_array().unwrap().len() == controls.len());
+        for (i, ctrl) in controls.iter().enumerate() {
+            simulation.ctrl_mut().copy_from_slice(&numbers(ctrl));
+            let expected = if i + 1 < controls.len() { Physics::Sound } else { Physics::Diverged };
+            assert_eq!(simulation.step(1), expected, "step {i}");
+        }
+    }
+}
