@@ -1,0 +1,177 @@
+//! Files and inputs that somebody made to harm, and days of logging: whatever they are, the memory stays small. Alone in its
+//! binary, because what is measured is the whole process.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Mutex;
+
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use shadow_repose::config::Config;
+use shadow_repose::env::{ACTION_SIZE, EnvPool, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::ppo::{Array, Checkpoint, Ppo, Progress};
+use shadow_repose::rng::{self, Rng};
+use shadow_repose::run::{Report, Status};
+
+#[path = "../fuzz/targets.rs"]
+mod targets;
+
+/// One test at a time: they measure memory.
+static ALONE: Mutex<()> = Mutex::new(());
+
+/// The memory of this process in MiB, as the system names it: `VmRSS` now, `VmHWM` at most.
+fn memory(name: &str) -> u64 {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix(name)).expect("Linux tells it");
+    line.trim_matches(|c: char| !c.is_ascii_digit()).parse::<u64>().unwrap() / 1024
+}
+
+/// The bytes of a small but whole checkpoint.
+fn a_checkpoint() -> Checkpoint {
+    let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
+    let config = Config::resolve(None, &sets).unwrap();
+    let task = Task::new(&config.env).unwrap();
+    let mut pool = EnvPool::new(0, (0..1).map(|_| Repose::new(&task)).collect());
+    let ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
+    pool.reset(ppo.rollout(&pool.block_sizes()).first_observations_mut());
+    let state = pool.save();
+    let mut checkpoint = ppo.checkpoint(&config.to_text(), Progress::default()).unwrap();
+    checkpoint.insert("envs.numbers", Array::F64(vec![1, state.numbers.len()], state.numbers));
+    checkpoint.insert("envs.counters", Array::U64(vec![1, state.counters.len()], state.counters));
+    checkpoint.insert("scene", Array::U64(vec![1], vec![task.scene().fingerprint().unwrap()]));
+    checkpoint
+}
+
+/// Bits flipped, parts cut out, swapped, repeated or filled, lengths made huge; mostly in the part that has a structure.
+fn mutated(good: &[u8], structured: usize, rng: &mut Rng) -> Vec<u8> {
+    let mut bytes = good.to_vec();
+    for _ in 0..rng.random_range(1..4) {
+        let end = if rng.random::<bool>() { bytes.len().min(structured) } else { bytes.len() };
+        if end < 16 {
+            break;
+        }
+        let from = rng.random_range(0..end - 8);
+        let length = rng.random_range(1..=(end - from).min(64));
+        match rng.random_range(0..8) {
+            0 | 1 => bytes[from] ^= 1 << rng.random_range(0..8),
+            2 => bytes.truncate(from),
+            3 => drop(bytes.drain(from..from + length)),
+            4 => bytes[from..from + length].shuffle(rng),
+            5 => bytes.extend_from_within(from..from + length),
+            6 => bytes[from..from + 8]
+                .copy_from_slice(&[u64::MAX, 1 << 62, 1 << 33, 0][rng.random_range(0..4)].to_le_bytes()),
+            // A digit more or another one: sizes in the header, numbers in the settings.
+            _ => match bytes[from..end].iter().position(u8::is_ascii_digit) {
+                Some(digit) if rng.random::<bool>() => bytes[from + digit] = b'9',
+                Some(digit) => bytes.splice(from + digit..from + digit, *b"99999999").for_each(drop),
+                None => {}
+            },
+        }
+    }
+    bytes
+}
+
+#[test]
+fn ten_thousand_mutations_of_a_checkpoint_and_of_a_config_do_no_harm() {
+    let _alone = ALONE.lock().unwrap();
+    let whole = a_checkpoint();
+    let alone = whole.policy_alone().to_bytes().unwrap();
+    let whole = whole.to_bytes().unwrap();
+    let config = Config::resolve(None, &[]).unwrap().to_text().into_bytes();
+    let header = |bytes: &[u8]| 8 + u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+    let mut rng = rng::stream(0, "test", 0);
+    for (good, target) in [(&whole, targets::checkpoint as targets::Target), (&alone, targets::policy)] {
+        assert!(target(good));
+        for _ in 0..10_000 {
+            let bad = mutated(good, header(good), &mut rng);
+            // What is accepted has not been changed, whatever the layout of its header.
+            if target(&bad) {
+                let [found, expected] = [&bad, good].map(|bytes| Checkpoint::parse(bytes).unwrap().to_bytes().unwrap());
+                assert_eq!(found.len(), expected.len());
+                let [found, expected] = [&found, &expected].map(|bytes| bytes[header(bytes)..].to_vec());
+                assert!(found == expected, "a changed checkpoint was accepted");
+            }
+        }
+    }
+    assert!(targets::config(&config) && targets::set(b"ppo.gamma=0.9\nenv.model=x.xml"));
+    for _ in 0..10_000 {
+        targets::config(&mutated(&config, config.len(), &mut rng));
+        targets::set(&mutated(
+            b"ppo.learning_rate=1e-4\nppo.hidden=[64, 32]\nenv.success_hold=consecutive",
+            80,
+            &mut rng,
+        ));
+    }
+    let most = memory("VmHWM:");
+    assert!(most < 1024, "{most} MiB");
+}
+
+#[test]
+fn the_seeds_of_the_fuzz_targets_do_no_harm() {
+    let _alone = ALONE.lock().unwrap();
+    for (name, target) in targets::TARGETS {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds").join(name);
+        let seeds: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        assert!(seeds.len() > 3, "{}", folder.display());
+        for seed in seeds {
+            let accepted = target(&fs::read(&seed).unwrap());
+            let good = seed.file_name().unwrap().to_str().unwrap().starts_with("good");
+            assert_eq!(accepted, good, "{}", seed.display());
+        }
+    }
+}
+
+/// The memory after so many rows of logging, less that after a tenth of them, in MiB.
+fn growth(rows: u64) -> i64 {
+    let place = tempfile::tempdir().unwrap();
+    let names: Vec<String> = (0..30).map(|i| format!("group/value_{i}")).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let mut report = Report::open(place.path(), &names, 0, 0, rows);
+    let mut early = 0;
+    for row in 1..=rows {
+        let values: Vec<(&str, f64)> = names.iter().map(|name| (*name, (row as f64).sqrt())).collect();
+        report.iteration(row, &values, &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN });
+        if row % 500 == 0 {
+            report.sync();
+        }
+        if row == rows / 10 {
+            early = memory("VmRSS:");
+        }
+    }
+    report.finish();
+    drop(report);
+    // A resumed session goes through all of it.
+    let resumed = Report::open(place.path(), &names, rows - 1, rows - 1, rows);
+    resumed.finish();
+    let text = fs::metadata(place.path().join("metrics.csv")).unwrap().len();
+    assert!(text > rows * 300, "the rows were written");
+    memory("VmRSS:") as i64 - early as i64
+}
+
+#[test]
+fn the_memory_stays_flat_while_rows_are_logged() {
+    let _alone = ALONE.lock().unwrap();
+    let growth = growth(20_000);
+    assert!(growth < 8, "{growth} MiB");
+}
+
+#[test]
+#[ignore = "a minute: the same with a million rows, as in 12 hours and more"]
+fn the_memory_stays_flat_while_a_million_rows_are_logged() {
+    let _alone = ALONE.lock().unwrap();
+    let growth = growth(1_000_000);
+    assert!(growth < 8, "{growth} MiB");
+}
+
+/// Writes the good seeds; the bad ones are made from them by hand.
+#[test]
+#[ignore = "writes fuzz/seeds/*/good-*, after a change of the format"]
+fn the_good_seeds_are_written() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
+    let whole = a_checkpoint();
+    let config = Config::resolve(None, &[]).unwrap().to_text();
+    fs::write(folder.join("checkpoint/good-whole"), whole.to_bytes().unwrap()).unwrap();
+    fs::write(folder.join("policy/good-alone"), whole.policy_alone().to_bytes().unwrap()).unwrap();
+    fs::write(folder.join("policy/good-whole"), whole.to_bytes().unwrap()).unwrap();
+    fs::write(folder.join("config/good-whole"), config).unwrap();
+}
