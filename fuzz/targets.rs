@@ -2,59 +2,70 @@
 //! abort, or take much memory. The seeds run through the same functions as ordinary tests.
 
 use std::path::Path;
+use std::sync::{Arc, OnceLock};
 
 use shadow_repose::config::{Config, Override, Source};
-use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE};
+use shadow_repose::env::{ACTION_SIZE, EnvPool, EnvState, OBSERVATION_SIZE, Repose, StepBuffers, Task};
 use shadow_repose::load;
 use shadow_repose::ppo::{Ppo, sealed};
 
-/// Tells whether it accepts what it is given.
-pub type Target = fn(&[u8]) -> bool;
+/// Tells whether it accepts what it is given, and whether it does so once the checksum fits, where there is one.
+pub type Target = fn(&[u8]) -> [bool; 2];
 
 /// The targets by their names.
 #[allow(dead_code)]
 pub const TARGETS: [(&str, Target); 4] =
     [("config", config), ("set", set), ("checkpoint", checkpoint), ("policy", policy)];
 
-/// A file of settings; whether it is accepted.
-pub fn config(data: &[u8]) -> bool {
-    let Ok(text) = str::from_utf8(data) else { return false };
+/// A file of settings.
+pub fn config(data: &[u8]) -> [bool; 2] {
+    let Ok(text) = str::from_utf8(data) else { return [false; 2] };
     let source = Source { path: "my.toml".into(), text: text.into() };
-    let Ok(config) = Config::resolve(Some(&source), &[]) else { return false };
+    let Ok(config) = Config::resolve(Some(&source), &[]) else { return [false; 2] };
     let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]);
     assert_eq!(again.expect("what is written can be read"), config);
-    true
+    [true; 2]
 }
 
-/// Lines of `--set`; whether they are accepted.
-pub fn set(data: &[u8]) -> bool {
-    let Ok(text) = str::from_utf8(data) else { return false };
-    let Ok(sets) = text.lines().map(str::parse).collect::<Result<Vec<Override>, _>>() else { return false };
-    Config::resolve(None, &sets).is_ok()
+/// Lines of `--set`.
+pub fn set(data: &[u8]) -> [bool; 2] {
+    let parse = |text: &str| text.lines().map(str::parse).collect::<Result<Vec<Override>, _>>();
+    let sets = str::from_utf8(data).ok().and_then(|text| parse(text).ok());
+    [sets.is_some_and(|sets| Config::resolve(None, &sets).is_ok()); 2]
 }
 
-/// The bytes of a checkpoint, as they are and with a checksum that fits, to resume the learner from; whether it is accepted.
-pub fn checkpoint(data: &[u8]) -> bool {
+/// The bytes of a checkpoint of one environment, to resume from: learner and environment, which then takes a few steps.
+pub fn checkpoint(data: &[u8]) -> [bool; 2] {
+    static TASK: OnceLock<Arc<Task>> = OnceLock::new();
+    let task = TASK.get_or_init(|| Task::new(&Config::resolve(None, &[]).unwrap().env).unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
         let (mut checkpoint, mut config) = load::parse(Path::new("x.safetensors"), bytes, &[])?;
         // What a training needs besides grows with these, and is the user's to allow.
         (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches) = (1, 1, 1);
         let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0)?;
         ppo.restore(&mut checkpoint)?;
-        checkpoint.take_doubles("envs.numbers")?;
-        checkpoint.take_counters("envs.counters")?;
+        let state = EnvState {
+            numbers: checkpoint.take_doubles("envs.numbers")?,
+            counters: checkpoint.take_counters("envs.counters")?,
+        };
         checkpoint.take_counters("scene")?;
-        checkpoint.finish()
+        checkpoint.finish()?;
+        let mut pool = EnvPool::new(0, vec![Repose::new(task)]);
+        let (mut observation, mut last) = ([0.0; OBSERVATION_SIZE], [0.0; OBSERVATION_SIZE]);
+        pool.restore(&state, vec![&mut observation])?;
+        for _ in 0..3 {
+            let (rewards, ends) = (&mut [0.0], &mut [None]);
+            let (observations, final_observations) = (&mut observation[..], &mut last[..]);
+            let buffers = StepBuffers { rewards, ends, observations, final_observations };
+            pool.blocks_mut()[0].step(&[0.0; ACTION_SIZE], buffers)?;
+        }
+        Ok(())
     };
-    let accepted = resume(data).is_ok();
-    if let Ok(sealed) = sealed(data) {
-        let _ = resume(&sealed);
-    }
-    accepted
+    [resume(data).is_ok(), sealed(data).is_ok_and(|data| resume(&data).is_ok())]
 }
 
-/// The bytes of a policy, as they are and with a checksum that fits, to play; whether it is accepted.
-pub fn policy(data: &[u8]) -> bool {
+/// The bytes of a policy, to play.
+pub fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
         let (checkpoint, config) = load::parse(Path::new("x.safetensors"), bytes, &[])?;
         let policy = load::policy(&checkpoint, &config)?;
@@ -62,9 +73,5 @@ pub fn policy(data: &[u8]) -> bool {
         let (mut action, mut work) = ([0.0; ACTION_SIZE], frozen.workspace(1));
         frozen.forward(&[0.5; OBSERVATION_SIZE], [Some(&mut action), None], &mut work)
     };
-    let accepted = play(data).is_ok();
-    if let Ok(sealed) = sealed(data) {
-        let _ = play(&sealed);
-    }
-    accepted
+    [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]
 }

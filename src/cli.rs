@@ -75,7 +75,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
     /// How many of the newest checkpoints to keep
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = TrainArgs::KEEP, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub keep: usize,
     /// Save and exit with 0 after this time, as 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
@@ -83,6 +83,11 @@ pub struct TrainArgs {
     /// Write the last steps of every episode whose physics diverged, for replay
     #[arg(long)]
     pub dump_diverged: bool,
+}
+
+impl TrainArgs {
+    /// How many checkpoints are kept where nothing else is said: the newest, and one in case it is damaged.
+    pub const KEEP: usize = 2;
 }
 
 /// `play`

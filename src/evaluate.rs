@@ -4,14 +4,15 @@
 //! nets always see batches of one shape and the result does not depend on threads or on how many episodes are asked for.
 
 use std::f64::consts::TAU;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
+use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task, panic_message};
 use crate::ppo::{FrozenPolicy, Workspace};
 use crate::rng::{self, Rng};
 
@@ -82,7 +83,7 @@ impl Lane {
 /// of one episode in order, those of different episodes interleaved.
 ///
 /// # Errors
-/// The observer's, and candle's if it cannot allocate.
+/// The observer's; a panic in an episode, with its number; candle's if it cannot allocate.
 pub fn evaluate(
     task: &Arc<Task>,
     actor: &Actor,
@@ -115,8 +116,13 @@ pub fn evaluate(
                 .zip(actions.par_chunks_exact(ACTION_SIZE))
                 .zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE))
                 .zip(&mut ends)
-                .filter(|(((lane, _), _), _)| lane.running)
-                .for_each(|(((lane, action), row), end)| *end = lane.env.step(action, row).end);
+                .enumerate()
+                .filter(|(_, (((lane, _), _), _))| lane.running)
+                .try_for_each(|(i, (((lane, action), row), end))| {
+                    // What a panic leaves half done is not used again.
+                    let stepped = catch_unwind(AssertUnwindSafe(|| *end = lane.env.step(action, row).end));
+                    stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
+                })?;
             for (i, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.running) {
                 let observation = &observations[i * OBSERVATION_SIZE..][..OBSERVATION_SIZE];
                 let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];

@@ -36,9 +36,9 @@ pub fn parse(path: &Path, bytes: &[u8], overrides: &[Override]) -> Result<(Check
     let named = overrides.iter().any(|set| set.key == MODEL);
     match config.env.model_file() {
         Some(model) if !named => {
-            let model = model.display();
+            let set = run::quoted(&format!("{MODEL}={}", model.display()));
             bail!(
-                "it comes from the scene {model}; no path in a file is followed: say --set {MODEL}={model} if you want that one"
+                "it was made in a scene of its own, and no path in a file is followed: say --set {set} if you want that one"
             )
         }
         _ => Ok((checkpoint, config)),

@@ -48,7 +48,7 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     let checkpoint = loaded.as_ref().map(|loaded| loaded.path.display().to_string());
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
-    let mut requests = Requests::default();
+    let mut requests = Requests::none();
     let mut trace = output.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
     let played = match &args.video {
         Some(path) => {

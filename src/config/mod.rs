@@ -313,7 +313,7 @@ mod tests {
             ("env.num_envs=0", "must be at least 1"),
             ("env.num_envs=1.5", "must be a whole number, not negative"),
             ("ppo.hidden=3", "must be an array"),
-            ("ppo.hidden=[]", "must hold one or more sizes"),
+            ("ppo.hidden=[]", "must hold one to 64 sizes"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
             ("env.goal_position=[1,2]", "goal_position"),

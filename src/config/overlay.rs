@@ -34,9 +34,15 @@ fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     }
 }
 
+/// Whoever has so many is helped by the first of them.
+const MOST_PROBLEMS: usize = 20;
+
 /// Lays `table` over `merged`, whose keys and types are those of `base`; what does not fit is left out and reported.
 pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
     for (key, value) in table {
+        if problems.len() >= MOST_PROBLEMS {
+            return;
+        }
         let name = format!("{prefix}{key}");
         match (base.get(key), value) {
             (None, _) => problems.push(unknown(&name)),
@@ -78,7 +84,14 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     }
 }
 
+/// Names longer than this are not compared with ours: it would take the square of their length.
+const LONGEST_NAME: usize = 64;
+
 fn unknown(name: &str) -> String {
+    if name.len() > LONGEST_NAME {
+        let start: String = name.chars().take(LONGEST_NAME).collect();
+        return format!("{start}…: unknown key; configs/repose.toml lists all of them");
+    }
     let base: Table = BASE.parse().expect("the built-in configuration is TOML");
     let mut known = Vec::new();
     for (section, keys) in &base {

@@ -47,8 +47,8 @@ impl Config {
         rules.at_least("ppo.horizon", ppo.horizon, 1);
         rules.at_least("ppo.epochs", ppo.epochs, 1);
         let samples = env.num_envs.saturating_mul(ppo.horizon);
-        let rule = "be at most 2^24 samples together with env.num_envs";
-        rules.check(samples <= 1 << 24, "ppo.horizon", ppo.horizon, rule);
+        let rule = "be at most 2^22 samples together with env.num_envs";
+        rules.check(samples <= 1 << 22, "ppo.horizon", ppo.horizon, rule);
         rules.check(
             ppo.minibatches >= 1 && samples.is_multiple_of(ppo.minibatches),
             "ppo.minibatches",
@@ -61,12 +61,11 @@ impl Config {
             toml::Value::try_from(ppo.precision).expect("a word"),
             "be \"f32\" with ppo.backend = \"candle\"",
         );
-        let sizes_fit = !ppo.hidden.is_empty() && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
-        let hidden = format!("{:?}", ppo.hidden);
-        rules.check(sizes_fit, "ppo.hidden", hidden, "hold one or more sizes from 1 to 16384");
+        let sizes_fit = (1..=64).contains(&ppo.hidden.len()) && ppo.hidden.iter().all(|h| (1..=16384).contains(h));
+        let hidden = format!("{:?}", &ppo.hidden[..ppo.hidden.len().min(65)]);
+        rules.check(sizes_fit, "ppo.hidden", &hidden, "hold one to 64 sizes from 1 to 16384");
         let weights =
             ppo.hidden.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
-        let hidden = format!("{:?}", ppo.hidden);
         rules.check(weights <= 1 << 25, "ppo.hidden", hidden, "have at most 2^25 weights between them");
         rules.positive("ppo.learning_rate", ppo.learning_rate);
         let [low, high] = ppo.learning_rate_range;

@@ -47,7 +47,7 @@ impl EpisodeStats {
     }
 }
 
-/// Sums since they were last taken, across episodes.
+/// Sums since they were last taken, across episodes; taken before a state is saved, and no part of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Recent {
     /// Control steps.
@@ -56,23 +56,6 @@ pub struct Recent {
     pub reward: RewardTerms,
     /// Steps on which the physics diverged.
     pub diverged: u64,
-}
-
-impl Recent {
-    /// How many numbers it saves.
-    pub(super) const NUMBERS: usize = 5;
-
-    pub(super) fn save(&self, state: &mut EnvState) {
-        state.numbers.extend(self.reward.values());
-        state.counters.extend([self.steps, self.diverged]);
-    }
-
-    pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
-        let reward = RewardTerms::from(state.numbers()?);
-        let [steps, diverged] = state.counters()?;
-        ensure!(diverged <= steps && steps < 1 << 60, "{diverged} of {steps} steps diverged");
-        Ok(Self { steps, reward, diverged })
-    }
 }
 
 impl std::ops::AddAssign for Recent {

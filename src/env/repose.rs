@@ -224,6 +224,8 @@ impl Repose {
             self.held = 0;
             self.episode.goals += 1;
             self.set_goal();
+            // In a scene where the target is more than a picture: nothing may be left of where it was.
+            self.sim.refresh();
         }
     }
 
@@ -380,13 +382,16 @@ impl Resumable for Repose {
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
         self.episode.save(state);
-        self.recent.save(state);
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
-        self.sim.restore(state.numbers_but::<{ 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS + Recent::NUMBERS }>()?)?;
+        self.sim.restore(state.numbers_but::<{ 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS }>()?)?;
         self.goal = state.numbers()?;
+        let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
+        ensure!((length - 1.0).abs() < 1e-6, "a goal that is no orientation: {:?}", self.goal);
         self.previous_action = state.numbers()?.map(|x| x as f32);
+        let clipped = self.previous_action.iter().all(|action| (-1.0..=1.0).contains(action));
+        ensure!(clipped, "a last action beyond [-1, 1]: {:?}", self.previous_action);
         self.targets = state.numbers()?;
         self.rng = rng::at(state.counters()?);
         let [age, held] = state.counters()?;
@@ -396,7 +401,7 @@ impl Resumable for Repose {
         ensure!(possible, "an episode at step {age} that has held its goal for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
         self.episode = EpisodeStats::saved(state)?;
-        self.recent = Recent::saved(state)?;
+        self.recent = Recent::default();
         self.last = StepDetails::default();
         self.recorder.clear();
         self.observe(observation);

@@ -16,6 +16,9 @@ use crate::config::PpoConfig;
 /// The text `format` of a file.
 const FORMAT: &str = "shadow-repose checkpoint 2";
 
+/// Ours takes a thousand bytes.
+const LONGEST_CONFIG: usize = 1 << 16;
+
 /// Of what a policy alone does without, the part that every learner has.
 const LEARNING_RATE: &str = "learning_rate";
 
@@ -52,6 +55,11 @@ impl Checkpoint {
         let format = text("format")?;
         ensure!(format == FORMAT, "its format is `{format}`, this program reads `{FORMAT}`");
         let config = text("config")?;
+        ensure!(
+            config.len() <= LONGEST_CONFIG,
+            "its configuration has {} bytes, at most {LONGEST_CONFIG} are read",
+            config.len()
+        );
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata hold an unknown `{key}`");
@@ -139,9 +147,14 @@ impl Checkpoint {
     /// A tensor that is missing, or of another shape.
     pub fn expect_policy(&self, config: &PpoConfig, observation_size: usize, action_size: usize) -> Result<()> {
         for (name, shape) in parameter_shapes(config, observation_size, action_size) {
-            let found = self.shape(&name).with_context(|| format!("tensor `{name}` is missing"))?;
-            ensure!(found == shape, "tensor `{name}` has the shape {found:?}, expected {shape:?}");
+            self.expect(&name, &shape)?;
         }
+        Ok(())
+    }
+
+    fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
+        let found = self.shape(name).with_context(|| format!("tensor `{name}` is missing"))?;
+        ensure!(found == shape, "tensor `{name}` has the shape {found:?}, expected {shape:?}");
         Ok(())
     }
 
@@ -156,8 +169,12 @@ impl Checkpoint {
             variance: self.take_vector("normalizer.variance", size)?,
             count,
         };
-        let sound = count >= 0.0 && policy.normalizer.variance.iter().all(|&v| v >= 0.0);
-        ensure!(sound, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
+        let Normalizer { mean, variance, .. } = &policy.normalizer;
+        let small = |x: f64| x.abs() < 1e18;
+        let sound = small(count) && mean.iter().chain(variance).copied().all(small);
+        ensure!(sound, "a tensor `normalizer.…` has a value that no observations have");
+        let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
+        ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
         Ok(())
     }
 
@@ -233,11 +250,10 @@ impl Ppo {
         checkpoint.take_policy(&mut self.policy)?;
         let mut tensors = Vec::new();
         for (name, var) in self.policy.parameters() {
-            let mut moment = |kind: &str| {
+            let mut moment = |kind: &str| -> Result<(String, Tensor)> {
                 let name = format!("adam.{kind}.{name}");
+                checkpoint.expect(&name, var.dims())?;
                 let moment = checkpoint.take_tensor(&name)?;
-                let (found, expected) = (moment.dims(), var.dims());
-                ensure!(found == expected, "tensor `{name}` has the shape {found:?}, expected {expected:?}");
                 Ok((name, moment))
             };
             let (_, mean) = moment("mean")?;
@@ -246,7 +262,8 @@ impl Ppo {
             tensors.push([mean, square]);
         }
         let steps = checkpoint.take_counters("adam.steps")?;
-        ensure!(steps.len() == 1 && steps[0] < 1 << 60, "tensor `adam.steps` is no number of steps");
+        // The kernels count them in 32 bits: 10¹³ environment steps of the default training.
+        ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is no number of steps");
         let learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
         ensure!(learning_rate > 0.0, "its learning rate is {learning_rate}");
         self.backend.restore(Moments { tensors, steps: steps[0] })?;

@@ -12,7 +12,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 const CHECKSUM: &str = "checksum";
 
 /// A header of ours takes a few KiB; the limit keeps a foreign one from filling the memory.
-const LARGEST_HEADER: u64 = 1 << 22;
+const LARGEST_HEADER: u64 = 1 << 20;
 
 /// An array of any shape, by rows.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,7 +47,7 @@ impl Content {
         }
         let mut views = Vec::new();
         for (name, bytes, array) in &parts {
-            views.push((name.as_str(), TensorView::new(array.dtype(), array.shape().to_vec(), bytes)?));
+            views.push((name.to_string(), TensorView::new(array.dtype(), array.shape().to_vec(), bytes)?));
         }
         let mut texts: HashMap<String, String> = self.texts.clone().into_iter().collect();
         texts.insert(CHECKSUM.into(), checksum(&texts, &views));
@@ -59,30 +59,37 @@ impl Content {
     /// # Errors
     /// Bytes that were not written by [`Content::to_bytes`] or have been changed since.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
-        let whole = |error| anyhow!("not a whole safetensors file ({error}); it may be cut off");
-        if let Some((length, _)) = bytes.split_first_chunk() {
-            let length = u64::from_le_bytes(*length);
-            ensure!(
-                length <= LARGEST_HEADER,
-                "not a file of this program: its header would have {length} bytes, at most {LARGEST_HEADER} are read"
-            );
-        }
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
-        let mut texts = header.metadata().clone().context("no metadata: not a file of this program")?;
-        let file = SafeTensors::deserialize(bytes).map_err(whole)?;
-        let mut views = file.tensors();
-        views.sort_by(|(a, _), (b, _)| a.cmp(b));
-        let views: Vec<(&str, TensorView)> = views.iter().map(|(name, view)| (name.as_str(), view.clone())).collect();
+        let (mut texts, views) = read(bytes)?;
         let stored =
             texts.remove(CHECKSUM).context("no checksum: not a file of this program, or of an older version")?;
         let found = checksum(&texts, &views);
         ensure!(stored == found, "damaged: its checksum is {found}, it should be {stored}");
         let mut arrays = BTreeMap::new();
         for (name, view) in views {
-            arrays.insert(name.to_owned(), Array::read(&view).with_context(|| format!("tensor `{name}`"))?);
+            let array = Array::read(&view).with_context(|| format!("tensor `{name}`"))?;
+            arrays.insert(name, array);
         }
         Ok(Self { texts: texts.into_iter().collect(), arrays })
     }
+}
+
+/// The texts of a file, and its arrays in the order of their names.
+type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
+
+fn read(bytes: &[u8]) -> Result<Raw<'_>> {
+    let whole = |error| anyhow!("not a whole safetensors file ({error}); it may be cut off");
+    if let Some(length) = bytes.first_chunk() {
+        let length = u64::from_le_bytes(*length);
+        ensure!(
+            length <= LARGEST_HEADER,
+            "not a file of this program: its header would have {length} bytes, at most {LARGEST_HEADER} are read"
+        );
+    }
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
+    let texts = header.metadata().clone().context("no metadata: not a file of this program")?;
+    let mut views = SafeTensors::deserialize(bytes).map_err(whole)?.tensors();
+    views.sort_by(|(a, _), (b, _)| a.cmp(b));
+    Ok((texts, views))
 }
 
 /// The file with these bytes, with the checksum that fits what is in it now: for tests of what lies behind the checksum.
@@ -90,20 +97,14 @@ impl Content {
 /// # Errors
 /// Bytes that are no whole safetensors file.
 pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
-    ensure!(bytes.first_chunk().is_some_and(|length| u64::from_le_bytes(*length) <= LARGEST_HEADER), "no header");
-    let (_, header) = SafeTensors::read_metadata(bytes)?;
-    let mut texts = header.metadata().clone().unwrap_or_default();
+    let (mut texts, views) = read(bytes)?;
     texts.remove(CHECKSUM);
-    let file = SafeTensors::deserialize(bytes)?;
-    let mut views = file.tensors();
-    views.sort_by(|(a, _), (b, _)| a.cmp(b));
-    let views: Vec<(&str, TensorView)> = views.iter().map(|(name, view)| (name.as_str(), view.clone())).collect();
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
     Ok(safetensors::serialize(views, Some(texts))?)
 }
 
 /// The CRC-32 of all names, texts, types, shapes and numbers: it does not depend on how the header is laid out.
-fn checksum(texts: &HashMap<String, String>, views: &[(&str, TensorView)]) -> String {
+fn checksum(texts: &HashMap<String, String>, views: &[(String, TensorView)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |part: &[u8]| {
         hasher.update(&(part.len() as u64).to_le_bytes());

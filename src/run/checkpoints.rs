@@ -1,15 +1,17 @@
 //! The checkpoints of a run: each there whole or not at all, the newest few kept, and `latest` another name of the newest.
 
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-use super::file::{PARTIAL, name_also, write_whole};
+use super::file::{name_also, same_file, sync_folder, write_whole};
 
 const LATEST: &str = "latest.safetensors";
 const BEST: &str = "best.safetensors";
+
+/// How the name of a checkpoint ends that has been put aside.
+const LATER: &str = "later";
 
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
@@ -50,11 +52,16 @@ impl Checkpoints {
         let path = self.of_iteration(iteration);
         write_whole(&path, bytes)?;
         name_also(&path, &self.latest())?;
-        // Later ones are of a course that was given up when an earlier checkpoint was resumed from.
+        // Later ones are there when an earlier one was resumed from. They must not be gone on from any more, as the logs go on
+        // from here; but whoever has named the wrong file can still have them back.
         let (later, earlier): (Vec<_>, Vec<_>) = self.numbered().into_iter().partition(|(of, _)| *of > iteration);
-        for (_, path) in later.into_iter().chain(earlier.into_iter().skip(keep)) {
+        for (_, path) in earlier.into_iter().skip(keep) {
             // One too many does no harm.
             let _ = fs::remove_file(path);
+        }
+        for (_, path) in later {
+            let aside = path.with_extension(LATER);
+            fs::rename(&path, &aside).with_context(|| format!("cannot rename {}", path.display()))?;
         }
         Ok(())
     }
@@ -69,13 +76,17 @@ impl Checkpoints {
     }
 
     pub(super) fn create_folder(&self) -> Result<()> {
-        fs::create_dir_all(&self.folder).with_context(|| format!("cannot create {}", self.folder.display()))
+        let created = fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder));
+        created.with_context(|| format!("cannot create {}", self.folder.display()))
     }
 
-    /// All that may be gone on from, the newest first: the latest, then those of iterations.
+    /// All that may be gone on from, the newest first. `latest` is one of the others under a second name, and one that is older
+    /// than the newest if the program ended just between naming the two; where it is a file of its own, it is the newest.
     pub fn newest_first(&self) -> Vec<PathBuf> {
-        let latest = [self.latest()].into_iter().filter(|path| path.exists());
-        latest.chain(self.numbered().into_iter().map(|(_, path)| path)).collect()
+        let numbered: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
+        let latest = self.latest();
+        let alone = latest.exists() && !numbered.iter().any(|path| same_file(path, &latest));
+        alone.then_some(latest).into_iter().chain(numbered).collect()
     }
 
     /// Those of iterations, the newest first.
@@ -93,24 +104,7 @@ impl Checkpoints {
 
     /// Whether a run has been here.
     pub(super) fn begun(&self) -> bool {
-        fs::read_dir(&self.folder).is_ok_and(|mut entries| entries.next().is_some())
-    }
-
-    /// Removes what a crash in the middle of writing left.
-    ///
-    /// # Errors
-    /// A place that cannot be written to.
-    pub(super) fn clean(&self) -> Result<()> {
-        for entry in fs::read_dir(&self.folder).into_iter().flatten().flatten() {
-            let path = entry.path();
-            if path.extension().is_some_and(|extension| extension == PARTIAL) {
-                match fs::remove_file(&path) {
-                    Err(error) if error.kind() == ErrorKind::NotFound => {}
-                    result => result.with_context(|| format!("cannot remove {}", path.display()))?,
-                }
-            }
-        }
-        Ok(())
+        self.best().exists() || !self.newest_first().is_empty()
     }
 }
 
@@ -141,18 +135,27 @@ mod tests {
             (kept.map(String::from).into(), b"again".into())
         );
         let newest: Vec<PathBuf> = checkpoints.newest_first();
-        assert!(newest[0].ends_with("latest.safetensors") && newest[2].ends_with(kept[0]), "{newest:?}");
+        assert!(newest.len() == 2 && newest[0].ends_with(kept[1]) && newest[1].ends_with(kept[0]), "{newest:?}");
+        // A crash just before the new one is called the latest.
+        fs::write(checkpoints.of_iteration(80), "newer").unwrap();
+        assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(80));
+        // A copy, as of a folder that was moved to where there are no second names.
+        fs::remove_file(checkpoints.latest()).unwrap();
+        fs::write(checkpoints.latest(), "copy").unwrap();
+        assert_eq!(checkpoints.newest_first()[0], checkpoints.latest());
     }
 
     #[test]
-    fn those_of_a_course_that_was_given_up_are_removed() {
+    fn later_ones_are_put_aside_when_an_earlier_one_is_gone_on_from() {
         let place = tempfile::tempdir().unwrap();
         let checkpoints = Checkpoints::of(place.path());
         for iteration in [20, 40, 60, 30] {
             checkpoints.write(iteration, b"", 3).unwrap();
         }
-        assert_eq!(names(&checkpoints)[..2], ["iteration-00000020.safetensors", "iteration-00000030.safetensors"]);
-        assert_eq!(names(&checkpoints).len(), 3);
+        let expected =
+            ["20.safetensors", "30.safetensors", "40.later", "60.later"].map(|name| format!("iteration-000000{name}"));
+        assert_eq!(names(&checkpoints)[..4], expected);
+        assert_eq!(checkpoints.newest_first().len(), 2);
     }
 
     #[test]

@@ -11,6 +11,8 @@ use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
 use tensorboard_proto::summary::{Summary, Summary_Value};
 use tensorboard_rs::record_writer::RecordWriter;
 
+use super::file::{expect_named, sync_folder};
+
 /// How the names of event files begin and end.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
 
@@ -33,7 +35,8 @@ impl EventFile {
     /// A file that cannot be written.
     pub fn create(folder: &Path, first_step: u64) -> Result<Self> {
         let [begin, end] = NAME;
-        let mut seconds = now() as u64;
+        // Readers take the files in the order of their names, and clocks are not to be relied on.
+        let mut seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
         let (path, file) = loop {
             let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
             match File::create_new(&path) {
@@ -43,15 +46,24 @@ impl EventFile {
         };
         let writer = RecordWriter::new(BufWriter::new(file.try_clone()?));
         let mut events = Self { path, file, writer };
+        match events.begin(first_step).and_then(|()| Ok(sync_folder(&events.path)?)) {
+            Ok(()) => Ok(events),
+            Err(error) => {
+                let _ = fs::remove_file(&events.path);
+                Err(error)
+            }
+        }
+    }
+
+    fn begin(&mut self, first_step: u64) -> Result<()> {
         let mut version = Event::new();
         version.set_file_version("brain.Event:2".into());
-        events.write(version, 0)?;
+        self.write(version, 0)?;
         let mut start = Event::new();
         let mut session = SessionLog::new();
         session.set_status(SessionLog_SessionStatus::START);
         start.set_session_log(session);
-        events.write(start, first_step)?;
-        Ok(events)
+        self.write(start, first_step)
     }
 
     /// Adds the values of one step and flushes; values that are `NaN` are left out.
@@ -84,8 +96,8 @@ impl EventFile {
     /// # Errors
     /// A file that cannot be written, or was deleted.
     pub fn sync(&self) -> Result<()> {
-        let synced = fs::metadata(&self.path).and_then(|_| self.file.sync_data());
-        synced.with_context(|| format!("cannot write {}", self.path.display()))
+        expect_named(&self.path, &self.file)?;
+        self.file.sync_data().with_context(|| format!("cannot write {}", self.path.display()))
     }
 }
 
@@ -95,20 +107,29 @@ impl EventFile {
 /// # Errors
 /// A file that cannot be read or written.
 pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
-    let [begin, end] = NAME;
-    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
-    for entry in entries.flatten() {
-        if entry.file_name().to_str().is_some_and(|name| name.starts_with(begin) && name.ends_with(end)) {
-            let path = entry.path();
-            let cut = || {
-                let file = OpenOptions::new().read(true).write(true).open(&path)?;
-                let kept = length_up_to(&file, last_step)?;
-                if kept < file.metadata()?.len() { file.set_len(kept) } else { Ok(()) }
-            };
-            cut().with_context(|| format!("cannot shorten {}", path.display()))?;
-        }
+    for (_, path) in event_files(folder)? {
+        let cut = || {
+            let file = OpenOptions::new().read(true).write(true).open(&path)?;
+            let kept = length_up_to(&file, last_step)?;
+            if kept < file.metadata()?.len() { file.set_len(kept) } else { Ok(()) }
+        };
+        cut().with_context(|| format!("cannot shorten {}", path.display()))?;
     }
     Ok(())
+}
+
+/// Our event files in `folder`, with the second in their names.
+fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
+    let [begin, end] = NAME;
+    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+    let ours = entries.flatten().filter_map(|entry| {
+        let name = entry.file_name();
+        let (seconds, _) = name.to_str()?.strip_prefix(begin)?.strip_suffix(end)?.split_once('.')?;
+        // Far from the end of all numbers.
+        let seconds = seconds.parse().ok().filter(|&seconds: &u64| seconds < 1 << 40)?;
+        Some((seconds, entry.path()))
+    });
+    Ok(ours.collect())
 }
 
 /// The bytes of the whole events up to `last_step`; steps do not go back within a file.

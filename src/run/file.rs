@@ -1,7 +1,8 @@
 //! Files that are read whole, and written whole or not at all.
 
 use std::fs::{self, File};
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -10,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 pub const PARTIAL: &str = "partial";
 
 /// A text of settings takes a few KiB.
-const LARGEST_TEXT: u64 = 1 << 22;
+const LARGEST_TEXT: u64 = 1 << 20;
 
 /// The largest policy that the settings allow, its optimizer, and 65536 hands take less.
 const LARGEST_BYTES: u64 = 1 << 30;
@@ -38,7 +39,9 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
     let size = facts.len();
     ensure!(size <= LARGEST_BYTES, "{}: {size} bytes are more than any file of this program has", path.display());
-    fs::read(path).with_context(context)
+    let mut bytes = Vec::with_capacity(size as usize);
+    File::open(path).and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes)).with_context(context)?;
+    Ok(bytes)
 }
 
 /// Gives a file another name as well, in place of whatever has it. Where the file system knows no second names, it is a copy.
@@ -56,6 +59,23 @@ pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     named.with_context(|| format!("cannot write {}", name.display()))
 }
 
+/// Makes sure that `path` still names this open file: it may have been deleted, or replaced by another.
+///
+/// # Errors
+/// It does not.
+pub fn expect_named(path: &Path, file: &File) -> Result<()> {
+    let context = || format!("cannot find {}", path.display());
+    let [named, held] = [fs::metadata(path).with_context(context)?, file.metadata().with_context(context)?];
+    let same = (named.dev(), named.ino()) == (held.dev(), held.ino());
+    ensure!(same, "{} has been replaced", path.display());
+    Ok(())
+}
+
+/// Whether two names are of one file.
+pub fn same_file(a: &Path, b: &Path) -> bool {
+    File::open(a).is_ok_and(|file| expect_named(b, &file).is_ok())
+}
+
 fn partial(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".");
@@ -63,10 +83,17 @@ fn partial(path: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// A new name in a folder is on the disk once the folder is.
-fn sync_folder(path: &Path) -> io::Result<()> {
+/// Brings the name of a new file onto the disk: it is there once its folder is.
+///
+/// # Errors
+/// A folder that cannot be read, or a disk that fails.
+pub fn sync_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    File::open(folder)?.sync_all()
+    match File::open(folder)?.sync_all() {
+        // Some network file systems cannot do this to folders, and do not need it.
+        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        result => result,
+    }
 }
 
 /// Writes a file so that whoever looks finds the whole old one or the whole new one.
@@ -94,7 +121,14 @@ impl OutputFile {
     pub fn create(path: &Path) -> Result<Self> {
         let special = fs::metadata(path).is_ok_and(|facts| !facts.is_file());
         let partial = (!special).then(|| partial(path));
-        let file = File::create(partial.as_deref().unwrap_or(path));
+        let file = match &partial {
+            Some(partial) => {
+                // Of an earlier attempt; or a link that somebody laid, which is not to be written through.
+                let _ = fs::remove_file(partial);
+                File::create_new(partial)
+            }
+            None => File::create(path),
+        };
         let file = file.with_context(|| format!("cannot write {}", path.display()))?;
         Ok(Self { path: path.to_owned(), partial, file })
     }

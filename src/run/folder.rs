@@ -8,7 +8,7 @@ use std::time::SystemTime;
 use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::Checkpoints;
-use super::file::write_whole;
+use super::file::{PARTIAL, expect_named, read_text, sync_folder, write_whole};
 
 /// Where runs go when nothing else is said.
 const RUNS: &str = "runs/shadow-hand-repose";
@@ -17,6 +17,7 @@ const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
 const LOCK: &str = "run.lock";
+const DIVERGED: &str = "diverged";
 /// Files in the folder `diverged`; whoever has so many needs no more to find the cause, but may need the disk.
 const MOST_DUMPS: usize = 1000;
 pub(super) const METRICS: &str = "metrics.csv";
@@ -30,7 +31,15 @@ pub struct RunFolder {
 /// A run folder that no other training uses. The system gives it free when the program ends, however it ends.
 #[derive(Debug)]
 pub struct Locked {
-    _file: File,
+    path: PathBuf,
+    file: File,
+}
+
+impl Locked {
+    /// Whether the folder still has this lock: it may have been deleted and made anew.
+    pub fn holds(&self) -> bool {
+        expect_named(&self.path, &self.file).is_ok()
+    }
 }
 
 impl RunFolder {
@@ -45,7 +54,8 @@ impl RunFolder {
         };
         let run = Self { path };
         run.expect_empty()?;
-        run.checkpoints().create_folder().context("cannot create the run folder")?;
+        let created = run.checkpoints().create_folder().and_then(|()| Ok(sync_folder(&run.path)?));
+        created.with_context(|| format!("cannot create the run folder {}", run.path.display()))?;
         let lock = run.lock()?;
         // Another training may have begun and ended meanwhile.
         run.expect_empty()?;
@@ -62,7 +72,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// A run folder among the temporary files, where its own cannot be written to.
+    /// A new run folder among the temporary files, where its own cannot be written to.
     ///
     /// # Errors
     /// A place that cannot be written to.
@@ -78,6 +88,11 @@ impl RunFolder {
             }
         }
         bail!("{} is full of folders of this program", std::env::temp_dir().display())
+    }
+
+    /// Removes a folder in which nothing could be saved.
+    pub fn remove(self) {
+        let _ = fs::remove_dir_all(self.path);
     }
 
     /// The folder of an existing run that `place` is, or that the checkpoint `place` lies in.
@@ -104,6 +119,7 @@ impl RunFolder {
     /// # Errors
     /// Another training uses it, or it cannot be written to.
     pub fn lock(&self) -> Result<Locked> {
+        self.expect_plain()?;
         let path = self.path.join(LOCK);
         let context = || format!("cannot write {}", path.display());
         let mut file =
@@ -119,13 +135,42 @@ impl RunFolder {
             Err(TryLockError::Error(_)) => {}
         }
         file.set_len(0).and_then(|()| write!(file, ": process {}", std::process::id())).with_context(context)?;
-        self.checkpoints().clean()?;
-        Ok(Locked { _file: file })
+        self.clean()?;
+        Ok(Locked { path, file })
     }
 
-    /// Whether there is a lock; also of a training that has ended.
-    pub fn has_lock(&self) -> bool {
-        self.path.join(LOCK).exists()
+    /// Removes what a crash in the middle of writing left.
+    fn clean(&self) -> Result<()> {
+        for folder in self.folders() {
+            for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+                let path = entry.path();
+                if path.extension().is_some_and(|extension| extension == PARTIAL) {
+                    fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn folders(&self) -> [PathBuf; 3] {
+        [self.path.clone(), self.checkpoints().folder().to_owned(), self.path.join(DIVERGED)]
+    }
+
+    /// Makes sure that nothing in the folder leads out of it: it may come from somebody else, and will be written into.
+    fn expect_plain(&self) -> Result<()> {
+        for folder in self.folders().iter().filter(|folder| folder.exists()) {
+            let context = || format!("cannot read {}", folder.display());
+            for entry in fs::read_dir(folder).with_context(context)? {
+                let entry = entry.with_context(context)?;
+                let kind = entry.file_type().with_context(context)?;
+                ensure!(
+                    kind.is_file() || kind.is_dir(),
+                    "{}: neither a file nor a folder; no link in a run folder is followed",
+                    entry.path().display()
+                );
+            }
+        }
+        Ok(())
     }
 
     /// Where it is.
@@ -148,7 +193,7 @@ impl RunFolder {
     /// # Errors
     /// A folder that cannot be written to.
     pub fn dump(&self, name: &str, text: &str) -> Result<()> {
-        let folder = self.path.join("diverged");
+        let folder = self.path.join(DIVERGED);
         fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
         if fs::read_dir(&folder).is_ok_and(|entries| entries.count() >= MOST_DUMPS) {
             return Ok(());
@@ -164,7 +209,7 @@ impl RunFolder {
         fs::create_dir_all(&self.path).with_context(|| format!("cannot create {}", self.path.display()))?;
         for (name, text) in [(CONFIG, config), (VERSION, version)] {
             let path = self.path.join(name);
-            if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
+            if read_text(&path).ok().as_deref() != Some(text) {
                 write_whole(&path, text.as_bytes())?;
             }
         }
@@ -251,6 +296,25 @@ mod tests {
         assert!(refusal.contains(&format!("another program: process {}", std::process::id())), "{refusal}");
         drop(first);
         run.lock().unwrap();
+    }
+
+    #[test]
+    fn no_link_in_a_run_folder_is_followed() {
+        let place = tempfile::tempdir().unwrap();
+        let victim = place.path().join("victim");
+        fs::write(&victim, "precious").unwrap();
+        for name in ["run.lock", "metrics.csv", "events.out.tfevents.1.2.shadow-repose", "checkpoints/x.partial"] {
+            let run = RunFolder { path: place.path().join("run") };
+            run.checkpoints().create_folder().unwrap();
+            std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
+            let refusal = run.lock().unwrap_err().to_string();
+            assert!(refusal.contains(name) && refusal.contains("no link"), "{refusal}");
+            fs::remove_dir_all(&run.path).unwrap();
+        }
+        // One that is laid later is replaced, not written through.
+        std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
+        RunFolder { path: place.path().into() }.describe("a = 1", "1").unwrap();
+        assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
     }
 
     #[test]

@@ -1,44 +1,70 @@
-//! Signals and the time limit: what asks the program to save and stop, or to save and go on. The second that asks to stop ends
-//! it at once.
+//! Signals and the time limit: what asks the program to save and stop, or to save and go on. Whoever asks twice to stop ends it
+//! at once.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1};
-use signal_hook::flag;
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::exit;
+
+/// A terminal that is closed sends SIGHUP twice, and some schedulers send SIGTERM and SIGHUP: within this time they are one
+/// request.
+const ONE_REQUEST: Duration = Duration::from_secs(1);
 
 /// What has been asked for since the program began to listen.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Requests {
+    since: Instant,
     stop: Arc<AtomicBool>,
     /// Which signal asked to stop, or 0.
-    signal: Arc<AtomicUsize>,
+    signal: Arc<AtomicI32>,
     save: Arc<AtomicBool>,
 }
 
 impl Requests {
+    /// What nobody can ask anything of.
+    pub fn none() -> Self {
+        Self { since: Instant::now(), stop: Arc::default(), signal: Arc::default(), save: Arc::default() }
+    }
+
     /// Catches SIGINT, SIGTERM, SIGHUP (unless it is ignored, as under `nohup`) and SIGUSR1 from now on.
     ///
     /// # Errors
-    /// A handler that the system refuses.
+    /// A handler or a thread that the system refuses.
     pub fn listen() -> Result<Self> {
-        let requests = Self::default();
-        let signalled = Arc::new(AtomicBool::new(false));
-        for signal in [SIGINT, SIGTERM, SIGHUP] {
-            if signal == SIGHUP && hangup_is_ignored() {
+        let requests = Self::none();
+        let caught: &[i32] = match hangup_is_ignored() {
+            true => &[SIGINT, SIGTERM, SIGUSR1],
+            false => &[SIGINT, SIGTERM, SIGUSR1, SIGHUP],
+        };
+        let mut signals = Signals::new(caught).context("cannot catch signals")?;
+        let shared = requests.clone();
+        let listener = thread::Builder::new().name("signals".into());
+        listener.spawn(move || shared.take(&mut signals)).context("cannot start a thread for signals")?;
+        Ok(requests)
+    }
+
+    fn take(&self, signals: &mut Signals) {
+        let mut first: Option<Instant> = None;
+        for signal in signals.forever() {
+            if signal == SIGUSR1 {
+                self.save.store(true, Ordering::Relaxed);
                 continue;
             }
-            // In this order: the first signal finds its flag unset, passes by, and sets it.
-            flag::register_conditional_shutdown(signal, 128 + signal, signalled.clone())
-                .and_then(|_| flag::register(signal, signalled.clone()))
-                .and_then(|_| flag::register_usize(signal, requests.signal.clone(), signal as usize))
-                .and_then(|_| flag::register(signal, requests.stop.clone()))
-                .context("cannot catch signals")?;
+            match first {
+                Some(first) if signal == SIGINT || first.elapsed() > ONE_REQUEST => exit(128 + signal),
+                Some(_) => {}
+                None => {
+                    first = Some(Instant::now());
+                    self.signal.store(signal, Ordering::Relaxed);
+                    self.stop.store(true, Ordering::Relaxed);
+                }
+            }
         }
-        flag::register(SIGUSR1, requests.save.clone()).context("cannot catch signals")?;
-        Ok(requests)
     }
 
     /// Set when the program was asked to stop.
@@ -54,13 +80,17 @@ impl Requests {
         }
     }
 
-    /// Asks to stop when this time has passed.
-    pub fn stop_after(&self, limit: Duration) {
-        let stop = self.stop.clone();
-        std::thread::spawn(move || {
-            std::thread::sleep(limit);
+    /// Asks to stop when the program has listened for this time.
+    ///
+    /// # Errors
+    /// A thread that the system refuses.
+    pub fn stop_after(&self, limit: Duration) -> Result<()> {
+        let (stop, left) = (self.stop.clone(), limit.saturating_sub(self.since.elapsed()));
+        let clock = thread::Builder::new().name("time limit".into()).spawn(move || {
+            thread::sleep(left);
             stop.store(true, Ordering::Relaxed);
         });
+        clock.map(drop).context("cannot start a thread for the time limit")
     }
 
     /// Whether it was asked to save since the last call.

@@ -3,10 +3,15 @@
 //! What lies behind the checkpoint that is gone on from is cut off, so rows are neither missing nor there twice.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{BufRead, BufReader, ErrorKind, Seek, SeekFrom, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+
+use super::file::{expect_named, sync_folder};
+
+/// No row of ours is longer; the rest of a longer one is not a row either.
+const LONGEST_ROW: u64 = 1 << 20;
 
 /// The table while it is written.
 pub struct Metrics {
@@ -40,6 +45,7 @@ impl Metrics {
         metrics.repair().with_context(context)?;
         if length == 0 {
             metrics.row(&format!("{header}\n"))?;
+            sync_folder(path).with_context(context)?;
         }
         Ok((metrics, dropped))
     }
@@ -67,7 +73,8 @@ impl Metrics {
     /// # Errors
     /// A file that cannot be written, or was deleted.
     pub fn sync(&mut self) -> Result<()> {
-        let synced = fs::metadata(&self.path).and_then(|_| self.repair()).and_then(|()| self.file.sync_data());
+        expect_named(&self.path, &self.file)?;
+        let synced = self.repair().and_then(|()| self.file.sync_data());
         synced.with_context(|| format!("cannot write {}", self.path.display()))
     }
 }
@@ -81,13 +88,16 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u6
     let (mut reader, mut line) = (BufReader::new(file), Vec::new());
     let mut next = |line: &mut Vec<u8>| {
         line.clear();
-        reader.read_until(b'\n', line)
+        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
     };
     if next(&mut line)? == 0 {
         return Ok(Some((0, 0)));
     }
-    if line.strip_suffix(b"\n") != Some(header.as_bytes()) {
-        return Ok(None);
+    match line.strip_suffix(b"\n") {
+        Some(found) if found == header.as_bytes() => {}
+        // There was no room for more of it.
+        None if header.as_bytes().starts_with(&line) => return Ok(Some((0, 0))),
+        _ => return Ok(None),
     }
     let (mut length, mut dropped) = (line.len() as u64, 0);
     while next(&mut line)? > 0 {
@@ -141,12 +151,23 @@ mod tests {
     }
 
     #[test]
-    fn a_table_that_was_deleted_is_noticed() {
+    fn a_header_that_did_not_fit_is_written_again() {
+        let (place, path) = table("");
+        fs::write(&path, "iterat").unwrap();
+        Metrics::open(&path, "iteration,loss", 3).unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n");
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_table_that_was_deleted_or_replaced_is_noticed() {
         let (_place, path) = table("");
         let (mut metrics, _) = Metrics::open(&path, "iteration,loss", 0).unwrap();
         metrics.sync().unwrap();
         fs::remove_file(&path).unwrap();
         metrics.row("1,2\n").unwrap();
+        assert!(metrics.sync().is_err());
+        fs::write(&path, "of somebody else").unwrap();
         assert!(metrics.sync().is_err());
     }
 }

@@ -13,7 +13,7 @@ mod pip;
 mod report;
 
 pub use checkpoints::Checkpoints;
-pub use file::{OutputFile, read_bytes, read_text, write_whole};
+pub use file::{OutputFile, read_bytes, read_text, same_file, write_whole};
 #[cfg(feature = "video")]
 pub use film::{FilmFormat, FilmWriter, write_png};
 pub use folder::{Locked, RunFolder, newest_checkpoint, resolve_checkpoint};
@@ -28,9 +28,27 @@ pub fn print(text: &str) {
     let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
 }
 
-/// Prints a line on stderr.
+/// Prints a line on stderr. What it quotes may come from a file of somebody else, and must not steer the terminal.
 pub fn say(line: &str) {
-    let _ = std::io::Write::write_all(&mut std::io::stderr(), format!("{line}\n").as_bytes());
+    let mut harmless = String::with_capacity(line.len() + 1);
+    for c in line.chars() {
+        match c {
+            '\n' | '\t' => harmless.push(c),
+            c if c.is_control() => harmless.extend(c.escape_default()),
+            c => harmless.push(c),
+        }
+    }
+    let _ = std::io::Write::write_all(&mut std::io::stderr(), (harmless + "\n").as_bytes());
+}
+
+/// A text as one word for a shell.
+pub fn quoted(text: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
+    if !text.is_empty() && text.chars().all(plain) {
+        text.to_owned()
+    } else {
+        format!("'{}'", text.replace('\'', "'\\''"))
+    }
 }
 
 /// Whether there is a display that a window could open on.
@@ -45,4 +63,16 @@ pub fn has_display() -> bool {
 pub fn start_threads(threads: usize) -> Result<()> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
     pool.build_global().with_context(|| format!("cannot start {threads} worker threads"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_with_a_meaning_for_a_shell_are_quoted() {
+        assert_eq!(quoted("runs/a-1"), "runs/a-1");
+        assert_eq!(quoted("my run"), "'my run'");
+        assert_eq!(quoted("$(it's)"), "'$(it'\\''s)'");
+    }
 }

@@ -47,31 +47,40 @@ struct Log<W> {
     failing: bool,
     /// Iterations that it lacks.
     lost: u64,
+    /// Iterations written since it was last known to be on the disk.
+    unsynced: u64,
 }
 
 impl<W> Log<W> {
     fn new(name: &'static str) -> Self {
-        Self { name, writer: None, failing: false, lost: 0 }
+        Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
     }
 
     /// Writes an iteration if it can; what there is to say of it.
     fn write(&mut self, write: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
-        let written = self.writer.as_mut().map(write);
-        match written {
-            Some(Ok(())) if std::mem::take(&mut self.failing) => {
-                Some(format!("{} is written again; it lacks {} iterations so far", self.name, self.lost))
-            }
-            Some(Ok(())) => None,
-            failed => {
-                self.lost += 1;
-                self.take_error(failed)
-            }
+        let Some(writer) = &mut self.writer else {
+            self.lost += 1;
+            return None;
+        };
+        if let Err(error) = write(writer) {
+            self.lost += 1;
+            return self.give_up(&error);
         }
+        self.unsynced += 1;
+        let again = std::mem::take(&mut self.failing);
+        again.then(|| format!("{} is written again; it lacks {} iterations so far", self.name, self.lost))
     }
 
-    /// Gives the log up where it was found to be unwritable; a warning if that is new.
-    fn take_error(&mut self, result: Option<Result<()>>) -> Option<String> {
-        let error = result?.err()?;
+    /// Makes sure that all is on the disk; a warning where it is not.
+    fn sync(&mut self, sync: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
+        let result = sync(self.writer.as_mut()?);
+        let unsynced = std::mem::take(&mut self.unsynced);
+        let error = result.err()?;
+        self.lost += unsynced;
+        self.give_up(&error)
+    }
+
+    fn give_up(&mut self, error: &anyhow::Error) -> Option<String> {
         self.writer = None;
         let known = std::mem::replace(&mut self.failing, true);
         (!known).then(|| format!("{} is not written for now: {error:#}", self.name))
@@ -174,9 +183,7 @@ impl Report {
     /// Brings all that was logged onto the disk, before a checkpoint says that it is there; opens again what could not be
     /// written.
     pub fn sync(&mut self) {
-        let synced = self.metrics.writer.as_mut().map(Metrics::sync);
-        let events = self.events.writer.as_ref().map(EventFile::sync);
-        let warnings = [self.metrics.take_error(synced), self.events.take_error(events)];
+        let warnings = [self.metrics.sync(Metrics::sync), self.events.sync(|events| events.sync())];
         warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
         // The whole folder may have been deleted.
         let _ = fs::create_dir_all(&self.folder);
@@ -204,7 +211,8 @@ impl Report {
     fn time_left(&self, env_steps: u64) -> Duration {
         let (start, before) = self.begun;
         let pace = start.elapsed().as_secs_f64() / env_steps.saturating_sub(before).max(1) as f64;
-        Duration::from_secs_f64(pace * self.total_steps.saturating_sub(env_steps) as f64)
+        let left = pace * self.total_steps.saturating_sub(env_steps) as f64;
+        Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
     }
 
     /// Prints a line above the progress bar.
@@ -328,6 +336,7 @@ mod tests {
         fs::remove_dir_all(&folder).unwrap();
         report.iteration(3, &[("a", 3.0)], &status(30));
         report.sync();
+        assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "what was logged and deleted unseen is lost too");
         report.iteration(4, &[("a", 4.0)], &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);

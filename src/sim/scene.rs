@@ -4,7 +4,9 @@ use std::path::Path;
 use std::sync::{Arc, Once};
 
 use anyhow::{Result, anyhow, bail, ensure};
-use mujoco_rs::prelude::{MjModel, MjtBias, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
+use mujoco_rs::prelude::{
+    MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
+};
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
 use super::{Look, Simulation};
@@ -97,6 +99,12 @@ impl Scene {
         let scene = Self { model: Arc::new(model), origin };
         if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {
             bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);
+        }
+        if scene.model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 != 0 {
+            bail!(
+                "{}: what sleeps is not part of the state that MuJoCo can save; leave sleep switched off",
+                scene.origin
+            );
         }
         Ok(scene)
     }

@@ -121,6 +121,7 @@ impl Simulation {
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
         self.refresh();
+        ensure!(!self.diverged(), "a state that MuJoCo cannot go on from");
         Ok(())
     }
 

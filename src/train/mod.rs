@@ -2,7 +2,6 @@
 
 mod saving;
 
-use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -78,23 +77,27 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
         return Ok(Outcome::Finished);
     }
     if let Some(limit) = args.stop_after {
-        requests.stop_after(limit);
+        requests.stop_after(limit)?;
     }
     run::say(&format!("run folder: {}", session.folder.path().display()));
-    let mut report = session.open_report()?;
     // The end of the last iteration: what is saved if the next one does not come to its own.
     let mut end = session.checkpoint()?;
-    if session.progress.iteration == 0 {
-        // So that a run that dies before its first checkpoint can be resumed like any other.
-        session.save(&end, &mut report)?;
+    if !session.is_newest {
+        // Before anything else: whatever happens then, it can be resumed, and nothing that is in the logs is newer.
+        session.write_to(&session.folder, &end)?;
     }
+    let mut report = session.open_report()?;
     while !session.finished() {
-        match session.iterate(requests.stop(), &report) {
-            Ok(Some(iteration)) => session.report(&mut report, &iteration),
-            Ok(None) => return session.stop(&end, &mut report, requests),
+        match session.iterate(requests.stop(), &mut report) {
+            Ok(true) => {}
+            Ok(false) => return session.stop(&end, &mut report, requests),
             Err(error) => return Err(session.give_up(error, &end, &mut report)),
         }
+        let known = end.progress.best;
         end = session.checkpoint()?;
+        if end.progress.best != known {
+            (session.best, session.best_is_saved) = (Some(end.clone()), false);
+        }
         let due = session.progress.iteration.is_multiple_of(session.config.run.checkpoint_every);
         if (requests.take_save() || due)
             && !session.finished()
@@ -108,7 +111,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     Ok(Outcome::Finished)
 }
 
-/// What an iteration tells.
+/// What is reported of an iteration.
 struct Iteration {
     update: UpdateStats,
     evaluation: Option<Score>,
@@ -131,10 +134,11 @@ struct Session {
     rollout: Rollout,
     scratch: Scratch,
     progress: Progress,
-    /// The last evaluation was the best one so far, and its policy is not saved yet.
-    found_best: bool,
-    /// The checkpoint of the best evaluation, until it is saved.
+    /// The newest checkpoint of the folder is where the session is.
+    is_newest: bool,
+    /// The checkpoint of the best evaluation, if this session has found it.
     best: Option<Checkpoint>,
+    best_is_saved: bool,
 }
 
 impl Session {
@@ -164,13 +168,16 @@ impl Session {
         let lock = folder.lock()?;
         let mut overrides = args.settings.set.clone();
         overrides.extend(asked(args));
-        let places = if place.is_dir() { newest } else { vec![place.to_owned()] };
+        let places = if place.is_dir() { newest.clone() } else { vec![place.to_owned()] };
         let (path, checkpoint, mut config) =
             saving::first_sound(&places, &overrides).with_context(|| format!("cannot resume {}", place.display()))?;
+        let context = || format!("cannot resume from {}", path.display());
+        saving::expect_states(&checkpoint, &config).with_context(context)?;
         settle_model(&mut config)?;
         run::start_threads(config.run.threads)?;
         let mut session = Self::new(config, || Ok((folder, lock)), args)?;
-        session.restore(checkpoint).with_context(|| format!("cannot resume from {}", path.display()))?;
+        session.restore(checkpoint).with_context(context)?;
+        session.is_newest = run::same_file(&path, &newest[0]);
         Ok(session)
     }
 
@@ -184,7 +191,6 @@ impl Session {
         let scratch = Scratch::new(&pool, &ppo);
         let (folder, lock) = folder()?;
         let (keep, dump_diverged) = (args.keep, args.dump_diverged);
-        let (progress, found_best, best) = (Progress::default(), false, None);
         Ok(Self {
             config,
             folder,
@@ -197,9 +203,10 @@ impl Session {
             ppo,
             rollout,
             scratch,
-            progress,
-            found_best,
-            best,
+            progress: Progress::default(),
+            is_newest: false,
+            best: None,
+            best_is_saved: true,
         })
     }
 
@@ -217,23 +224,22 @@ impl Session {
         Ok(Report::open(self.folder.path(), &TAGS, iteration, env_steps, self.config.run.total_steps))
     }
 
-    /// Collects, learns, and evaluates where that is due; `None` if `stop` was set meanwhile. Where it does not come to its
-    /// end, the session is good for nothing but saving the end of the iteration before.
-    fn iterate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Iteration>> {
+    /// One iteration, whatever happens in it; false if `stop` was set meanwhile. Where it does not come to its end, the session
+    /// is good for nothing but saving the end of the one before.
+    fn iterate(&mut self, stop: &AtomicBool, report: &mut Report) -> Result<bool> {
         let iteration = self.progress.iteration + 1;
-        let work = AssertUnwindSafe(|| self.iterate_unguarded(iteration, stop, report));
-        catch_unwind(work)
-            .unwrap_or_else(|panic: Box<dyn Any + Send>| Err(anyhow!("panic: {}", panic_message(&*panic))))
-            .with_context(|| format!("iteration {iteration}"))
+        let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(iteration, stop, report)));
+        let result = caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
+        result.with_context(|| format!("iteration {iteration}"))
     }
 
-    fn iterate_unguarded(&mut self, iteration: u64, stop: &AtomicBool, report: &Report) -> Result<Option<Iteration>> {
+    fn collect_learn_evaluate(&mut self, iteration: u64, stop: &AtomicBool, report: &mut Report) -> Result<bool> {
         let started = Instant::now();
         if !collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)? {
-            return Ok(None);
+            return Ok(false);
         }
         let collected = Instant::now();
-        let Some(update) = self.ppo.update(&mut self.rollout, iteration, stop)? else { return Ok(None) };
+        let Some(update) = self.ppo.update(&mut self.rollout, iteration, stop)? else { return Ok(false) };
         self.rollout.carry_over();
         let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
         let env_steps = self.progress.env_steps + self.config.steps_per_iteration();
@@ -241,17 +247,15 @@ impl Session {
         if iteration.is_multiple_of(self.config.run.eval_every) {
             evaluation = self.evaluate(env_steps, stop, report)?;
             if evaluation.is_none() {
-                return Ok(None);
+                return Ok(false);
             }
         }
-        (self.progress.iteration, self.progress.env_steps) = (iteration, env_steps);
-        if let Some(score) = &evaluation {
-            let found = [score.goals, score.rot_dist];
-            if is_better(found, self.progress.best) {
-                (self.progress.best, self.found_best) = (Some(found), true);
-            }
-        }
-        Ok(Some(Iteration { update, evaluation, collect_s, update_s }))
+        let known = self.progress.best;
+        let found = evaluation.map(|score| [score.goals, score.rot_dist]);
+        let best = found.filter(|&found| is_better(found, known)).or(known);
+        self.progress = Progress { iteration, env_steps, best };
+        self.report(report, &Iteration { update, evaluation, collect_s, update_s });
+        Ok(true)
     }
 
     /// Saves the end of the last iteration, when it was asked to stop.
@@ -376,6 +380,27 @@ fn version() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_panic_on_a_worker_thread_is_an_error_and_the_iteration_before_is_saved() {
+        let place = tempfile::tempdir().unwrap();
+        let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]", "run.eval_every=1000"];
+        let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
+        let config = Config::resolve(None, &sets).unwrap();
+        let args = TrainArgs { keep: 2, ..TrainArgs::default() };
+        let mut session = Session::new(config, || RunFolder::create(Some(place.path()), None), &args).unwrap();
+        session.pool.reset(session.rollout.first_observations_mut());
+        let (mut report, never) = (session.open_report().unwrap(), AtomicBool::new(false));
+        assert!(session.iterate(&never, &mut report).unwrap(), "nothing stops it");
+        let end = session.checkpoint().unwrap();
+        // Room for fewer environments than there are.
+        session.rollout = session.ppo.rollout(&[7, 1]);
+        let error = session.iterate(&never, &mut report).unwrap_err();
+        let error = format!("{:#}", session.give_up(error, &end, &mut report));
+        assert!(error.contains("iteration 2: panic: "), "{error}");
+        let saved = run::read_bytes(&session.folder.checkpoints().latest()).unwrap();
+        assert_eq!(Checkpoint::parse(&saved).unwrap().progress.iteration, 1);
+    }
 
     #[test]
     fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {

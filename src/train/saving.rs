@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 
 use super::{Session, is_better, version};
+use crate::cli::TrainArgs;
 use crate::config::{Config, Override};
 use crate::dump;
 use crate::env::EnvState;
@@ -19,25 +20,19 @@ const SCENE: &str = "scene";
 
 impl Session {
     /// The state at the end of an iteration, whole.
-    pub(super) fn checkpoint(&mut self) -> Result<Checkpoint> {
+    pub(super) fn checkpoint(&self) -> Result<Checkpoint> {
         let mut checkpoint = self.ppo.checkpoint(&self.config.to_text(), self.progress)?;
         let EnvState { numbers, counters } = self.pool.save();
         let rows = self.pool.len();
         checkpoint.insert(NUMBERS, Array::F64(vec![rows, numbers.len() / rows], numbers));
         checkpoint.insert(COUNTERS, Array::U64(vec![rows, counters.len() / rows], counters));
         checkpoint.insert(SCENE, Array::U64(vec![1], vec![self.scene]));
-        if std::mem::take(&mut self.found_best) {
-            self.best = Some(checkpoint.clone());
-        }
         Ok(checkpoint)
     }
 
     /// Goes on from what [`Session::checkpoint`] has saved.
     pub(super) fn restore(&mut self, mut checkpoint: Checkpoint) -> Result<()> {
         self.progress = checkpoint.progress;
-        let Progress { iteration, env_steps, .. } = self.progress;
-        let steps = iteration.checked_mul(self.config.steps_per_iteration());
-        ensure!(steps == Some(env_steps), "{iteration} iterations cannot have made {env_steps} steps");
         self.ppo.restore(&mut checkpoint)?;
         let state =
             EnvState { numbers: checkpoint.take_doubles(NUMBERS)?, counters: checkpoint.take_counters(COUNTERS)? };
@@ -54,32 +49,35 @@ impl Session {
     fn remember_best(&mut self) {
         let saved = run::read_bytes(&self.folder.checkpoints().best()).and_then(|bytes| Checkpoint::parse(&bytes));
         let saved = saved.ok().and_then(|checkpoint| checkpoint.progress.best);
-        self.progress.best = self.progress.best.and_then(|known| match saved {
-            Some(saved) if !is_better(known, Some(saved)) => Some(saved),
-            other => other.map(|_| known),
-        });
+        let known = self.progress.best.filter(|&known| saved.is_some_and(|saved| is_better(known, Some(saved))));
+        self.progress.best = known.or(saved);
     }
 
     /// Writes logs, the best policy and the checkpoint, each before what speaks of it.
     pub(super) fn save(&mut self, end: &Checkpoint, report: &mut Report) -> Result<()> {
-        report.sync();
-        self.folder.describe(&self.config.to_text(), &version())?;
-        if !self.folder.has_lock() {
-            // The folder was deleted and is made anew.
+        if !self.lock.holds() {
+            // The folder was deleted and is made anew; if not by another training.
+            self.folder.describe(&self.config.to_text(), &version())?;
             self.lock = self.folder.lock()?;
         }
+        report.sync();
+        self.folder.describe(&self.config.to_text(), &version())?;
         self.write_to(&self.folder, end)?;
-        self.best = None;
+        self.best_is_saved = true;
         Ok(())
     }
 
-    fn write_to(&self, folder: &RunFolder, end: &Checkpoint) -> Result<()> {
+    pub(super) fn write_to(&self, folder: &RunFolder, end: &Checkpoint) -> Result<()> {
         let checkpoints = folder.checkpoints();
-        if let Some(best) = &self.best {
-            run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
-            checkpoints.write_best(&best.to_bytes()?)?;
-        } else if self.progress.best.is_none() {
-            run::write_whole(&folder.policy(), &end.policy_alone().to_bytes()?)?;
+        let there = checkpoints.best().exists();
+        match &self.best {
+            Some(_) if self.best_is_saved && there => {}
+            Some(best) => {
+                run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
+                checkpoints.write_best(&best.to_bytes()?)?;
+            }
+            None if there => {}
+            None => run::write_whole(&folder.policy(), &end.policy_alone().to_bytes()?)?,
         }
         checkpoints.write(end.progress.iteration, &end.to_bytes()?, self.keep)
     }
@@ -89,8 +87,7 @@ impl Session {
         let saved = self.save(end, report);
         report.finish();
         let Err(error) = saved else { return Ok(()) };
-        let elsewhere = RunFolder::for_now();
-        match elsewhere.and_then(|run| self.write_to(&run, end).map(|()| run)) {
+        match self.save_elsewhere(end) {
             Ok(run) => bail!(
                 "{error:#}\nThe state after {} is in {} instead; go on with\n  {}",
                 self.steps_made(),
@@ -105,10 +102,30 @@ impl Session {
         }
     }
 
+    fn save_elsewhere(&self, end: &Checkpoint) -> Result<RunFolder> {
+        let run = RunFolder::for_now()?;
+        match self.write_to(&run, end) {
+            Ok(()) => Ok(run),
+            Err(error) => {
+                run.remove();
+                Err(error)
+            }
+        }
+    }
+
+    /// The command that goes on with a run in this folder, as this training does.
     pub(super) fn how_to_resume(&self, run: &Path) -> String {
-        let model = self.config.env.model_file();
-        let model = model.map_or(String::new(), |model| format!(" --set {MODEL}={}", model.display()));
-        format!("shadow-repose train --resume {}{model}", run.display())
+        let mut command = format!("shadow-repose train --resume {}", run::quoted(&run.display().to_string()));
+        if let Some(model) = self.config.env.model_file() {
+            command += &format!(" --set {}", run::quoted(&format!("{MODEL}={}", model.display())));
+        }
+        if self.keep != TrainArgs::KEEP {
+            command += &format!(" --keep {}", self.keep);
+        }
+        if self.dump_diverged {
+            command += " --dump-diverged";
+        }
+        command
     }
 
     /// Writes what led to each episode that diverged.
@@ -122,6 +139,20 @@ impl Session {
             }
         }
     }
+}
+
+/// Makes sure that a checkpoint holds the states of as many environments as its configuration says, and of as many steps:
+/// before anything is allocated by what the configuration says.
+pub(super) fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
+    let Progress { iteration, env_steps, .. } = checkpoint.progress;
+    let steps = iteration.checked_mul(config.steps_per_iteration());
+    ensure!(steps == Some(env_steps), "{iteration} iterations cannot have made {env_steps} steps");
+    let expected = config.env.num_envs;
+    for name in [NUMBERS, COUNTERS] {
+        let rows = checkpoint.shape(name).and_then(|shape| shape.first().copied()).unwrap_or(0);
+        ensure!(rows == expected, "it holds the states of {rows} environments, expected {expected}");
+    }
+    Ok(())
 }
 
 /// The first of these files that can be used, with a warning for each one before it.

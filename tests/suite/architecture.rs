@@ -29,7 +29,7 @@ fn outside_worlds_are_fenced() {
         ("println!", "run"),
         ("indicatif", "run"),
         ("tensorboard_", "run"),
-        ("ctrlc", "run"),
+        ("signal_hook", "run"),
         ("egui::", "sim"),
         ("openh264", "run"),
         ("shiguredo_mp4", "run"),

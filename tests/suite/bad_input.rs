@@ -134,7 +134,7 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
     for (bad, part) in [
         (set("envs.counters", &huge), "environment 0"),
         (set("envs.numbers", &short), "environment 0"),
-        (set("envs.numbers", &Array::F64(vec![1], vec![0.0])), "no states of 16 environments"),
+        (set("envs.numbers", &Array::F64(vec![1], vec![0.0])), "the states of 1 environments, expected 16"),
         (set("learning_rate", &Array::F64(vec![1], vec![-1.0])), "its learning rate is -1"),
         (set("adam.steps", &Array::U64(vec![1], vec![u64::MAX])), "`adam.steps`"),
         (set("normalizer.variance", &Array::F64(vec![157], vec![-1.0; 157])), "`normalizer.variance`"),

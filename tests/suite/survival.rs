@@ -36,6 +36,12 @@ fn endless(folder: &Path, more: &[&str]) -> (Child, Lines<BufReader<ChildStderr>
 
 fn begun(mut command: Command) -> (Child, Lines<BufReader<ChildStderr>>) {
     let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
+    let id = child.id().to_string();
+    // Whatever goes wrong, nothing waits for it for ever.
+    std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_secs(300));
+        let _ = Command::new("kill").args(["-KILL", &id]).status();
+    });
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     while !lines.next().expect("the training goes on").unwrap().contains("steps/s") {}
     (child, lines)
@@ -114,16 +120,14 @@ fn killed(kills: usize, iterations: u64) {
         std::thread::sleep(Duration::from_secs_f64(patience * noise.random::<f64>()));
         child.kill().unwrap();
         hit += usize::from(!child.wait().unwrap().success());
-        let begun = folder.path().join("run/checkpoints/latest.safetensors").exists();
-        if begun {
+        // Killed before its first checkpoint it has not begun yet.
+        if folder.path().join("run/checkpoints/latest.safetensors").exists() {
             args = resume.to_vec();
-        } else if folder.path().join("run").exists() {
-            // Killed before its first checkpoint: nothing was made yet.
-            fs::remove_dir_all(folder.path().join("run")).unwrap();
         }
     }
     succeeded(program(folder.path(), &args));
-    assert!(hit * 2 > kills, "only {hit} of {kills} were killed in time");
+    println!("{hit} of {kills} were killed before they came to their end");
+    assert!(hit * 4 > kills, "only {hit} of {kills} were killed in time");
     assert!(result(folder.path(), "run") == expected, "after {kills} kills");
     let left = names(&folder.path().join("run/checkpoints"));
     assert!(left.iter().all(|name| name.ends_with(".safetensors")), "{left:?}");
@@ -165,6 +169,10 @@ fn killed_a_hundred_times_and_resumed_it_comes_to_the_same_end() {
 #[test]
 fn each_signal_saves_the_last_whole_iteration_and_has_its_exit_code() {
     for (signal, code) in [("INT", 130), ("TERM", 143), ("HUP", 129)] {
+        if signal == "HUP" && ignored(1) {
+            eprintln!("not tested: SIGHUP is ignored here");
+            continue;
+        }
         let folder = tempfile::tempdir().unwrap();
         let (child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
         let (found, said) = ended_by(signal, child, lines);
@@ -175,6 +183,59 @@ fn each_signal_saves_the_last_whole_iteration_and_has_its_exit_code() {
         assert!(!stderr(&more).contains("dropped"), "every row is of an iteration that was saved: {}", stderr(&more));
         assert_eq!(iterations(folder.path()), made + 1);
     }
+}
+
+/// Whether this process was started with a signal ignored; then its children are too.
+fn ignored(signal: u32) -> bool {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
+    u64::from_str_radix(mask.trim(), 16).unwrap() >> (signal - 1) & 1 == 1
+}
+
+/// A training whose every minibatch takes many seconds, in its first update.
+fn slow(folder: &Path) -> Child {
+    let mut args = train(&["--run-dir", "run"]);
+    for setting in ["env.num_envs=64", "ppo.horizon=512", "ppo.hidden=[3072,3072]", "ppo.minibatches=1"] {
+        args.extend(["--set", setting]);
+    }
+    let mut child = command(folder, &args).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.next().unwrap().unwrap().contains("run folder"));
+    // 32768 steps take some seconds, the minibatch after them many.
+    std::thread::sleep(Duration::from_secs(6));
+    child
+}
+
+#[test]
+fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immediately_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut child = slow(folder.path());
+    send("TERM", &child);
+    send("TERM", &child);
+    std::thread::sleep(Duration::from_millis(1500));
+    if child.try_wait().unwrap().is_none() {
+        // It is still at its minibatch, so it was not the second signal that ended it.
+        send("TERM", &child);
+        let asked = Instant::now();
+        assert_eq!(child.wait().unwrap().code(), Some(143));
+        assert!(asked.elapsed() < Duration::from_millis(1500), "{:?}", asked.elapsed());
+    } else {
+        panic!("a minibatch is too fast here, or the second of two signals at once has ended the program");
+    }
+}
+
+#[test]
+fn a_terminal_that_is_closed_sends_two_signals_and_the_state_is_saved() {
+    if ignored(1) {
+        eprintln!("not tested: SIGHUP is ignored here");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
+    send("HUP", &child);
+    let (code, said) = ended_by("HUP", child, lines);
+    assert_eq!(code, Some(129));
+    assert!(said.contains("stopped after"), "{said}");
 }
 
 #[test]
@@ -200,7 +261,11 @@ fn a_training_started_with_nohup_outlives_its_terminal() {
     nohup.arg(env!("CARGO_BIN_EXE_shadow-repose")).args(args).current_dir(folder.path()).stdin(Stdio::null());
     let (child, lines) = begun(nohup);
     send("HUP", &child);
-    std::thread::sleep(Duration::from_millis(100));
+    let (before, patience) = (iterations(folder.path()), Instant::now());
+    while iterations(folder.path()) < before + 50 {
+        assert!(patience.elapsed() < Duration::from_secs(60), "it does not go on");
+        std::thread::sleep(Duration::from_millis(20));
+    }
     assert_eq!(ended_by("TERM", child, lines).0, Some(143), "not by SIGHUP");
 }
 
@@ -262,6 +327,58 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
     let output = resume(folder.path(), &[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(stderr(&output).contains("error: cannot resume run"), "{}", stderr(&output));
+}
+
+#[test]
+fn whoever_goes_back_to_an_older_checkpoint_goes_on_from_there_even_if_killed_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["--total-steps", "1280", "--run-dir", "run", "--keep", "9", "--set", "run.checkpoint_every=2"];
+    succeeded(program(folder.path(), &train(&args)));
+    let expected = result(folder.path(), "run");
+    let older = "run/checkpoints/iteration-00000004.safetensors";
+    // No time for a single iteration.
+    succeeded(program(folder.path(), &["train", "--resume", older, "--keep", "9", "--stop-after", "1ms"]));
+    assert_eq!(iterations(folder.path()), 4);
+    let found = names(&folder.path().join("run/checkpoints"));
+    assert!(found.contains(&"iteration-00000010.later".to_owned()), "nothing is thrown away: {found:?}");
+    let output = succeeded(resume(folder.path(), &["--total-steps", "1280"]));
+    assert!(!stderr(&output).contains("dropped"), "{}", stderr(&output));
+    assert!(result(folder.path(), "run") == expected);
+}
+
+#[test]
+fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("tmp")).unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    let mut first = command(folder.path(), &args);
+    first.env("TMPDIR", folder.path().join("tmp"));
+    let (first, first_lines) = begun(first);
+    send("STOP", &first);
+    fs::rename(folder.path().join("run"), folder.path().join("gone")).unwrap();
+    let (second, second_lines) = begun(command(folder.path(), &args));
+    send("CONT", &first);
+    let (code, said) = ended_by("TERM", first, first_lines);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("is being trained in by another program") && said.contains("instead"), "{said}");
+    assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
+    let made = iterations(folder.path());
+    succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+}
+
+#[test]
+fn a_file_that_may_not_grow_any_more_costs_rows_but_not_the_training() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings = train(&["--total-steps", "64000", "--run-dir", "run", "--set", "run.checkpoint_every=5"]).join(" ");
+    // In blocks of 512 bytes: room for a checkpoint of 124 KB, not for 500 rows. Writes beyond it fail as on a full disk.
+    let script = format!("trap '' XFSZ; ulimit -f 280; exec {} {settings}", env!("CARGO_BIN_EXE_shadow-repose"));
+    let output = Command::new("sh").args(["-c", &script]).current_dir(folder.path()).output().unwrap();
+    let said = stderr(&succeeded(output));
+    assert!(said.contains("metrics.csv is not written for now") && said.contains("metrics.csv lacks"), "{said}");
+    let rows = iterations(folder.path());
+    assert!((100..500).contains(&rows), "{rows} rows");
+    succeeded(program(folder.path(), &["play", "--ckpt", "run", "--episodes", "2", "--json"]));
+    succeeded(resume(folder.path(), &["--total-steps", "64128"]));
 }
 
 #[test]
@@ -346,7 +463,7 @@ fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
     // The disk is full from early on, and is given room again before a second one comes to its end.
     let script = format!(
         "($PROGRAM {settings} 2> said & train=$!
-          until grep -q steps/s said; do sleep 0.01; done
+          until grep -q steps/s said || ! kill -0 $train; do sleep 0.01; done
           cat /dev/zero > small/filler 2> /dev/null
           wait $train; echo code $?
           rm small/filler
