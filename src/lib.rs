@@ -46,6 +46,12 @@
 //! ```
 //! How a minibatch is computed is described in `ppo::fused`; `ppo::reference` is the same in candle's tensors.
 //!
+//! # What survives
+//! At the end of each iteration [`train`] takes everything that the next one depends on into a [`ppo::Checkpoint`]: the learner
+//! by [`ppo::Ppo::checkpoint`], the environments by [`mod@env`]'s `EnvPool::save`. Whatever ends the iteration after it (a
+//! signal, a panic, a loss that is not finite) leaves that one to be written. [`run`] writes it whole or not at all, under its
+//! number, and finds the newest sound one again. [`load`] is the only way in for files.
+//!
 //! # Features
 //! Without `viewer` there is no window, without `video` there are no films and pictures: [`window`] and [`film`] are then
 //! replaced by modules of the same shape that say so. Neither changes anything else.

@@ -12,7 +12,7 @@ mod tail;
 
 pub use episode::{EpisodeStats, Recent, Score};
 pub use hand::{ACTION_SIZE, Hand, OBSERVATION_SIZE};
-pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message};
+pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message, stepping};
 pub use repose::{Diverged, Repose, StepDetails, Task};
 pub use reward::RewardTerms;
 pub use state::{EnvState, SavedEnv};

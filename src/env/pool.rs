@@ -4,6 +4,7 @@
 //! episode depends on its number alone; so the results do not depend on which thread steps which block when.
 
 use std::any::Any;
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -180,6 +181,7 @@ impl<E: Env> EnvBlock<E> {
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
         for (i, ((slot, action), ((reward, end), (row, final_row)))) in slots.zip(results).enumerate() {
+            STEPPING.set(Some(self.first + i));
             let step = || {
                 let transition: Transition = slot.env.step(action, row);
                 (*reward, *end) = (transition.reward, transition.end);
@@ -196,8 +198,18 @@ impl<E: Env> EnvBlock<E> {
                 bail!("environment {} panicked: {}", self.first + i, panic_message(&*panic));
             }
         }
+        STEPPING.set(None);
         Ok(())
     }
+}
+
+thread_local! {
+    static STEPPING: Cell<Option<usize>> = const { Cell::new(None) };
+}
+
+/// The number of the environment that this thread is stepping, if it is: for whoever must tell when there is no way to return.
+pub fn stepping() -> Option<usize> {
+    STEPPING.get()
 }
 
 /// What a panic said.

@@ -19,7 +19,7 @@ const FORMAT: &str = "shadow-repose checkpoint 2";
 /// Ours takes a thousand bytes.
 const LONGEST_CONFIG: usize = 1 << 16;
 
-/// Of what a policy alone does without, the part that every learner has.
+/// The name of the learning rate as it has been adapted.
 const LEARNING_RATE: &str = "learning_rate";
 
 /// How far a run has come.
@@ -241,10 +241,6 @@ impl Ppo {
     /// # Errors
     /// A policy alone; a tensor that is missing, or of another shape or type, or with values that it cannot have.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
-        ensure!(
-            checkpoint.shape(LEARNING_RATE).is_some(),
-            "it holds a policy alone, which can be played but not trained on"
-        );
         let [observation_size, action_size] = [self.policy.observation_size(), self.policy.action_size()];
         checkpoint.expect_policy(&self.config, observation_size, action_size)?;
         checkpoint.take_policy(&mut self.policy)?;
@@ -344,7 +340,7 @@ mod tests {
             let numbers = |var: &Tensor| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
             assert_eq!(numbers(a), numbers(b));
         }
-        assert!(refusal(read, &mut learner(&[8])).contains("policy alone"));
+        assert!(refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing"));
     }
 
     #[test]

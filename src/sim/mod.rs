@@ -2,6 +2,7 @@
 //!
 //! Nothing outside this folder names `mujoco_rs`; nothing inside knows the task. Angles rad, lengths m, world frame.
 
+mod fatal;
 #[cfg(any(feature = "video", feature = "viewer"))]
 mod graphics;
 mod look;
@@ -14,6 +15,7 @@ mod simulation;
 #[cfg(feature = "viewer")]
 mod viewer;
 
+pub use fatal::before_fatal_error;
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};

@@ -1,14 +1,14 @@
 //! A loaded scene and its names: each lookup gives an index that stays valid, or an error with file and name.
 
 use std::path::Path;
-use std::sync::{Arc, Once};
+use std::sync::Arc;
 
 use anyhow::{Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{
     MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
-use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
+use super::fatal::quieten_mujoco;
 use super::{Look, Simulation};
 
 /// The scene that is built into the program.
@@ -242,24 +242,5 @@ impl Scene {
         expected.sort_by_key(|&(joint, _)| joint);
         ensure!(parts == expected, "{}: tendon `{tendon}` must be the sum {}", self.origin, joints.join(" + "));
         Ok(())
-    }
-}
-
-/// Sends MuJoCo's messages nowhere but for its fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
-/// [`Simulation::step`] reports as a value.
-fn quieten_mujoco() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        // SAFETY: every use of MuJoCo in this program begins with a loaded scene, so no other thread can be inside it.
-        unsafe { mujoco_rs::logging::set_log_handler(report_fatal) };
-    });
-}
-
-/// MuJoCo ends the process with code 1 after this returns from an error.
-fn report_fatal(message: &MjLogMessage) {
-    if message.level() == MjtLogLevel::mjLOG_ERROR {
-        let text = format!("error: MuJoCo cannot go on: {}\n", message.subject());
-        // A panic must not cross MuJoCo's frames, so a closed stderr is ignored.
-        let _ = std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes());
     }
 }

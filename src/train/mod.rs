@@ -81,7 +81,8 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     }
     run::say(&format!("run folder: {}", session.folder.path().display()));
     // The end of the last iteration: what is saved if the next one does not come to its own.
-    let mut end = session.checkpoint()?;
+    let mut end = Arc::new(session.checkpoint()?);
+    session.save_before_fatal_errors(&end);
     if !session.is_newest {
         // Before anything else: whatever happens then, it can be resumed, and nothing that is in the logs is newer.
         session.write_to(&session.folder, &end)?;
@@ -94,7 +95,8 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
             Err(error) => return Err(session.give_up(error, &end, &mut report)),
         }
         let known = end.progress.best;
-        end = session.checkpoint()?;
+        end = Arc::new(session.checkpoint()?);
+        session.save_before_fatal_errors(&end);
         if end.progress.best != known {
             (session.best, session.best_is_saved) = (Some(end.clone()), false);
         }
@@ -137,7 +139,7 @@ struct Session {
     /// The newest checkpoint of the folder is where the session is.
     is_newest: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
-    best: Option<Checkpoint>,
+    best: Option<Arc<Checkpoint>>,
     best_is_saved: bool,
 }
 

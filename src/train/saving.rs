@@ -1,6 +1,7 @@
 //! What a training leaves on the disk and takes up again: checkpoints, the best policy, what diverged.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 
@@ -12,6 +13,7 @@ use crate::env::EnvState;
 use crate::load::{self, MODEL};
 use crate::ppo::{Array, Checkpoint, Progress};
 use crate::run::{self, Report, RunFolder};
+use crate::{env, sim};
 
 // Where a checkpoint keeps the states of the environments, and the fingerprint of the scene that they live in.
 const NUMBERS: &str = "envs.numbers";
@@ -128,6 +130,23 @@ impl Session {
         command
     }
 
+    /// Has `end` saved where MuJoCo ends the process by itself.
+    pub(super) fn save_before_fatal_errors(&self, end: &Arc<Checkpoint>) {
+        let (end, checkpoints, keep) = (end.clone(), self.folder.checkpoints(), self.keep);
+        let how_to_resume = self.how_to_resume(self.folder.path());
+        sim::before_fatal_error(move |said| {
+            let whose = env::stepping().map_or(String::new(), |number| format!("environment {number}: "));
+            run::say(&format!("error: {whose}MuJoCo cannot go on: {said}"));
+            let iteration = end.progress.iteration;
+            match end.to_bytes().and_then(|bytes| checkpoints.write(iteration, &bytes, keep)) {
+                Ok(()) => {
+                    run::say(&format!("saved the state after {iteration} iterations; go on with\n  {how_to_resume}"))
+                }
+                Err(error) => run::say(&format!("error: {error:#}")),
+            }
+        });
+    }
+
     /// Writes what led to each episode that diverged.
     pub(super) fn dump_diverged(&mut self, report: &Report) {
         let iteration = self.progress.iteration;
@@ -149,7 +168,9 @@ pub(super) fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<
     ensure!(steps == Some(env_steps), "{iteration} iterations cannot have made {env_steps} steps");
     let expected = config.env.num_envs;
     for name in [NUMBERS, COUNTERS] {
-        let rows = checkpoint.shape(name).and_then(|shape| shape.first().copied()).unwrap_or(0);
+        let shape =
+            checkpoint.shape(name).context("it holds a policy alone, which can be played but not trained on")?;
+        let rows = shape.first().copied().unwrap_or(0);
         ensure!(rows == expected, "it holds the states of {rows} environments, expected {expected}");
     }
     Ok(())

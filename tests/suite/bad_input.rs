@@ -129,6 +129,7 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
         assert_ne!(bad.config, good.config, "{from}");
         bad
     };
+    let alone = good.policy_alone();
     let mut behind = good.clone();
     behind.progress.iteration = u64::MAX;
     for (bad, part) in [
@@ -145,6 +146,7 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
         (config("model = \"builtin\"", "model = \"/etc/passwd\""), "no path in a file is followed"),
         (config("ctrl_dt = 0.01", "ctrl_dt = 1e300"), "ctrl_dt"),
         (behind, "cannot have made"),
+        (alone, "a policy alone, which can be played but not trained on"),
     ] {
         fs::write(&path, bad.to_bytes().unwrap()).unwrap();
         let checkpoint = path.display().to_string();

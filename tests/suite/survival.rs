@@ -521,3 +521,22 @@ fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
         }
     }
 }
+
+#[test]
+fn a_fatal_error_of_mujoco_names_the_environment_and_the_iteration_before_is_saved() {
+    let folder = tempfile::tempdir().unwrap();
+    // Enough memory for the first contacts, not for all that come.
+    assert!(SCENE.contains("<size memory=\"2M\"/>"));
+    fs::write(folder.path().join("small.xml"), SCENE.replace("memory=\"2M\"", "memory=\"80K\"")).unwrap();
+    let mut args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "env.model=small.xml"]);
+    args.extend(["--set", "env.max_episode_seconds=5", "--set", "ppo.init_std=2", "--set", "run.eval_every=1000000"]);
+    let output = program(folder.path(), &args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("error: environment ") && said.contains("MuJoCo cannot go on"), "{said}");
+    assert!(said.contains("saved the state after") && said.contains("train --resume run --set env.model="), "{said}");
+    let made = iterations(folder.path());
+    assert!(made > 0 && said.contains(&format!("after {made} iterations")), "{made}: {said}");
+    let latest = fs::read(folder.path().join("run/checkpoints/latest.safetensors")).unwrap();
+    assert_eq!(shadow_repose::ppo::Checkpoint::parse(&latest).unwrap().progress.iteration, made);
+}
