@@ -1,6 +1,6 @@
 //! The folder of a run and what lies in it.
 
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -18,6 +18,18 @@ const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
 const LOCK: &str = "run.lock";
 const DIVERGED: &str = "diverged";
+/// How the names of a run's files begin.
+const OURS: [&[u8]; 8] = [
+    b"config.toml",
+    b"version.txt",
+    b"policy.safetensors",
+    b"run.lock",
+    b"metrics.",
+    b"events.out.",
+    b"checkpoints",
+    b"diverged",
+];
+
 /// Files in the folder `diverged`; whoever has so many needs no more to find the cause, but may need the disk.
 const MOST_DUMPS: usize = 1000;
 pub(super) const METRICS: &str = "metrics.csv";
@@ -141,36 +153,47 @@ impl RunFolder {
 
     /// Removes what a crash in the middle of writing left.
     fn clean(&self) -> Result<()> {
-        for folder in self.folders() {
-            for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-                let path = entry.path();
-                if path.extension().is_some_and(|extension| extension == PARTIAL) {
-                    fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
-                }
+        for entry in self.entries()? {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == PARTIAL) {
+                fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
             }
         }
         Ok(())
-    }
-
-    fn folders(&self) -> [PathBuf; 3] {
-        [self.path.clone(), self.checkpoints().folder().to_owned(), self.path.join(DIVERGED)]
     }
 
     /// Makes sure that nothing in the folder leads out of it: it may come from somebody else, and will be written into.
     fn expect_plain(&self) -> Result<()> {
-        for folder in self.folders().iter().filter(|folder| folder.exists()) {
-            let context = || format!("cannot read {}", folder.display());
-            for entry in fs::read_dir(folder).with_context(context)? {
-                let entry = entry.with_context(context)?;
-                let kind = entry.file_type().with_context(context)?;
-                ensure!(
-                    kind.is_file() || kind.is_dir(),
-                    "{}: neither a file nor a folder; no link in a run folder is followed",
-                    entry.path().display()
-                );
-            }
+        for entry in self.entries()? {
+            let path = entry.path();
+            let kind = entry.file_type().with_context(|| format!("cannot read {}", path.display()))?;
+            ensure!(
+                kind.is_file() || kind.is_dir(),
+                "{}: neither a file nor a folder; no link in a run folder is followed",
+                path.display()
+            );
         }
         Ok(())
+    }
+
+    /// What lies in it under the names of a run's files; there may be other things beside.
+    fn entries(&self) -> Result<Vec<DirEntry>> {
+        let mut found = Vec::new();
+        for folder in [&self.path, self.checkpoints().folder(), &self.path.join(DIVERGED)] {
+            if folder.exists() {
+                let context = || format!("cannot read {}", folder.display());
+                for entry in fs::read_dir(folder).with_context(context)? {
+                    found.push(entry.with_context(context)?);
+                }
+            }
+        }
+        let ours = |entry: &DirEntry| {
+            let name = entry.file_name();
+            entry.path().parent() != Some(&self.path)
+                || OURS.iter().any(|&begin| name.as_encoded_bytes().starts_with(begin))
+        };
+        found.retain(ours);
+        Ok(found)
     }
 
     /// Where it is.
@@ -315,6 +338,15 @@ mod tests {
         std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
         RunFolder { path: place.path().into() }.describe("a = 1", "1").unwrap();
         assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
+    }
+
+    #[test]
+    fn what_else_lies_in_the_folder_of_a_run_is_left_alone() {
+        let place = tempfile::tempdir().unwrap();
+        fs::write(place.path().join("download.partial"), "mine").unwrap();
+        std::os::unix::fs::symlink("/nowhere", place.path().join("link")).unwrap();
+        RunFolder::create(Some(place.path()), None).unwrap();
+        assert_eq!(fs::read_to_string(place.path().join("download.partial")).unwrap(), "mine");
     }
 
     #[test]

@@ -9,8 +9,12 @@ use crate::support::{metrics, names, program, stderr, succeeded, train, weights}
 
 /// A folder with a finished run of two iterations in `run`.
 fn trained(more: &[&str]) -> tempfile::TempDir {
+    trained_for("256", more)
+}
+
+fn trained_for(steps: &str, more: &[&str]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let mut args = train(&["--total-steps", "256", "--run-dir", "run"]);
+    let mut args = train(&["--total-steps", steps, "--run-dir", "run"]);
     args.extend(more);
     succeeded(program(folder.path(), &args));
     folder
@@ -144,8 +148,10 @@ fn baselines_need_no_checkpoint() {
 
 #[test]
 fn the_same_seed_trains_the_same_policy_on_any_number_of_threads() {
-    let runs: Vec<_> = ["1", "2", "8"].map(|threads| trained(&["--seed", "5", "--threads", threads])).into();
-    let other = trained(&["--seed", "6"]);
+    // Twenty iterations.
+    let runs: Vec<_> =
+        ["1", "2", "8"].map(|threads| trained_for("2560", &["--seed", "5", "--threads", threads])).into();
+    let other = trained_for("2560", &["--seed", "6"]);
     let latest = |run: &tempfile::TempDir| weights(run.path().join("run/checkpoints/latest.safetensors"));
     for run in &runs[1..] {
         assert_eq!(metrics(&runs[0].path().join("run")), metrics(&run.path().join("run")));
