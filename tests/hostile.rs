@@ -103,6 +103,7 @@ fn ten_thousand_mutations_of_a_checkpoint_and_of_a_config_do_no_harm() {
         ));
     }
     let most = memory("VmHWM:");
+    println!("at most {most} KiB");
     assert!(most < 1 << 20, "{most} KiB");
 }
 
