@@ -17,6 +17,11 @@ fn threads() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(0..=4096)
 }
 
+/// Accepts a number of checkpoints to keep.
+fn kept() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(1..=1_000_000)
+}
+
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any asked orientation, on a CPU.
 #[derive(Debug, Parser)]
 #[command(version, arg_required_else_help = true)]
@@ -75,7 +80,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
     /// How many of the newest checkpoints to keep
-    #[arg(long, value_name = "N", default_value_t = TrainArgs::KEEP, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = TrainArgs::KEEP, value_parser = kept())]
     pub keep: usize,
     /// Save and exit with 0 after this time, as 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]

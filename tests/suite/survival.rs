@@ -63,9 +63,15 @@ fn iterations(folder: &Path) -> u64 {
     metrics(&folder.join("run")).last().unwrap()[0].parse().unwrap_or(0)
 }
 
-/// Episodes with contacts and drops, of which some end in every iteration, and evaluations that are rarer than checkpoints.
-const LONG: &[&str] =
-    &["--set", "env.max_episode_seconds=2", "--set", "run.eval_every=7", "--set", "run.checkpoint_every=3"];
+/// Episodes with contacts, goals that are reached and drawn anew, and ends, of which some fall into every iteration; and
+/// evaluations that are rarer than checkpoints.
+const LONG: &[&str] = &[
+    "--set=env.max_episode_seconds=2",
+    "--set=env.success_tolerance=2",
+    "--set=env.max_consecutive_successes=5",
+    "--set=run.eval_every=7",
+    "--set=run.checkpoint_every=3",
+];
 
 #[test]
 fn twenty_iterations_and_twenty_more_are_forty_bit_for_bit_on_any_threads() {
@@ -75,6 +81,11 @@ fn twenty_iterations_and_twenty_more_are_forty_bit_for_bit_on_any_threads() {
     succeeded(program(undisturbed.path(), &args));
     let expected = result(undisturbed.path(), "run");
     assert_eq!(expected.2.len(), 41);
+    let goals = expected.2[0].iter().position(|name| name == "episode/goals").unwrap();
+    assert!(
+        expected.2[1..].iter().any(|row| row[goals].parse().is_ok_and(|goals: f64| goals > 1.0)),
+        "no goals are reached"
+    );
     for threads in [["1", "8"], ["8", "1"]] {
         let folder = tempfile::tempdir().unwrap();
         let half = (20 * 128).to_string();
