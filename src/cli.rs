@@ -79,20 +79,15 @@ pub struct TrainArgs {
     /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
-    /// How many of the newest checkpoints to keep
-    #[arg(long, value_name = "N", default_value_t = TrainArgs::KEEP, value_parser = kept())]
-    pub keep: usize,
+    /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
+    #[arg(long, value_name = "N", value_parser = kept())]
+    pub keep: Option<usize>,
     /// Save and exit with 0 after this time, as 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
     pub stop_after: Option<Duration>,
     /// Write the last steps of every episode whose physics diverged, for replay
     #[arg(long)]
     pub dump_diverged: bool,
-}
-
-impl TrainArgs {
-    /// How many checkpoints are kept where nothing else is said: the newest, and one in case it is damaged.
-    pub const KEEP: usize = 2;
 }
 
 /// `play`

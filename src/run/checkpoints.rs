@@ -80,19 +80,29 @@ impl Checkpoints {
         created.with_context(|| format!("cannot create {}", self.folder.display()))
     }
 
-    /// All that may be gone on from, the newest first. `latest` is one of the others under a second name, and one that is older
-    /// than the newest if the program ended just between naming the two; where it is a file of its own, it is the newest.
+    /// All that may be gone on from, the newest first. `latest` is one of the others under a second name, or, where there are no
+    /// second names, a copy; it is older than the newest if the program ended just before it was made.
     pub fn newest_first(&self) -> Vec<PathBuf> {
-        let numbered: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
+        let mut found: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
         let latest = self.latest();
-        let alone = latest.exists() && !numbered.iter().any(|path| same_file(path, &latest));
-        alone.then_some(latest).into_iter().chain(numbered).collect()
+        if latest.exists() && !found.iter().any(|path| same_file(path, &latest)) {
+            let written = |path: &PathBuf| fs::metadata(path).and_then(|facts| facts.modified()).ok();
+            let newer = found.first().is_none_or(|newest| written(&latest) >= written(newest));
+            found.insert(if newer { 0 } else { found.len() }, latest);
+        }
+        found
+    }
+
+    /// How many of them there are.
+    pub fn count(&self) -> usize {
+        self.numbered().len()
     }
 
     /// Those of iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
         let entries = fs::read_dir(&self.folder).into_iter().flatten().flatten();
-        let numbered = entries.filter_map(|entry| {
+        let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
+        let numbered = files.filter_map(|entry| {
             let name = entry.file_name();
             let number = name.to_str()?.strip_prefix("iteration-")?.strip_suffix(".safetensors")?.parse().ok()?;
             Some((number, entry.path()))
@@ -141,8 +151,12 @@ mod tests {
         assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(80));
         // A copy, as of a folder that was moved to where there are no second names.
         fs::remove_file(checkpoints.latest()).unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(20));
         fs::write(checkpoints.latest(), "copy").unwrap();
         assert_eq!(checkpoints.newest_first()[0], checkpoints.latest());
+        std::thread::sleep(std::time::Duration::from_millis(20));
+        fs::write(checkpoints.of_iteration(100), "newer than the copy").unwrap();
+        assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(100));
     }
 
     #[test]

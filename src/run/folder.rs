@@ -134,6 +134,7 @@ impl RunFolder {
         self.expect_plain()?;
         let path = self.path.join(LOCK);
         let context = || format!("cannot write {}", path.display());
+        fs::create_dir_all(&self.path).with_context(context)?;
         let mut file =
             OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).with_context(context)?;
         match file.try_lock() {
@@ -146,7 +147,8 @@ impl RunFolder {
             // Some network file systems have no locks: then there is nothing to keep anyone out with.
             Err(TryLockError::Error(_)) => {}
         }
-        file.set_len(0).and_then(|()| write!(file, ": process {}", std::process::id())).with_context(context)?;
+        // Whom it may concern; on a full disk it stays unsaid.
+        let _ = file.set_len(0).and_then(|()| write!(file, ": process {}", std::process::id()));
         self.clean()?;
         Ok(Locked { path, file })
     }
@@ -229,7 +231,6 @@ impl RunFolder {
     /// # Errors
     /// A folder that cannot be written to.
     pub fn describe(&self, config: &str, version: &str) -> Result<()> {
-        fs::create_dir_all(&self.path).with_context(|| format!("cannot create {}", self.path.display()))?;
         for (name, text) in [(CONFIG, config), (VERSION, version)] {
             let path = self.path.join(name);
             if read_text(&path).ok().as_deref() != Some(text) {

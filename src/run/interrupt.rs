@@ -15,6 +15,9 @@ use signal_hook::low_level::exit;
 /// request.
 const ONE_REQUEST: Duration = Duration::from_secs(1);
 
+/// Who forwards Ctrl-C to a program and to its group sends it twice; who presses it twice takes longer.
+const ONE_KEY: Duration = Duration::from_millis(200);
+
 /// What has been asked for since the program began to listen.
 #[derive(Clone, Debug)]
 pub struct Requests {
@@ -55,8 +58,9 @@ impl Requests {
                 self.save.store(true, Ordering::Relaxed);
                 continue;
             }
+            let together = if signal == SIGINT { ONE_KEY } else { ONE_REQUEST };
             match first {
-                Some(first) if signal == SIGINT || first.elapsed() > ONE_REQUEST => exit(128 + signal),
+                Some(first) if first.elapsed() > together => exit(128 + signal),
                 Some(_) => {}
                 None => {
                     first = Some(Instant::now());

@@ -96,10 +96,10 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
         }
         let known = end.progress.best;
         end = Arc::new(session.checkpoint()?);
-        session.save_before_fatal_errors(&end);
         if end.progress.best != known {
             (session.best, session.best_is_saved) = (Some(end.clone()), false);
         }
+        session.save_before_fatal_errors(&end);
         let due = session.progress.iteration.is_multiple_of(session.config.run.checkpoint_every);
         if (requests.take_save() || due)
             && !session.finished()
@@ -125,7 +125,7 @@ struct Iteration {
 struct Session {
     config: Config,
     folder: RunFolder,
-    lock: Locked,
+    lock: Arc<Locked>,
     keep: usize,
     dump_diverged: bool,
     task: Arc<Task>,
@@ -165,9 +165,10 @@ impl Session {
             );
         }
         let folder = RunFolder::containing(place)?;
-        let newest = folder.checkpoints().newest_first();
-        ensure!(!newest.is_empty(), "{} holds no checkpoint", place.display());
+        let checkpoints = folder.checkpoints();
+        ensure!(!checkpoints.newest_first().is_empty(), "{} holds no checkpoint", place.display());
         let lock = folder.lock()?;
+        let newest = checkpoints.newest_first();
         let mut overrides = args.settings.set.clone();
         overrides.extend(asked(args));
         let places = if place.is_dir() { newest.clone() } else { vec![place.to_owned()] };
@@ -192,13 +193,14 @@ impl Session {
         let rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
         let (folder, lock) = folder()?;
-        let (keep, dump_diverged) = (args.keep, args.dump_diverged);
+        // The newest, and one in case it is damaged.
+        let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
         Ok(Self {
             config,
             folder,
-            lock,
+            lock: Arc::new(lock),
             keep,
-            dump_diverged,
+            dump_diverged: args.dump_diverged,
             scene: task.scene().fingerprint()?,
             task,
             pool,
@@ -389,7 +391,7 @@ mod tests {
         let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]", "run.eval_every=1000"];
         let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
         let config = Config::resolve(None, &sets).unwrap();
-        let args = TrainArgs { keep: 2, ..TrainArgs::default() };
+        let args = TrainArgs::default();
         let mut session = Session::new(config, || RunFolder::create(Some(place.path()), None), &args).unwrap();
         session.pool.reset(session.rollout.first_observations_mut());
         let (mut report, never) = (session.open_report().unwrap(), AtomicBool::new(false));

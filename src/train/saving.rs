@@ -3,10 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Error, Result, anyhow, ensure};
 
-use super::{Session, is_better, version};
-use crate::cli::TrainArgs;
+use super::{Session, version};
 use crate::config::{Config, Override};
 use crate::dump;
 use crate::env::EnvState;
@@ -46,21 +45,17 @@ impl Session {
         checkpoint.finish()
     }
 
-    /// The best policy of the folder may have been saved after the checkpoint that is resumed from; it is not given up for a
-    /// worse one. If it is lost, the next one is the best.
+    /// The best is what is in the folder. It may have been saved after the checkpoint that is resumed from, and is not given up for
+    /// a worse one; if it is lost, the next one is the best.
     fn remember_best(&mut self) {
-        let saved = run::read_bytes(&self.folder.checkpoints().best()).and_then(|bytes| Checkpoint::parse(&bytes));
-        let saved = saved.ok().and_then(|checkpoint| checkpoint.progress.best);
-        let known = self.progress.best.filter(|&known| saved.is_some_and(|saved| is_better(known, Some(saved))));
-        self.progress.best = known.or(saved);
+        self.progress.best = best_of(&self.folder.checkpoints().best());
     }
 
     /// Writes logs, the best policy and the checkpoint, each before what speaks of it.
     pub(super) fn save(&mut self, end: &Checkpoint, report: &mut Report) -> Result<()> {
         if !self.lock.holds() {
             // The folder was deleted and is made anew; if not by another training.
-            self.folder.describe(&self.config.to_text(), &version())?;
-            self.lock = self.folder.lock()?;
+            self.lock = Arc::new(self.folder.lock()?);
         }
         report.sync();
         self.folder.describe(&self.config.to_text(), &version())?;
@@ -70,79 +65,45 @@ impl Session {
     }
 
     pub(super) fn write_to(&self, folder: &RunFolder, end: &Checkpoint) -> Result<()> {
-        let checkpoints = folder.checkpoints();
-        let there = checkpoints.best().exists();
-        match &self.best {
-            Some(_) if self.best_is_saved && there => {}
-            Some(best) => {
-                run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
-                checkpoints.write_best(&best.to_bytes()?)?;
-            }
-            None if there => {}
-            None => run::write_whole(&folder.policy(), &end.policy_alone().to_bytes()?)?,
-        }
-        checkpoints.write(end.progress.iteration, &end.to_bytes()?, self.keep)
+        let unsaved = !self.best_is_saved || !folder.checkpoints().best().exists();
+        write(folder, self.best.as_deref().filter(|_| unsaved), end, self.keep)
     }
 
     /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report.
     pub(super) fn save_at_last(&mut self, end: &Checkpoint, report: &mut Report) -> Result<()> {
         let saved = self.save(end, report);
         report.finish();
-        let Err(error) = saved else { return Ok(()) };
-        match self.save_elsewhere(end) {
-            Ok(run) => bail!(
-                "{error:#}\nThe state after {} is in {} instead; go on with\n  {}",
-                self.steps_made(),
-                run.path().display(),
-                self.how_to_resume(run.path())
-            ),
-            Err(other) => bail!(
-                "{error:#}\nNor could it be saved elsewhere: {other:#}\nTMPDIR=PATH names a place to try; go on from the last \
-                 checkpoint with\n  {}",
-                self.how_to_resume(self.folder.path())
-            ),
-        }
+        saved.map_err(|error| elsewhere(error, self.best.as_deref(), end, &self.resuming()))
     }
 
-    fn save_elsewhere(&self, end: &Checkpoint) -> Result<RunFolder> {
-        let run = RunFolder::for_now()?;
-        match self.write_to(&run, end) {
-            Ok(()) => Ok(run),
-            Err(error) => {
-                run.remove();
-                Err(error)
-            }
-        }
-    }
-
-    /// The command that goes on with a run in this folder, as this training does.
     pub(super) fn how_to_resume(&self, run: &Path) -> String {
-        let mut command = format!("shadow-repose train --resume {}", run::quoted(&run.display().to_string()));
-        if let Some(model) = self.config.env.model_file() {
-            command += &format!(" --set {}", run::quoted(&format!("{MODEL}={}", model.display())));
-        }
-        if self.keep != TrainArgs::KEEP {
-            command += &format!(" --keep {}", self.keep);
-        }
-        if self.dump_diverged {
-            command += " --dump-diverged";
-        }
-        command
+        how_to_resume(run, &self.resuming())
+    }
+
+    /// The options with which this training is resumed.
+    fn resuming(&self) -> String {
+        let model = self.config.env.model_file().map(|model| run::quoted(&format!("{MODEL}={}", model.display())));
+        let model = model.map_or(String::new(), |set| format!(" --set {set}"));
+        format!("{model}{}", if self.dump_diverged { " --dump-diverged" } else { "" })
     }
 
     /// Has `end` saved where MuJoCo ends the process by itself.
     pub(super) fn save_before_fatal_errors(&self, end: &Arc<Checkpoint>) {
-        let (end, checkpoints, keep) = (end.clone(), self.folder.checkpoints(), self.keep);
-        let how_to_resume = self.how_to_resume(self.folder.path());
+        let (end, folder, lock, keep) = (end.clone(), self.folder.clone(), self.lock.clone(), self.keep);
+        let best = self.best.clone().filter(|_| !self.best_is_saved);
+        let options = self.resuming();
         sim::before_fatal_error(move |said| {
             let whose = env::stepping().map_or(String::new(), |number| format!("environment {number}: "));
             run::say(&format!("error: {whose}MuJoCo cannot go on: {said}"));
-            let iteration = end.progress.iteration;
-            match end.to_bytes().and_then(|bytes| checkpoints.write(iteration, &bytes, keep)) {
+            let held =
+                if lock.holds() { Ok(()) } else { Err(anyhow!("{} has been replaced", folder.path().display())) };
+            match held.and_then(|()| write(&folder, best.as_deref(), &end, keep)) {
                 Ok(()) => {
-                    run::say(&format!("saved the state after {iteration} iterations; go on with\n  {how_to_resume}"))
+                    let iteration = end.progress.iteration;
+                    let command = how_to_resume(folder.path(), &options);
+                    run::say(&format!("saved the state after {iteration} iterations; go on with\n  {command}"));
                 }
-                Err(error) => run::say(&format!("error: {error:#}")),
+                Err(error) => run::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &end, &options))),
             }
         });
     }
@@ -158,6 +119,53 @@ impl Session {
             }
         }
     }
+}
+
+/// Writes the best, if there is one to be written, and the checkpoint into a run folder. As long as nothing was scored, the
+/// policy to share is that of the checkpoint.
+fn write(folder: &RunFolder, best: Option<&Checkpoint>, end: &Checkpoint, keep: usize) -> Result<()> {
+    let checkpoints = folder.checkpoints();
+    if let Some(best) = best {
+        run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
+        checkpoints.write_best(&best.to_bytes()?)?;
+    } else if best_of(&folder.policy()).is_none() {
+        run::write_whole(&folder.policy(), &end.policy_alone().to_bytes()?)?;
+    }
+    checkpoints.write(end.progress.iteration, &end.to_bytes()?, keep)
+}
+
+/// Saves a state that could not be saved in its place for this reason elsewhere; what there is to say of both.
+fn elsewhere(reason: Error, best: Option<&Checkpoint>, end: &Checkpoint, options: &str) -> Error {
+    let saved = RunFolder::for_now().and_then(|run| match write(&run, best, end, 1) {
+        Ok(()) => Ok(run),
+        Err(error) => {
+            run.remove();
+            Err(error)
+        }
+    });
+    match saved {
+        Ok(run) => anyhow!(
+            "{reason:#}\nThe state after {} iterations is in {} instead; go on with\n  {}",
+            end.progress.iteration,
+            run.path().display(),
+            how_to_resume(run.path(), options)
+        ),
+        Err(error) => anyhow!(
+            "{reason:#}\nNor could it be saved elsewhere: {error:#}\nTMPDIR=PATH names a place to try; what there is now is the last \
+             checkpoint before"
+        ),
+    }
+}
+
+/// The command that goes on with a run in this folder, as this training does.
+fn how_to_resume(run: &Path, options: &str) -> String {
+    format!("shadow-repose train --resume {}{options}", run::quoted(&run.display().to_string()))
+}
+
+/// The evaluation that a checkpoint or a policy is the best of; none where the file is not there or damaged.
+fn best_of(path: &Path) -> Option<[f64; 2]> {
+    let checkpoint = run::read_bytes(path).and_then(|bytes| Checkpoint::parse(&bytes));
+    checkpoint.ok().and_then(|checkpoint| checkpoint.progress.best)
 }
 
 /// Makes sure that a checkpoint holds the states of as many environments as its configuration says, and of as many steps:

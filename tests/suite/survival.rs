@@ -236,17 +236,21 @@ fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immed
 }
 
 #[test]
-fn a_terminal_that_is_closed_sends_two_signals_and_the_state_is_saved() {
-    if ignored(1) {
-        eprintln!("not tested: SIGHUP is ignored here");
-        return;
+fn a_request_that_is_sent_twice_as_by_a_closed_terminal_is_one_and_the_state_is_saved() {
+    for (signal, code) in [("HUP", 129), ("INT", 130)] {
+        if signal == "HUP" && ignored(1) {
+            eprintln!("not tested: SIGHUP is ignored here");
+            continue;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let (mut child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
+        // From one shell: a new process for each could take longer than a key is pressed.
+        let twice = format!("kill -{signal} {0}; kill -{signal} {0}", child.id());
+        assert!(Command::new("sh").args(["-c", &twice]).status().unwrap().success());
+        let said: Vec<String> = lines.map_while(|line| line.ok()).collect();
+        assert_eq!(child.wait().unwrap().code(), Some(code));
+        assert!(said.iter().any(|line| line.contains("stopped after")), "{said:?}");
     }
-    let folder = tempfile::tempdir().unwrap();
-    let (child, lines) = endless(folder.path(), &["--set", "run.checkpoint_every=1000000"]);
-    send("HUP", &child);
-    let (code, said) = ended_by("HUP", child, lines);
-    assert_eq!(code, Some(129));
-    assert!(said.contains("stopped after"), "{said}");
 }
 
 #[test]
@@ -312,6 +316,10 @@ fn the_newest_checkpoints_are_kept_as_many_as_asked_for() {
     let args = train(&["--total-steps", "1280", "--run-dir", "run", "--keep", "3", "--set", "run.checkpoint_every=1"]);
     succeeded(program(folder.path(), &args));
     let expected = ["best", "iteration-00000008", "iteration-00000009", "iteration-00000010", "latest"];
+    assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
+    // As many in a resumed run, where nothing else is said.
+    succeeded(resume(folder.path(), &["--total-steps", "1408"]));
+    let expected = ["best", "iteration-00000009", "iteration-00000010", "iteration-00000011", "latest"];
     assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
 }
 
