@@ -40,6 +40,8 @@ pub enum Command {
     Play(PlayArgs),
     /// Look at the scene, without a policy
     View(ViewArgs),
+    /// Draw the learning curves of runs: SVG, or PNG
+    Plot(PlotArgs),
     /// Measure this machine: physics, environments, learner, and all together
     Bench(BenchArgs),
 }
@@ -235,6 +237,38 @@ pub enum Baseline {
     Zero,
     /// Uniformly random actions
     Random,
+}
+
+/// `plot`
+#[derive(Args, Debug)]
+pub struct PlotArgs {
+    /// Run folders, or their metrics.csv
+    #[arg(required = true, value_name = "RUN")]
+    pub runs: Vec<PathBuf>,
+    /// The picture: SVG or PNG, by the name
+    #[arg(long, value_name = "FILE", default_value = "learning.svg")]
+    pub out: PathBuf,
+    /// A column of metrics.csv, each in a panel of its own; may be repeated [default: goals, rotation error and drops per episode]
+    #[arg(long, value_name = "COLUMN")]
+    pub metric: Vec<String>,
+    /// What is laid along
+    #[arg(long, value_enum, default_value_t = Along::Steps)]
+    pub along: Along,
+    /// Iterations that a point of a curve is the mean of
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    pub smooth: usize,
+    /// Pixels of the whole picture [default: 800 wide, 260 for each panel]
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    pub size: Option<[u32; 2]>,
+}
+
+/// What a learning curve is drawn along.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Along {
+    /// Control steps over all environments
+    Steps,
+    /// Hours spent collecting and learning, without evaluations and saving
+    Hours,
 }
 
 /// `bench`

@@ -20,6 +20,7 @@
 //! | [`play`], [`trace`] | a policy plays: scores as table and JSON; episodes as JSON lines |
 //! | [`mod@view`] | the scene without a policy |
 //! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
+//! | [`plot`] | learning curves of runs |
 //! | [`mod@bench`] | what this machine can do |
 //! | [`mod@env`] | the task, its reward, and many of them in blocks |
 //! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
@@ -67,6 +68,7 @@ pub mod evaluate;
 pub mod film;
 pub mod load;
 pub mod play;
+pub mod plot;
 pub mod ppo;
 pub mod quat;
 pub mod rng;

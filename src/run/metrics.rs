@@ -9,6 +9,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 
 use super::file::{expect_named, sync_folder};
+use super::folder::METRICS;
+
+/// A million rows take half of this.
+const LARGEST_TABLE: u64 = 1 << 30;
 
 /// No row of ours is longer; the rest of a longer one is not a row either.
 const LONGEST_ROW: u64 = 1 << 20;
@@ -79,6 +83,38 @@ impl Metrics {
     }
 }
 
+/// The values in these columns of a table, row by row; `NaN` where a cell is empty. `place` is the file, or its run's folder.
+///
+/// # Errors
+/// A file that cannot be read, has no such column, or holds something else than numbers.
+pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
+    let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
+    let context = || format!("cannot read {}", path.display());
+    let mut lines = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE)).lines();
+    let header = lines.next().transpose().with_context(context)?.unwrap_or_default();
+    let names: Vec<&str> = header.split(',').collect();
+    let place = |column: &&str| {
+        let found = names.iter().position(|name| name == column);
+        found.with_context(|| format!("{} has no column {column}; it has {}", path.display(), names.join(" ")))
+    };
+    let places: Vec<usize> = columns.iter().map(place).collect::<Result<_>>()?;
+    let mut table = Vec::new();
+    for (i, line) in lines.enumerate() {
+        let line = line.with_context(context)?;
+        let cells: Vec<&str> = line.split(',').collect();
+        if cells.len() != names.len() {
+            // The last row of a run that is under way.
+            continue;
+        }
+        let number = |&place: &usize| match cells[place] {
+            "" => Ok(f64::NAN),
+            cell => cell.parse().with_context(|| format!("{}, row {}: `{cell}` is no number", path.display(), i + 1)),
+        };
+        table.push(places.iter().map(number).collect::<Result<_>>()?);
+    }
+    Ok(table)
+}
+
 /// Bytes of header and rows up to an iteration, and the number of rows after it; `None` where the header is another.
 fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u64, u64)>> {
     // A device has no rows to keep, and may have no end.
@@ -117,6 +153,16 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u6
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn columns_are_read_by_name_with_gaps_and_without_the_row_under_way() {
+        let (place, path) = table("1,0.5\n2,\n3");
+        let read = read_metrics(&path, &["loss", "iteration"]).unwrap();
+        assert!(read.len() == 2 && read[0] == [0.5, 1.0] && read[1][0].is_nan() && read[1][1] == 2.0, "{read:?}");
+        assert_eq!(read_metrics(place.path(), &["loss"]).unwrap().len(), 2);
+        let refusal = read_metrics(&path, &["goals"]).unwrap_err().to_string();
+        assert!(refusal.contains("no column goals; it has iteration loss"), "{refusal}");
+    }
 
     fn table(rows: &str) -> (tempfile::TempDir, PathBuf) {
         let place = tempfile::tempdir().unwrap();

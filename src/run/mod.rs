@@ -1,5 +1,6 @@
 //! The outside of a run: its folder, its logs, the terminal, signals. Knows neither environments nor learning.
 
+mod chart;
 mod checkpoints;
 mod events;
 mod file;
@@ -12,6 +13,7 @@ mod metrics;
 mod pip;
 mod report;
 
+pub use chart::{Chart, Curve, Panel};
 pub use checkpoints::Checkpoints;
 pub use file::{OutputFile, read_bytes, read_text, same_file, write_whole};
 #[cfg(feature = "video")]
@@ -19,6 +21,7 @@ pub use film::{FilmFormat, FilmWriter, write_png};
 pub use folder::{Locked, RunFolder, newest_checkpoint, resolve_checkpoint};
 pub use interrupt::Requests;
 pub use meshes::hand_meshes;
+pub use metrics::read_metrics;
 pub use report::{Bar, Report, Status};
 
 use anyhow::{Context, Result};

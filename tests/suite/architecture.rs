@@ -34,6 +34,7 @@ fn outside_worlds_are_fenced() {
         ("openh264", "run"),
         ("shiguredo_mp4", "run"),
         ("png::", "run"),
+        ("plotters", "run"),
     ];
     // What a folder must not know.
     let blind = [

@@ -216,6 +216,38 @@ fn an_own_scene_is_trained_on_and_used_again_only_when_it_is_named() {
 }
 
 #[test]
+fn learning_curves_are_drawn_of_any_columns_and_runs() {
+    let folder = trained_for("1280", &[]);
+    fs::create_dir(folder.path().join("other")).unwrap();
+    fs::copy(folder.path().join("run/metrics.csv"), folder.path().join("other/metrics.csv")).unwrap();
+    let plot = |more: &[&str]| {
+        program(folder.path(), &[&["plot", "run", "other/metrics.csv", "--smooth", "2"], more].concat())
+    };
+    succeeded(plot(&[]));
+    let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
+    for part in ["episode/goals", "episode/rot_dist", "episode/drop_rate", "run", "other", "million control steps"] {
+        assert!(svg.lines().any(|line| line.trim() == part), "{part} is not in\n{svg}");
+    }
+    // Five points a curve.
+    let points = |line: &&str| line.contains("<polyline") && line.matches(',').count() >= 5;
+    assert!(svg.lines().filter(|line| points(line)).count() >= 6, "{svg}");
+    succeeded(plot(&["--metric", "loss/value", "--along", "hours", "--out", "loss.svg", "--size", "400x300"]));
+    let svg = fs::read_to_string(folder.path().join("loss.svg")).unwrap();
+    assert!(
+        svg.contains("loss/value") && svg.contains("hours") && svg.contains("width=\"400\"") && !svg.contains("goals")
+    );
+    for (more, part) in [
+        (["--metric", "loss/vaule"], "has no column loss/vaule"),
+        (["--out", "x.pdf"], "must end in .svg or .png"),
+        (["--out", "absent/x.svg"], "cannot write absent/x.svg"),
+    ] {
+        let refused = plot(&more);
+        assert_eq!(refused.status.code(), Some(1));
+        assert!(stderr(&refused).contains(part), "{}", stderr(&refused));
+    }
+}
+
+#[test]
 fn bench_prints_every_figure() {
     let folder = tempfile::tempdir().unwrap();
     let args = ["bench", "--json", "--set", "env.num_envs=64", "--set", "ppo.hidden=[16]", "--threads", "2"];

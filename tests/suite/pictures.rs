@@ -240,6 +240,25 @@ fn without_egl_the_packages_are_named() {
 }
 
 #[test]
+fn learning_curves_are_drawn_as_png_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut table = "env_steps,time/collect_s,time/update_s,loss\n".to_owned();
+    (0..100).for_each(|row| table += &format!("{row}000000,1,1,{}\n", 100 - row));
+    fs::write(folder.path().join("metrics.csv"), table).unwrap();
+    let args = ["plot", ".", "--metric", "loss", "--smooth", "5", "--out", "x.png", "--size", "300x200"];
+    succeeded(program(folder.path(), &args));
+    let (size, rgb) = picture(&folder.path().join("x.png"));
+    assert_eq!(size, [300, 200]);
+    // The first curve is blue, and falls from the upper left to the lower right.
+    let blue = |x: usize, y: usize| matches!(rgb[3 * (300 * y + x)..][..3], [r, g, b] if b > 150 && r < 60 && g < 160);
+    let height = |columns: std::ops::Range<usize>| {
+        let found: Vec<usize> = columns.flat_map(|x| (0..200).filter(move |&y| blue(x, y))).collect();
+        found.iter().sum::<usize>() as f64 / found.len() as f64
+    };
+    assert!(height(200..220) > height(120..140) + 20.0, "{} {}", height(120..140), height(200..220));
+}
+
+#[test]
 fn pictures_and_films_that_cannot_be_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |args: &[&str], code: i32, part: &str| {

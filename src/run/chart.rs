@@ -1,0 +1,119 @@
+//! A picture with curves in panels, one above the other: SVG, or PNG where pictures are built in.
+
+use std::path::Path;
+
+use anyhow::{Result, anyhow, bail};
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+use super::write_whole;
+
+/// Curves of one quantity.
+pub struct Panel {
+    /// Of the quantity.
+    pub name: String,
+    /// In the order of the legend.
+    pub curves: Vec<Curve>,
+}
+
+/// A line through points.
+pub struct Curve {
+    /// For the legend.
+    pub name: String,
+    /// x and y, x rising.
+    pub points: Vec<[f64; 2]>,
+}
+
+/// Panels with one x axis.
+pub struct Chart {
+    /// What the x axis shows.
+    pub along: String,
+    /// From top to bottom.
+    pub panels: Vec<Panel>,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+}
+
+/// Told apart also by those who see no red or green: M. Okabe, K. Ito, "Color universal design" (2008).
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+];
+
+impl Chart {
+    /// Writes the picture, in the format that its name asks for.
+    ///
+    /// # Errors
+    /// Another format, a place that cannot be written to, a picture too small for its panels.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let [width, height] = self.size;
+        #[cfg(feature = "video")]
+        {
+            // Where pictures are built in, letters are measured also for SVG. A second time has no effect.
+            let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
+        }
+        match path.extension().and_then(|extension| extension.to_str()) {
+            Some("svg") => {
+                let mut text = String::new();
+                self.draw(SVGBackend::with_string(&mut text, (width, height)).into_drawing_area())?;
+                write_whole(path, text.as_bytes())
+            }
+            #[cfg(feature = "video")]
+            Some("png") => {
+                let mut rgb = vec![0; 3 * width as usize * height as usize];
+                self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
+                super::write_png(path, self.size, &rgb)
+            }
+            #[cfg(not(feature = "video"))]
+            Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", path.display()),
+            _ => bail!("{}: the name of a chart must end in .svg or .png", path.display()),
+        }
+    }
+
+    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+        let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
+        area.fill(&WHITE).map_err(failed)?;
+        let last = self.panels.len() - 1;
+        for (i, (panel, part)) in self.panels.iter().zip(area.split_evenly((self.panels.len(), 1))).enumerate() {
+            let points = || panel.curves.iter().flat_map(|curve| &curve.points);
+            let [x, y] = [0, 1].map(|axis| range(points().map(move |point| point[axis])));
+            let mut chart = ChartBuilder::on(&part)
+                .caption(&panel.name, ("sans-serif", 17))
+                .margin(8)
+                .x_label_area_size(if i == last { 42 } else { 24 })
+                .y_label_area_size(56)
+                .build_cartesian_2d(x, y)
+                .map_err(failed)?;
+            let mut mesh = chart.configure_mesh();
+            mesh.max_light_lines(0).label_style(("sans-serif", 13));
+            if i == last {
+                mesh.x_desc(&self.along);
+            }
+            mesh.draw().map_err(failed)?;
+            for (curve, colour) in panel.curves.iter().zip(COLOURS.iter().cycle()) {
+                let line = LineSeries::new(curve.points.iter().map(|&[x, y]| (x, y)), colour.stroke_width(2));
+                let drawn = chart.draw_series(line).map_err(failed)?;
+                drawn
+                    .label(&curve.name)
+                    .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+            }
+            if i == 0 {
+                let mut legend = chart.configure_series_labels();
+                legend.position(SeriesLabelPosition::UpperLeft).label_font(("sans-serif", 13));
+                legend.background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.2)).draw().map_err(failed)?;
+            }
+        }
+        area.present().map_err(failed)
+    }
+}
+
+/// From the least to the greatest of the values, and zero; not empty.
+fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
+    let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
+    if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }
+}
