@@ -34,6 +34,9 @@ pub struct Chart {
     pub size: [u32; 2],
 }
 
+/// Not black with opacity, which not every reader of SVG knows.
+const GRID: RGBColor = RGBColor(225, 225, 225);
+
 /// Told apart also by those who see no red or green: M. Okabe, K. Ito, "Color universal design" (2008).
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
@@ -85,12 +88,12 @@ impl Chart {
             let mut chart = ChartBuilder::on(&part)
                 .caption(&panel.name, ("sans-serif", 17))
                 .margin(8)
-                .x_label_area_size(if i == last { 42 } else { 24 })
+                .x_label_area_size(if i == last { 46 } else { 24 })
                 .y_label_area_size(56)
                 .build_cartesian_2d(x, y)
                 .map_err(failed)?;
             let mut mesh = chart.configure_mesh();
-            mesh.max_light_lines(0).label_style(("sans-serif", 13));
+            mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", 13));
             if i == last {
                 mesh.x_desc(&self.along);
             }
