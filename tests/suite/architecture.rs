@@ -3,6 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use shadow_repose::config::Config;
+
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -57,6 +59,18 @@ fn outside_worlds_are_fenced() {
         }
         assert!(text.starts_with("//!"), "{} must open with what it is", inside.display());
         assert!(text.lines().count() <= 450, "{} has grown too long", inside.display());
+    }
+}
+
+#[test]
+fn every_configuration_that_comes_with_the_program_is_valid() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let mut files = Vec::new();
+    sources(&folder, &mut files);
+    assert!(files.len() > 1);
+    for path in files {
+        let text = fs::read_to_string(&path).unwrap();
+        Config::from_text(&path, &text, &[]).unwrap();
     }
 }
 
