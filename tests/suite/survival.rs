@@ -204,7 +204,7 @@ fn ignored(signal: u32) -> bool {
 }
 
 /// A training whose every minibatch takes many seconds, in its first update.
-fn slow(folder: &Path) -> Child {
+fn slow(folder: &Path) -> (Child, Lines<BufReader<ChildStderr>>) {
     let mut args = train(&["--run-dir", "run"]);
     for setting in ["env.num_envs=64", "ppo.horizon=512", "ppo.hidden=[3072,3072]", "ppo.minibatches=1"] {
         args.extend(["--set", setting]);
@@ -214,25 +214,28 @@ fn slow(folder: &Path) -> Child {
     assert!(lines.next().unwrap().unwrap().contains("run folder"));
     // 32768 steps take some seconds, the minibatch after them many.
     std::thread::sleep(Duration::from_secs(6));
-    child
+    (child, lines)
 }
 
 #[test]
 fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immediately_does_not() {
     let folder = tempfile::tempdir().unwrap();
-    let mut child = slow(folder.path());
+    let (mut child, lines) = slow(folder.path());
     send("TERM", &child);
     send("TERM", &child);
     std::thread::sleep(Duration::from_millis(1500));
-    if child.try_wait().unwrap().is_none() {
-        // It is still at its minibatch, so it was not the second signal that ended it.
-        send("TERM", &child);
-        let asked = Instant::now();
-        assert_eq!(child.wait().unwrap().code(), Some(143));
-        assert!(asked.elapsed() < Duration::from_millis(1500), "{:?}", asked.elapsed());
-    } else {
-        panic!("a minibatch is too fast here, or the second of two signals at once has ended the program");
+    if child.try_wait().unwrap().is_some() {
+        // Too fast a machine to be caught at its minibatch; but it must have taken the two as one, and saved.
+        let said: Vec<String> = lines.map_while(|line| line.ok()).collect();
+        assert!(said.iter().any(|line| line.contains("stopped after")), "{said:?}");
+        eprintln!("not tested: a minibatch is too fast here");
+        return;
     }
+    // It is still at its minibatch, so the second signal has not ended it.
+    send("TERM", &child);
+    let asked = Instant::now();
+    assert_eq!(child.wait().unwrap().code(), Some(143));
+    assert!(asked.elapsed() < Duration::from_millis(1500), "{:?}", asked.elapsed());
 }
 
 #[test]
