@@ -13,6 +13,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task, panic_message};
+use crate::perception::perception;
 use crate::ppo::{FrozenPolicy, Workspace};
 use crate::rng::{self, Rng};
 
@@ -153,7 +154,9 @@ impl Actor<'_> {
         work: Option<&mut Workspace>,
     ) -> Result<()> {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
-            policy.forward(observations, [Some(actions), None], work)?;
+            let mut seen = observations.to_vec();
+            perception(policy.symmetry())(&mut seen);
+            policy.forward(&seen, [Some(actions), None], work)?;
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
             match self {

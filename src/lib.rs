@@ -67,6 +67,7 @@ pub mod evaluate;
 #[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
 pub mod film;
 pub mod load;
+pub mod perception;
 pub mod play;
 pub mod plot;
 pub mod ppo;

@@ -26,6 +26,8 @@ pub const BUILTIN_MODEL: &str = "builtin";
 pub struct Config {
     /// The task and its physics.
     pub env: EnvConfig,
+    /// What training changes of the task and adds to its reward.
+    pub training: TrainingConfig,
     /// The learner.
     pub ppo: PpoConfig,
     /// The course of a training.
@@ -43,6 +45,8 @@ pub struct EnvConfig {
     pub num_actuators: usize,
     pub sim_dt: f64,
     pub ctrl_dt: f64,
+    pub friction_scale: f64,
+    pub cube_mass_scale: f64,
     pub max_episode_seconds: f64,
     pub goal_position: [f64; 3],
     pub target_height: f64,
@@ -73,6 +77,23 @@ pub enum SuccessHold {
     Consecutive,
 }
 
+/// What only training sees; `configs/repose.toml` says what each key means and in which unit.
+#[allow(missing_docs)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingConfig {
+    pub task_reward: f64,
+    pub progress_reward: f64,
+    pub goal_reward: f64,
+    pub drop_reward: f64,
+    pub tolerance_start: f64,
+    pub tolerance_steps: u64,
+    pub hold_start: u32,
+    pub hold_steps: u64,
+    pub goal_angle_start: f64,
+    pub goal_angle_steps: u64,
+}
+
 /// The learner; `configs/repose.toml` says what each key means.
 #[allow(missing_docs)]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -83,6 +104,7 @@ pub struct PpoConfig {
     pub minibatches: usize,
     pub hidden: Vec<usize>,
     pub activation: Activation,
+    pub symmetry: Symmetry,
     pub backend: Backend,
     pub precision: Precision,
     pub learning_rate: f64,
@@ -107,6 +129,16 @@ pub enum Activation {
     Relu,
     Silu,
     Tanh,
+}
+
+/// What a policy takes to be the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Symmetry {
+    /// Nothing.
+    None,
+    /// A cube and the same cube turned onto itself.
+    Cube,
 }
 
 /// What computes the nets, their gradients and the steps of the optimizer.

@@ -5,7 +5,7 @@ use super::{Backend, Config, Precision};
 impl Config {
     /// Every rule that the values break, as "key = value: must …".
     pub(super) fn violations(&self) -> Vec<String> {
-        let Self { env, ppo, run } = self;
+        let Self { env, training, ppo, run } = self;
         let mut rules = Rules::default();
         rules.at_least("env.num_envs", env.num_envs, 1);
         rules.at_most("env.num_envs", env.num_envs, 1 << 16);
@@ -14,6 +14,8 @@ impl Config {
         rules.equal("env.num_actuators", env.num_actuators, 20);
         rules.positive("env.sim_dt", env.sim_dt);
         rules.positive("env.ctrl_dt", env.ctrl_dt);
+        rules.positive("env.friction_scale", env.friction_scale);
+        rules.positive("env.cube_mass_scale", env.cube_mass_scale);
         let ratio = env.ctrl_dt / env.sim_dt;
         rules.check(
             ratio.is_nan()
@@ -43,6 +45,20 @@ impl Config {
         rules.not_negative("env.reset_position_noise", env.reset_position_noise);
         rules.not_negative("env.reset_dof_pos_noise", env.reset_dof_pos_noise);
         rules.not_negative("env.reset_dof_vel_noise", env.reset_dof_vel_noise);
+
+        rules.not_negative("training.task_reward", training.task_reward);
+        rules.positive("training.tolerance_start", training.tolerance_start);
+        rules.at_least("training.hold_start", training.hold_start as usize, 1);
+        let most = env.max_consecutive_successes;
+        rules.check(
+            training.hold_start <= most || training.hold_steps == 0,
+            "training.hold_start",
+            training.hold_start,
+            &format!("be at most env.max_consecutive_successes = {most}"),
+        );
+        rules.positive("training.goal_angle_start", training.goal_angle_start);
+        let half_turn = training.goal_angle_start <= std::f64::consts::PI;
+        rules.check(half_turn, "training.goal_angle_start", training.goal_angle_start, "be at most pi");
 
         rules.at_least("ppo.horizon", ppo.horizon, 1);
         rules.at_least("ppo.epochs", ppo.epochs, 1);

@@ -2,7 +2,7 @@
 
 use anyhow::{Result, ensure};
 
-use super::{EnvState, RewardTerms, SavedEnv};
+use super::{EnvState, RewardTerms, SavedEnv, Shaping};
 
 /// The sums over one episode.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -54,6 +54,8 @@ pub struct Recent {
     pub steps: u64,
     /// Rewards by term.
     pub reward: RewardTerms,
+    /// What training pays besides, by term.
+    pub shaping: Shaping,
     /// Steps on which the physics diverged.
     pub diverged: u64,
 }
@@ -62,6 +64,7 @@ impl std::ops::AddAssign for Recent {
     fn add_assign(&mut self, other: Self) {
         self.steps += other.steps;
         self.reward += other.reward;
+        self.shaping += other.shaping;
         self.diverged += other.diverged;
     }
 }

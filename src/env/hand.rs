@@ -11,6 +11,12 @@ pub const ACTION_SIZE: usize = 20;
 /// previous action.
 pub const OBSERVATION_SIZE: usize = 24 + 24 + 13 + 7 + 4 + 65 + ACTION_SIZE;
 
+/// Where the cube's orientation stands in an observation.
+pub const CUBE_ORIENTATION: usize = 51;
+
+/// Where the goal's orientation stands in an observation.
+pub const GOAL_ORIENTATION: usize = 64;
+
 /// Joints in the order of the observation.
 const JOINTS: [&str; 24] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",

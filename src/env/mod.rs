@@ -4,6 +4,7 @@
 
 mod episode;
 mod hand;
+mod lesson;
 mod pool;
 mod repose;
 mod reward;
@@ -11,7 +12,8 @@ mod state;
 mod tail;
 
 pub use episode::{EpisodeStats, Recent, Score};
-pub use hand::{ACTION_SIZE, Hand, OBSERVATION_SIZE};
+pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE};
+pub use lesson::{Lesson, Shaping};
 pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message, stepping};
 pub use repose::{Diverged, Repose, StepDetails, Task};
 pub use reward::RewardTerms;

@@ -28,6 +28,7 @@ pub struct EnvBlock<E: Env> {
     /// The number of environments in the whole pool: so far apart are the numbers of an environment's episodes.
     stride: u64,
     finished: Vec<E::Episode>,
+    perceive: fn(&mut [f32]),
 }
 
 struct Slot<E: Env> {
@@ -56,9 +57,14 @@ impl<E: Env> EnvPool<E> {
         let block = |size| {
             let slots = slots.by_ref().take(size).collect();
             first += size;
-            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new() }
+            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new(), perceive: |_| {} }
         };
         Self { blocks: sizes.into_iter().map(block).collect() }
+    }
+
+    /// From now on turns the rows `[B, O]` of observations that it writes, in place, into those that the policy looks at.
+    pub fn perceive_with(&mut self, perceive: fn(&mut [f32])) {
+        self.blocks.iter_mut().for_each(|block| block.perceive = perceive);
     }
 
     /// The number of environments.
@@ -102,6 +108,7 @@ impl<E: Env> EnvPool<E> {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
                 slot.start(block.seed, block.stride, row);
                 slot.env.skip_ahead(age);
+                (block.perceive)(row);
             }
         });
     }
@@ -136,6 +143,7 @@ impl<E: Resumable> EnvPool<E> {
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
         let size = self.observation_size();
         let mut rows = state.rows(self.len())?;
+        let perceive = self.blocks[0].perceive;
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         for (i, (slot, row)) in
             slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
@@ -146,6 +154,7 @@ impl<E: Resumable> EnvPool<E> {
                 ensure!(next_episode < 1 << 60, "an episode with the number {next_episode}");
                 slot.next_episode = next_episode;
                 slot.env.restore(&mut state, row)?;
+                perceive(row);
                 state.finish()
             };
             restore().with_context(|| format!("environment {i}"))?;
@@ -188,10 +197,12 @@ impl<E: Env> EnvBlock<E> {
                 if let Some(end) = transition.end {
                     if end == End::Truncated {
                         final_row.copy_from_slice(row);
+                        (self.perceive)(final_row);
                     }
                     self.finished.push(slot.env.episode());
                     slot.start(self.seed, self.stride, row);
                 }
+                (self.perceive)(row);
             };
             // What a panic leaves half done is not used again.
             if let Err(panic) = catch_unwind(AssertUnwindSafe(step)) {

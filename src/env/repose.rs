@@ -3,19 +3,20 @@
 //! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter and new
 //! goal, ends, observation with the goal in force next.
 
+use std::f64::consts::PI;
 use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 
 use super::tail::{Recorder, Tail};
 use super::{
-    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Hand, OBSERVATION_SIZE, Recent, Resumable, RewardTerms, SavedEnv,
-    Transition,
+    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Hand, Lesson, OBSERVATION_SIZE, Recent, Resumable, RewardTerms,
+    SavedEnv, Shaping, Transition,
 };
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Look, Physics, Scene, Simulation};
+use crate::sim::{Look, Physics, Scene, Simulation, Variation};
 
 /// What all environments of a run share: the scene, the hand in it, the settings.
 pub struct Task {
@@ -30,7 +31,7 @@ impl Task {
     /// # Errors
     /// A scene that cannot be loaded or lacks a name, with its file.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::of(Scene::load(config.model_file(), config.sim_dt)?, config)
+        Self::of(Scene::load(config.model_file(), variation(config))?, config)
     }
 
     /// The same task in a scene to be looked at.
@@ -38,7 +39,7 @@ impl Task {
     /// # Errors
     /// As [`Task::new`], and meshes that cannot be read.
     pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::of(Scene::load_to_see(config.model_file(), config.sim_dt, look)?, config)
+        Self::of(Scene::load_to_see(config.model_file(), variation(config), look)?, config)
     }
 
     fn of(scene: Scene, config: &EnvConfig) -> Result<Arc<Self>> {
@@ -57,9 +58,14 @@ impl Task {
     }
 }
 
+fn variation(config: &EnvConfig) -> Variation {
+    Variation { timestep: config.sim_dt, friction: config.friction_scale, load: config.cube_mass_scale }
+}
+
 /// One hand with its cube.
 pub struct Repose {
     task: Arc<Task>,
+    lesson: Lesson,
     sim: Simulation,
     rng: Rng,
     goal: Quat,
@@ -107,6 +113,7 @@ impl Repose {
         Self {
             sim: task.scene.simulate(),
             task: task.clone(),
+            lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
             previous_action: [0.0; ACTION_SIZE],
@@ -119,6 +126,11 @@ impl Repose {
             recorder: Recorder::default(),
             diverged: None,
         }
+    }
+
+    /// Trains this lesson from now on, instead of the task itself.
+    pub fn set_lesson(&mut self, lesson: Lesson) {
+        self.lesson = lesson;
     }
 
     /// What happened in the last step.
@@ -180,7 +192,12 @@ impl Repose {
     }
 
     fn set_goal(&mut self) {
-        self.goal = self.draw_rotation();
+        let drawn = self.draw_rotation();
+        self.goal = match self.lesson.goal_angle < PI {
+            // The same distribution of axes, with angles that are smaller in proportion.
+            true => quat::mul(quat::power(drawn, self.lesson.goal_angle / PI), self.cube().1),
+            false => drawn,
+        };
         let [x, y, z] = self.task.config.goal_position;
         self.sim.place(self.task.hand.target, [x, y, z + self.task.config.target_height], self.goal);
     }
@@ -212,21 +229,22 @@ impl Repose {
         }
     }
 
-    /// Counts a step within tolerance or not, and draws a new goal when this one has been held long enough.
-    fn hold(&mut self, within: bool) {
+    /// Counts a step within tolerance or not, and draws a new goal when this one has been held long enough; tells if so.
+    fn hold(&mut self, within: bool) -> bool {
         if within {
             self.held += 1;
-            self.episode.in_tolerance += 1;
         } else if self.task.config.success_hold == SuccessHold::Consecutive {
             self.held = 0;
         }
-        if self.held >= self.task.config.max_consecutive_successes {
+        let reached = self.held >= self.lesson.hold;
+        if reached {
             self.held = 0;
             self.episode.goals += 1;
             self.set_goal();
             // In a scene where the target is more than a picture: nothing may be left of where it was.
             self.sim.refresh();
         }
+        reached
     }
 
     /// Writes the observation `[157]` of the present state, in the order of the task.
@@ -324,6 +342,7 @@ impl Env for Repose {
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
+        let rot_dist_before = self.rot_dist();
         self.actuate(action);
         self.recorder.record(&self.sim, action);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
@@ -339,7 +358,7 @@ impl Env for Repose {
         let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
         let reward = match diverged {
             true => RewardTerms::default(),
-            false => RewardTerms::of_step(config, rot_dist, goal_dist, &self.previous_action),
+            false => RewardTerms::of_step(config, self.lesson.tolerance, rot_dist, goal_dist, &self.previous_action),
         };
         self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged };
 
@@ -351,12 +370,16 @@ impl Env for Repose {
         self.recent.steps += 1;
         self.recent.reward += reward;
         self.recent.diverged += u64::from(diverged);
+        let mut shaping = Shaping::default();
         if diverged {
             let length = self.episode.length;
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, tail });
         } else {
             self.episode.rot_dist_sum += rot_dist;
-            self.hold(rot_dist <= self.task.config.success_tolerance);
+            self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
+            let reached = self.hold(rot_dist <= self.lesson.tolerance);
+            shaping = self.lesson.shaping(rot_dist_before - rot_dist, reached, self.episode.dropped);
+            self.recent.shaping += shaping;
         }
 
         let end = if diverged || self.episode.dropped {
@@ -365,7 +388,7 @@ impl Env for Repose {
             (self.age >= self.task.config.max_episode_steps()).then_some(End::Truncated)
         };
         self.observe(observation);
-        Transition { reward: reward.total() as f32, end }
+        Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }
     }
 
     fn episode(&self) -> EpisodeStats {

@@ -8,7 +8,7 @@ use super::Normalizer;
 use super::fused::{Arithmetic, Net, Workspace};
 use super::normalizer::Scaling;
 use super::reference::Mlp;
-use crate::config::{Activation, Backend, PpoConfig};
+use crate::config::{Activation, Backend, PpoConfig, Symmetry};
 use crate::rng::{self, Rng};
 
 /// The last layer of the actor starts this much smaller, so that the first actions are near the middle of their range.
@@ -22,6 +22,7 @@ pub struct Policy {
     hidden: Vec<usize>,
     activation: Activation,
     backend: Backend,
+    symmetry: Symmetry,
     sizes: [usize; 2],
 }
 
@@ -71,6 +72,7 @@ impl Policy {
             hidden: config.hidden.clone(),
             activation: config.activation,
             backend: config.backend,
+            symmetry: config.symmetry,
             sizes: [observation_size, action_size],
         })
     }
@@ -167,6 +169,11 @@ impl FrozenPolicy<'_> {
     /// What [`FrozenPolicy::forward`] needs, to be used again and again; `rows` rows are computed at a time, in floats.
     pub fn workspace(&self, rows: usize) -> Workspace {
         self.policy.workspace(rows, false, Arithmetic::F32)
+    }
+
+    /// What it takes to be the same; whoever gives it observations sees to that.
+    pub fn symmetry(&self) -> Symmetry {
+        self.policy.symmetry
     }
 
     /// The standard deviations of the actions `[A]`.

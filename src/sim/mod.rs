@@ -18,7 +18,7 @@ mod viewer;
 pub use fatal::before_fatal_error;
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
-pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
+pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene, Variation};
 pub use simulation::{BareSimulation, Physics, Simulation, SimulationState};
 
 #[cfg(feature = "viewer")]

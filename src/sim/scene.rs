@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{
-    MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
+    MjData, MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
 
 use super::fatal::quieten_mujoco;
@@ -19,6 +19,44 @@ const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
     origin: String,
+}
+
+/// What of the physics is set from outside; the rest is said by the scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Variation {
+    /// The physics timestep, s.
+    pub timestep: f64,
+    /// Every coefficient of friction between two bodies is multiplied by it.
+    pub friction: f64,
+    /// The mass and the inertia of every body with a free joint are multiplied by it.
+    pub load: f64,
+}
+
+impl Variation {
+    /// The scene's own physics, with this timestep in s.
+    pub fn none(timestep: f64) -> Self {
+        Self { timestep, friction: 1.0, load: 1.0 }
+    }
+
+    fn apply(self, model: &mut MjModel) {
+        model.opt_mut().timestep = self.timestep;
+        let scale = |factors: &mut [f64]| factors.iter_mut().for_each(|x| *x *= self.friction);
+        scale(model.geom_friction_mut().as_flattened_mut());
+        scale(model.pair_friction_mut().as_flattened_mut());
+        if self.load != 1.0 {
+            for body in 0..model.nbody() as usize {
+                let joint = usize::try_from(model.body_jntadr()[body]).ok();
+                if joint.is_some_and(|joint| model.jnt_type()[joint] == MjtJoint::mjJNT_FREE) {
+                    model.body_mass_mut()[body] *= self.load;
+                    model.body_inertia_mut()[body].iter_mut().for_each(|x| *x *= self.load);
+                }
+            }
+            // What MuJoCo works out from the masses once, as the scale of contact forces, must follow them.
+            let mut data = MjData::new(Box::new(model.clone()));
+            data.set_const();
+            *model = data.model().clone();
+        }
+    }
 }
 
 /// A hinge joint with limits.
@@ -59,11 +97,11 @@ pub struct Actuator {
 }
 
 impl Scene {
-    /// Loads the built-in scene (`None`) or a user's MJCF file, with the physics timestep `sim_dt` in s.
+    /// Loads the built-in scene (`None`) or a user's MJCF file, with this variation of its physics.
     ///
     /// # Errors
     /// MuJoCo's own message, with the file's name, where it refuses the scene.
-    pub fn load(file: Option<&Path>, sim_dt: f64) -> Result<Self> {
+    pub fn load(file: Option<&Path>, variation: Variation) -> Result<Self> {
         quieten_mujoco();
         let model = match file {
             None => MjModel::from_xml_string(BUILTIN),
@@ -78,24 +116,24 @@ impl Scene {
         };
         let origin = file.map_or("the built-in scene".into(), |path| path.display().to_string());
         let model = model.map_err(|error| anyhow!("{origin}: MuJoCo refuses this scene: {error}"))?;
-        Self::of(model, origin, sim_dt)
+        Self::of(model, origin, variation)
     }
 
     /// The same scene, with the same physics, to be looked at.
     ///
     /// # Errors
     /// As [`Scene::load`], and meshes that cannot be read.
-    pub fn load_to_see(file: Option<&Path>, sim_dt: f64, look: &Look) -> Result<Self> {
-        let mut scene = Self::load(file, sim_dt)?;
+    pub fn load_to_see(file: Option<&Path>, variation: Variation, look: &Look) -> Result<Self> {
+        let mut scene = Self::load(file, variation)?;
         if file.is_none() && !look.meshes.is_empty() {
-            scene = Self::of(look.dress(BUILTIN)?, scene.origin, sim_dt)?;
+            scene = Self::of(look.dress(BUILTIN)?, scene.origin, variation)?;
         }
         look.set_up(Arc::get_mut(&mut scene.model).expect("a new scene is not shared"));
         Ok(scene)
     }
 
-    fn of(mut model: MjModel, origin: String, sim_dt: f64) -> Result<Self> {
-        model.opt_mut().timestep = sim_dt;
+    fn of(mut model: MjModel, origin: String, variation: Variation) -> Result<Self> {
+        variation.apply(&mut model);
         let scene = Self { model: Arc::new(model), origin };
         if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {
             bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);

@@ -13,9 +13,10 @@ use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use crate::cli::{Settings, TrainArgs};
 use crate::collect::{Scratch, collect};
 use crate::config::{Config, Override, Source};
-use crate::env::{EnvPool, Recent, Repose, Score, Task, panic_message};
+use crate::env::{EnvPool, Lesson, Recent, Repose, Score, Task, panic_message};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::load::MODEL;
+use crate::perception::perception;
 use crate::ppo::{Checkpoint, Ppo, Progress, Rollout, UpdateStats};
 use crate::run::{self, Locked, Report, Requests, RunFolder, Status};
 
@@ -29,7 +30,7 @@ pub enum Outcome {
 }
 
 /// The names under which an iteration is logged, in order.
-const TAGS: [&str; 30] = [
+const TAGS: [&str; 36] = [
     "episode/return",
     "episode/length",
     "episode/goals",
@@ -42,6 +43,12 @@ const TAGS: [&str; 30] = [
     "reward/action",
     "reward/bonus",
     "reward/fall",
+    "training/progress",
+    "training/goal",
+    "training/drop",
+    "training/tolerance",
+    "training/hold",
+    "training/goal_angle",
     "eval/goals",
     "eval/drop_rate",
     "eval/rot_dist",
@@ -115,6 +122,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
 
 /// What is reported of an iteration.
 struct Iteration {
+    lesson: Lesson,
     update: UpdateStats,
     evaluation: Option<Score>,
     collect_s: f64,
@@ -152,6 +160,8 @@ impl Session {
         run::start_threads(config.run.threads)?;
         let folder = || RunFolder::create(args.run_dir.as_deref(), args.name.as_deref());
         let mut session = Self::new(config, folder, args)?;
+        let lesson = session.lesson();
+        session.pool.envs_mut().for_each(|env| env.set_lesson(lesson));
         session.pool.reset(session.rollout.first_observations_mut());
         Ok(session)
     }
@@ -188,7 +198,8 @@ impl Session {
     fn new(config: Config, folder: impl FnOnce() -> Result<(RunFolder, Locked)>, args: &TrainArgs) -> Result<Self> {
         let task = Task::new(&config.env)?;
         let envs = (0..config.env.num_envs).map(|_| Repose::new(&task)).collect();
-        let pool = EnvPool::new(config.run.seed, envs);
+        let mut pool = EnvPool::new(config.run.seed, envs);
+        pool.perceive_with(perception(config.ppo.symmetry));
         let ppo = Ppo::new(&config.ppo, pool.observation_size(), pool.action_size(), config.run.seed)?;
         let rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
@@ -212,6 +223,11 @@ impl Session {
             best: None,
             best_is_saved: true,
         })
+    }
+
+    /// What is trained in the iteration that comes next.
+    fn lesson(&self) -> Lesson {
+        Lesson::at(self.progress.env_steps, &self.config.training, &self.config.env)
     }
 
     fn finished(&self) -> bool {
@@ -239,6 +255,8 @@ impl Session {
 
     fn collect_learn_evaluate(&mut self, iteration: u64, stop: &AtomicBool, report: &mut Report) -> Result<bool> {
         let started = Instant::now();
+        let lesson = self.lesson();
+        self.pool.envs_mut().for_each(|env| env.set_lesson(lesson));
         if !collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)? {
             return Ok(false);
         }
@@ -258,7 +276,7 @@ impl Session {
         let found = evaluation.map(|score| [score.goals, score.rot_dist]);
         let best = found.filter(|&found| is_better(found, known)).or(known);
         self.progress = Progress { iteration, env_steps, best };
-        self.report(report, &Iteration { update, evaluation, collect_s, update_s });
+        self.report(report, &Iteration { lesson, update, evaluation, collect_s, update_s });
         Ok(true)
     }
 
@@ -302,7 +320,7 @@ impl Session {
         if self.dump_diverged {
             self.dump_diverged(report);
         }
-        let Iteration { update, evaluation, collect_s, update_s } = iteration;
+        let Iteration { lesson, update, evaluation, collect_s, update_s } = iteration;
         let episodes = Score::of(&self.pool.take_finished());
         let mut recent = Recent::default();
         for env in self.pool.envs_mut() {
@@ -320,6 +338,8 @@ impl Session {
             episodes.steps_per_goal,
         ];
         values.extend(recent.reward.values().map(|sum| sum / recent.steps as f64));
+        values.extend(recent.shaping.values().map(|sum| sum / recent.steps as f64));
+        values.extend([lesson.tolerance, f64::from(lesson.hold), lesson.goal_angle]);
         values.extend([evaluation.goals, evaluation.drop_rate, evaluation.rot_dist, evaluation.episode_return]);
         values.extend([update.policy_loss, update.value_loss]);
         values.extend([update.entropy, update.kl, update.first_kl, update.clip_fraction, update.std]);

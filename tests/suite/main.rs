@@ -14,5 +14,6 @@ mod scene;
 mod support;
 mod survival;
 mod task;
+mod training;
 #[cfg(feature = "viewer")]
 mod window;

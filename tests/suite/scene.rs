@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use shadow_repose::env::{Env, Hand, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::sim::{BareSimulation, Physics, Scene};
+use shadow_repose::sim::{BareSimulation, Physics, Scene, Variation};
 
 use crate::support::{SCENE, env_config, started, task};
 
@@ -37,7 +37,7 @@ fn assert_range(found: [f64; 2], expected: [f64; 2]) {
 
 #[test]
 fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
-    let scene = Scene::load(None, 0.01).unwrap();
+    let scene = Scene::load(None, Variation::none(0.01)).unwrap();
     let hand = Hand::bind(&scene).unwrap();
     assert_eq!(scene.controls(), 20);
     for (name, range) in [

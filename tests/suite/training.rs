@@ -1,0 +1,140 @@
+//! What only training changes: lessons, and what a policy takes to be the same.
+
+use shadow_repose::config::Symmetry;
+use shadow_repose::env::{Env, Lesson, OBSERVATION_SIZE, Repose};
+use shadow_repose::perception::perception;
+use shadow_repose::quat;
+use shadow_repose::rng;
+
+use crate::support::{config, started, task};
+
+fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
+    let config = config(settings);
+    Lesson::at(env_steps, &config.training, &config.env)
+}
+
+fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
+    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    env.reset(rng::stream(7, "test", episode), &mut observation);
+    observation
+}
+
+#[test]
+fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy() {
+    // A hand that moves slowly, to which the cube falls.
+    let task = task(&["env.act_moving_average=0.05"]);
+    let cube = task.scene().free_body("cube").unwrap().qpos;
+    let (half, root) = (0.5, std::f64::consts::FRAC_1_SQRT_2);
+    for (episode, turn) in
+        [[root, 0.0, root, 0.0], [half, -half, half, half], [0.0, 0.0, root, -root]].iter().enumerate()
+    {
+        let (mut one, mut other) = (Repose::new(&task), Repose::new(&task));
+        let (mut seen, mut other_seen) = (start(&mut one, episode as u64), start(&mut other, episode as u64));
+        let orientation = *other.simulation().qpos()[cube + 3..].first_chunk().unwrap();
+        other.simulation_mut().qpos_mut()[cube + 3..cube + 7].copy_from_slice(&quat::mul(orientation, *turn));
+        other.simulation_mut().refresh();
+        // Contacts amplify rounding: after some more steps of a moving hand, no two cubes lie alike.
+        for step in 0..15 {
+            let action = [0.3 * (step as f32 / 5.0).sin(); 20];
+            let _ = one.step(&action, &mut seen);
+            let _ = other.step(&action, &mut other_seen);
+        }
+        let moved = seen[48..51].iter().zip(&other_seen[48..51]).all(|(a, b)| (a - b).abs() < 1e-4);
+        assert!(moved, "{:?} and {:?}", &seen[48..51], &other_seen[48..51]);
+        let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "they lie differently");
+        for row in [&mut seen, &mut other_seen] {
+            perception(Symmetry::Cube)(row);
+        }
+        // All but the goals, which were drawn for cubes that lie differently.
+        for same in [0..64, 72..157] {
+            assert!(apart(&seen[same.clone()], &other_seen[same]) < 0.02, "{seen:?}\n{other_seen:?}");
+        }
+    }
+}
+
+#[test]
+fn a_lesson_decides_what_reaches_a_goal_and_which_goals_are_drawn() {
+    let task = task(&[]);
+    let mut env = Repose::new(&task);
+    let easy = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_steps=1000"];
+    let near = ["training.goal_angle_start=0.3", "training.goal_angle_steps=1000"];
+    env.set_lesson(lesson(0, &[&easy[..], &near].concat()));
+    let mut observation = start(&mut env, 0);
+    for goals in 1..=20 {
+        let before = env.goal();
+        let _ = env.step(&[0.0; 20], &mut observation);
+        assert_eq!(env.episode().goals, goals, "every step reaches one");
+        assert!(env.goal() != before && env.rot_dist() <= 0.3, "{}", env.rot_dist());
+    }
+    let in_tolerance = env.episode().in_tolerance;
+    assert!(in_tolerance < 20, "what is within the tolerance of the task is counted by that: {in_tolerance}");
+    // Later the lesson is the task itself.
+    env.set_lesson(lesson(1000, &[&easy[..], &near].concat()));
+    let mut farthest = 0.0f64;
+    for episode in 0..30 {
+        observation = start(&mut env, episode);
+        farthest = farthest.max(env.rot_dist());
+        let _ = env.step(&[0.0; 20], &mut observation);
+        assert_eq!(env.episode().goals, 0);
+    }
+    assert!(farthest > 2.5, "{farthest}");
+}
+
+#[test]
+fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
+    let task = task(&[]);
+    let (mut plain, mut observation) = started(&task);
+    let (mut shaped, _) = started(&task);
+    shaped.set_lesson(lesson(0, &["training.task_reward=0.5", "training.progress_reward=100"]));
+    for _ in 0..20 {
+        let before = shaped.rot_dist();
+        let expected = plain.step(&[0.3; 20], &mut observation);
+        let found = shaped.step(&[0.3; 20], &mut observation);
+        let progress = 100.0 * (before - shaped.last_step().rot_dist);
+        let paid = 0.5 * plain.last_step().reward.total() + progress;
+        assert!((f64::from(found.reward) - paid).abs() < 1e-4, "{found:?} {paid}");
+        assert_eq!(found.end, expected.end);
+        assert_eq!(shaped.last_step().reward, plain.last_step().reward);
+    }
+    assert_eq!(shaped.episode(), plain.episode());
+    let recent = shaped.take_recent();
+    assert!(recent.shaping.progress != 0.0 && recent.reward == plain.take_recent().reward);
+}
+
+/// Where everything is after a second of a swinging hand.
+fn after_a_second(settings: &[&str]) -> Vec<f64> {
+    let task = task(settings);
+    let (mut env, mut observation) = started(&task);
+    for step in 0..100 {
+        let _ = env.step(&[0.3 * (step as f32 / 15.0).sin(); 20], &mut observation);
+    }
+    env.simulation().qpos().to_vec()
+}
+
+#[test]
+fn friction_and_the_mass_of_the_cube_are_scaled_as_if_the_scene_said_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = include_str!("../../assets/shadow_hand/scene.xml");
+    let said = |replacements: &[[&str; 2]]| {
+        let path = folder.path().join("scene.xml");
+        let text = replacements.iter().fold(scene.to_owned(), |text, [from, to]| {
+            assert!(text.contains(from));
+            text.replace(from, to)
+        });
+        std::fs::write(&path, text).unwrap();
+        after_a_second(&[&format!("env.model={}", path.display())])
+    };
+    let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let unchanged = after_a_second(&[]);
+    assert_eq!(unchanged, after_a_second(&["env.friction_scale=1", "env.cube_mass_scale=1"]));
+    let heavy = after_a_second(&["env.cube_mass_scale=2"]);
+    let heavy_in_the_scene = said(&[[r#"mass=".028""#, r#"mass=".056""#]]);
+    assert!(apart(&heavy, &heavy_in_the_scene) < 1e-4, "{heavy:?}\n{heavy_in_the_scene:?}");
+    assert!(apart(&heavy, &unchanged) > 1e-3);
+    let slippery = after_a_second(&["env.friction_scale=0.5"]);
+    let all = [r#"<geom solref=".005 1""#, r#"<geom friction=".5 .0025 .00005" solref=".005 1""#];
+    let slippery_in_the_scene = said(&[all, [r#"friction="1.2""#, r#"friction=".6 .0025 .00005""#]]);
+    assert!(apart(&slippery, &slippery_in_the_scene) < 1e-4, "{slippery:?}\n{slippery_in_the_scene:?}");
+    assert!(apart(&slippery, &unchanged) > 1e-3);
+}
