@@ -95,7 +95,8 @@ pub struct TrainArgs {
 /// `play`
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// A checkpoint, or a run folder (its best checkpoint, or its latest) [default: the newest run]
+    /// A checkpoint, or a run folder (its best checkpoint, or its latest) [default: the newest run, or if there is none the
+    /// policy that is built in]
     #[arg(long, value_name = "FILE|RUN")]
     pub ckpt: Option<PathBuf>,
     /// Whole episodes to play, every one counted [default: 256; in a window, until it is closed; in a film, 1]

@@ -154,8 +154,15 @@ fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     Episodes { seed: args.seed, purpose: "score", first: 0, count }
 }
 
-/// A policy from a file, with the configuration that it was trained with and `--set` on top.
+/// The policy that comes with the program.
+const SHIPPED: &[u8] = include_bytes!("../assets/policies/repose.safetensors");
+
+/// What the score calls it.
+const SHIPPED_NAME: &str = "built into the program";
+
+/// A policy, with the configuration that it was trained with and `--set` on top.
 struct Loaded {
+    /// The file that it comes from.
     path: PathBuf,
     config: Config,
     policy: Policy,
@@ -163,12 +170,16 @@ struct Loaded {
 
 impl Loaded {
     fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
-        let path = match place {
-            Some(place) => run::resolve_checkpoint(place)?,
-            None => run::newest_checkpoint()?,
-        };
         let overrides = of_the_task(overrides)?;
-        let (checkpoint, config) = load::load(&path, overrides)?;
+        let found = match place {
+            Some(place) => Some(run::resolve_checkpoint(place)?),
+            None => run::newest_checkpoint(),
+        };
+        let path = found.clone().unwrap_or_else(|| SHIPPED_NAME.into());
+        let (checkpoint, config) = match found {
+            Some(path) => load::load(&path, overrides)?,
+            None => load::parse(&path, SHIPPED, overrides)?,
+        };
         let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play {}", path.display()))?;
         Ok(Self { path, config, policy })
     }

@@ -110,6 +110,7 @@ pub struct PpoConfig {
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
     pub desired_kl: f64,
+    pub critic_learning_rate: f64,
     pub gamma: f64,
     pub lambda: f64,
     pub clip: f64,

@@ -94,6 +94,7 @@ impl Config {
             &format!("lie in ppo.learning_rate_range = [{low}, {high}] unless ppo.desired_kl = 0"),
         );
         rules.not_negative("ppo.desired_kl", ppo.desired_kl);
+        rules.not_negative("ppo.critic_learning_rate", ppo.critic_learning_rate);
         rules.between("ppo.gamma", ppo.gamma, 0.0, 1.0);
         rules.between("ppo.lambda", ppo.lambda, 0.0, 1.0);
         rules.positive("ppo.clip", ppo.clip);

@@ -60,11 +60,12 @@ pub trait Backend: Send {
     /// Only if candle cannot allocate.
     fn gradient(&mut self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Losses>;
 
-    /// Moves the parameters one step of Adam against that gradient, which is first multiplied by `scale`.
+    /// Moves the parameters one step of Adam against that gradient, which is first multiplied by `scale`; the critic's with the
+    /// second of the learning rates, the others with the first.
     ///
     /// # Errors
     /// Only if candle cannot allocate.
-    fn step(&mut self, policy: &Policy, learning_rate: f64, scale: f64) -> Result<()>;
+    fn step(&mut self, policy: &Policy, learning_rates: [f64; 2], scale: f64) -> Result<()>;
 
     /// The optimizer's state.
     ///
@@ -145,7 +146,7 @@ mod tests {
                     let (mut ppo, rollout) = learner(backend, activation);
                     let samples: Vec<u32> = (0..samples).map(|i| (i * 7) % rollout.samples() as u32).collect();
                     let losses = ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap();
-                    ppo.backend.step(&ppo.policy, 1e-3, 1.0).unwrap();
+                    ppo.backend.step(&ppo.policy, [1e-3, 2e-3], 1.0).unwrap();
                     // After the first step the mean of the gradient is a tenth of it.
                     let moments = ppo.backend.moments(&ppo.policy).unwrap();
                     let gradient = moments.tensors.into_iter().map(|[mean, _]| {
@@ -189,7 +190,7 @@ mod tests {
             for step in 0..20 {
                 let samples: Vec<u32> = (0..256).map(|i| (i * 5 + step * 31) % rollout.samples() as u32).collect();
                 let norm = ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap().grad_norm;
-                ppo.backend.step(&ppo.policy, 1e-3, (1.0 / (norm + 1e-6)).min(1.0)).unwrap();
+                ppo.backend.step(&ppo.policy, [1e-3, 2e-3], (1.0 / (norm + 1e-6)).min(1.0)).unwrap();
             }
             parameters(&ppo.policy)
         });
@@ -218,7 +219,7 @@ mod tests {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(number).build().unwrap();
                     losses.push(pool.install(|| ppo.backend.gradient(&ppo.policy, &rollout, samples).unwrap()));
                 }
-                ppo.backend.step(&ppo.policy, 1e-3, 1.0).unwrap();
+                ppo.backend.step(&ppo.policy, [1e-3, 2e-3], 1.0).unwrap();
                 (losses.pop(), parameters(&ppo.policy))
             };
             let one = run(&[1]);
@@ -241,7 +242,7 @@ mod tests {
             rollout.blocks[0].returns.fill(0.3);
             ppo.backend.begin(&ppo.policy, &rollout).unwrap();
             let losses = ppo.backend.gradient(&ppo.policy, &rollout, &[0]).unwrap();
-            ppo.backend.step(&ppo.policy, 1e-3, 1.0).unwrap();
+            ppo.backend.step(&ppo.policy, [1e-3, 2e-3], 1.0).unwrap();
             (losses, parameters(&ppo.policy))
         });
         assert_close(found[0].0.grad_norm, found[1].0.grad_norm, 1e-5, "norm");

@@ -302,7 +302,7 @@ mod tests {
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout).unwrap();
         ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap();
-        ppo.backend.step(&ppo.policy, 0.01, 1.0).unwrap();
+        ppo.backend.step(&ppo.policy, [0.01; 2], 1.0).unwrap();
         ppo
     }
 

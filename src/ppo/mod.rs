@@ -191,7 +191,11 @@ impl Ppo {
         }
         // As in PyTorch's clip_grad_norm_, with its constant against a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
-        self.backend.step(&self.policy, self.learning_rate, scale)?;
+        let critic = match self.config.critic_learning_rate {
+            0.0 => self.learning_rate,
+            own => own,
+        };
+        self.backend.step(&self.policy, [self.learning_rate, critic], scale)?;
         Ok(losses)
     }
 

@@ -82,6 +82,11 @@ impl Policy {
         &self.parameters
     }
 
+    /// Whether the parameter of this name belongs to the critic.
+    pub(super) fn is_of_critic(name: &str) -> bool {
+        name.starts_with("critic.")
+    }
+
     /// The number of weights, biases and standard deviations.
     pub fn parameter_count(&self) -> usize {
         self.parameters.iter().map(|(_, var)| var.elem_count()).sum()

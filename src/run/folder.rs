@@ -256,20 +256,13 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
-/// The checkpoint of the newest run that has one.
-///
-/// # Errors
-/// There is none.
-pub fn newest_checkpoint() -> Result<PathBuf> {
+/// The checkpoint of the newest run that has one, if any does.
+pub fn newest_checkpoint() -> Option<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
     // By the time of the latest checkpoint, so that a run that was resumed counts as new.
-    let newest = runs
-        .filter_map(|run| Some((modified(&run.checkpoints().latest())?, resolve_checkpoint(&run.path).ok()?)))
+    runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, resolve_checkpoint(&run.path).ok()?)))
         .max()
-        .map(|(_, checkpoint)| checkpoint);
-    newest.with_context(|| {
-        format!("there is no run with a checkpoint in {RUNS}; train one first, or name one with --ckpt")
-    })
+        .map(|(_, checkpoint)| checkpoint)
 }
 
 fn modified(path: &Path) -> Option<SystemTime> {

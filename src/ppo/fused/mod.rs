@@ -199,14 +199,15 @@ impl Backend for Fused {
         })
     }
 
-    fn step(&mut self, policy: &Policy, learning_rate: f64, scale: f64) -> Result<()> {
+    fn step(&mut self, policy: &Policy, learning_rates: [f64; 2], scale: f64) -> Result<()> {
         self.steps += 1;
-        let rates = adam::Rates::new(self.steps, learning_rate, scale);
+        let rates = learning_rates.map(|rate| adam::Rates::new(self.steps, rate, scale));
         let [mean, square] = &mut self.moments;
         let mut at = 0;
-        for (_, var) in policy.parameters() {
+        for (name, var) in policy.parameters() {
             let own = at..at + var.elem_count();
             at = own.end;
+            let rates = rates[usize::from(Policy::is_of_critic(name))];
             adam::step(var, rates, &self.gradient[own.clone()], &mut mean[own.clone()], &mut square[own])?;
         }
         Ok(())

@@ -39,22 +39,29 @@ impl Adam {
         (self.moments, self.steps) = (moments, steps);
     }
 
-    /// Moves the parameters one step against the gradients, each of which is first multiplied by `scale`.
+    /// Moves the parameters one step against the gradients, each of which is first multiplied by `scale`, at the `rate` of a
+    /// parameter of this name.
     ///
     /// # Errors
     /// Shapes that do not match the parameters this was made for.
-    pub fn step(&mut self, parameters: &[(String, Var)], grads: &GradStore, rate: f64, scale: f64) -> Result<()> {
+    pub fn step(
+        &mut self,
+        parameters: &[(String, Var)],
+        grads: &GradStore,
+        rate: impl Fn(&str) -> f64,
+        scale: f64,
+    ) -> Result<()> {
         self.steps += 1;
         let correction1 = 1.0 - BETA1.powi(self.steps as i32);
         let correction2 = 1.0 - BETA2.powi(self.steps as i32);
-        for ((_, var), moments) in parameters.iter().zip(&mut self.moments) {
+        for ((name, var), moments) in parameters.iter().zip(&mut self.moments) {
             let Some(grad) = grads.get(var) else { continue };
             // A gradient keeps the graph it came from; detached, the moments do not grow a chain of them.
             let grad = (grad.detach() * scale)?;
             let mean = ((&moments[0] * BETA1)? + (&grad * (1.0 - BETA1))?)?;
             let square = ((&moments[1] * BETA2)? + (grad.sqr()? * (1.0 - BETA2))?)?;
             let root = ((&square / correction2)?.sqrt()? + EPSILON)?;
-            let update = ((&mean * (rate / correction1))? / root)?;
+            let update = ((&mean * (rate(name) / correction1))? / root)?;
             var.set(&(var.as_detached_tensor() - update)?)?;
             *moments = [mean, square];
         }
@@ -103,7 +110,7 @@ mod tests {
             let loss = (x.as_tensor().sqr().unwrap() * &weights).unwrap().sum_all().unwrap();
             let grads = loss.backward().unwrap();
             let norm = global_norm(&parameters, &grads).unwrap();
-            adam.step(&parameters, &grads, 0.1, (1.0 / (norm + 1e-6)).min(1.0)).unwrap();
+            adam.step(&parameters, &grads, |_| 0.1, (1.0 / (norm + 1e-6)).min(1.0)).unwrap();
             assert!((norm - expected_norm).abs() < 1e-5, "norm {norm}");
             for (found, expected) in x.to_vec1::<f32>().unwrap().iter().zip(expected) {
                 assert!((found - expected).abs() < 1e-6, "{found} instead of {expected}");

@@ -90,9 +90,10 @@ impl Backend for Reference {
         })
     }
 
-    fn step(&mut self, policy: &Policy, learning_rate: f64, scale: f64) -> Result<()> {
+    fn step(&mut self, policy: &Policy, learning_rates: [f64; 2], scale: f64) -> Result<()> {
         let grads = self.grads.take().expect("gradient comes first");
-        self.adam.step(policy.parameters(), &grads, learning_rate, scale)
+        let rate = |name: &str| learning_rates[usize::from(Policy::is_of_critic(name))];
+        self.adam.step(policy.parameters(), &grads, rate, scale)
     }
 
     fn moments(&self, _: &Policy) -> Result<Moments> {
