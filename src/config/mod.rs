@@ -86,6 +86,8 @@ pub struct TrainingConfig {
     pub progress_reward: f64,
     pub goal_reward: f64,
     pub drop_reward: f64,
+    pub drop_reward_start: f64,
+    pub drop_reward_steps: u64,
     pub tolerance_start: f64,
     pub tolerance_steps: u64,
     pub hold_start: u32,

@@ -65,7 +65,7 @@ impl Lesson {
             task_reward: training.task_reward,
             progress_reward: training.progress_reward,
             goal_reward: training.goal_reward,
-            drop_reward: training.drop_reward,
+            drop_reward: between(training.drop_reward_start, training.drop_reward, share(training.drop_reward_steps)),
         }
     }
 
@@ -143,5 +143,8 @@ mod tests {
         assert_eq!(shaping.values(), [-2.0, 7.0, 0.0]);
         assert_eq!(lesson.total(4.0, shaping), 7.0);
         assert_eq!(lesson.shaping(0.1, false, true).values(), [1.0, 0.0, -3.0]);
+        let sets = ["training.drop_reward=-3", "training.drop_reward_start=1", "training.drop_reward_steps=100"];
+        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).shaping(0.0, false, true).drop);
+        assert_eq!(drops, [1.0, -1.0, -3.0, -3.0]);
     }
 }
