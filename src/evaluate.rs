@@ -228,3 +228,34 @@ impl Player {
         &mut self.lane.env
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Symmetry};
+    use crate::env::CUBE_ORIENTATION;
+    use crate::ppo::Ppo;
+
+    #[test]
+    fn a_policy_with_the_symmetry_of_the_cube_acts_alike_however_the_cube_is_turned_onto_itself() {
+        for (symmetry, alike) in [(Symmetry::Cube, true), (Symmetry::None, false)] {
+            let mut config = Config::resolve(None, &[]).unwrap();
+            config.ppo.symmetry = symmetry;
+            let task = Task::new(&config.env).unwrap();
+            let ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
+            let actor = Actor::Mean(ppo.policy().freeze().unwrap());
+            let mut work = actor.policy().map(|policy| policy.workspace(2));
+            // Cube and goal are one: as they are, and turned by half a turn about their own x.
+            let mut observations = vec![0.1; 2 * OBSERVATION_SIZE];
+            for (row, q) in observations.chunks_exact_mut(OBSERVATION_SIZE).zip([[1.0, 0.0], [0.0, 1.0]]) {
+                for place in [CUBE_ORIENTATION, crate::env::GOAL_ORIENTATION] {
+                    row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
+                }
+            }
+            let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * ACTION_SIZE]);
+            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut()).unwrap();
+            let (one, other) = actions.split_at(ACTION_SIZE);
+            assert_eq!(one == other, alike, "{symmetry:?}");
+        }
+    }
+}

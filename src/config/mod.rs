@@ -17,6 +17,21 @@ use overlay::overlay;
 /// The default configuration, commented.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
+/// What a run did that was begun before a setting existed, where that is not the default of today.
+const BEFORE: &str = r#"
+[training]
+task_reward = 1.0
+progress_reward = 0.0
+goal_reward = 0.0
+drop_reward = 0.0
+drop_reward_steps = 0
+tolerance_steps = 0
+hold_steps = 0
+goal_angle_steps = 0
+[ppo]
+symmetry = "none"
+"#;
+
 /// `env.model` of the scene that is built into the program.
 pub const BUILTIN_MODEL: &str = "builtin";
 
@@ -232,9 +247,15 @@ impl Config {
     /// # Errors
     /// One error that lists every unknown key, every value of a wrong type and every value out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let base: Table = BASE.parse().expect("the built-in configuration is TOML");
+        Self::layered("", user, overrides)
+    }
+
+    /// The base, overlaid by some settings of ours, the user's file, and `overrides`.
+    fn layered(ours: &str, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        let [base, ours]: [Table; 2] = [BASE, ours].map(|text| text.parse().expect("our own settings are TOML"));
         let mut merged = base.clone();
         let mut problems = Vec::new();
+        overlay(&mut merged, &ours, &base, "", &mut problems);
         if let Some(Source { path, text }) = user {
             match text.parse::<Table>() {
                 Ok(table) => overlay(&mut merged, &table, &base, "", &mut problems),
@@ -265,13 +286,13 @@ impl Config {
         bail!("invalid configuration{origin}:\n  {}", problems.join("\n  "))
     }
 
-    /// A configuration that a run has written whole.
+    /// A configuration that a run has written whole, maybe before some of today's settings existed.
     ///
     /// # Errors
     /// As [`Config::resolve`].
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
         let source = Source { path: path.into(), text: text.into() };
-        Self::resolve(Some(&source), overrides)
+        Self::layered(BEFORE, Some(&source), overrides)
     }
 
     /// The whole configuration as TOML.
@@ -305,6 +326,20 @@ mod tests {
         assert_eq!(config.env.substeps(), 1);
         let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]).unwrap();
         assert_eq!(config, again);
+    }
+
+    #[test]
+    fn a_run_from_before_a_setting_existed_goes_on_as_it_was() {
+        let config = Config::from_text(Path::new("config.toml"), "[ppo]\ngamma = 0.5", &[]).unwrap();
+        assert_eq!((config.ppo.symmetry, config.ppo.gamma), (Symmetry::None, 0.5));
+        let TrainingConfig { task_reward, progress_reward, goal_reward, drop_reward, .. } = config.training;
+        assert_eq!([task_reward, progress_reward, goal_reward, drop_reward], [1.0, 0.0, 0.0, 0.0]);
+        let curricula = &config.training;
+        let steps = [curricula.drop_reward_steps, curricula.tolerance_steps, curricula.hold_steps];
+        assert_eq!((steps, curricula.goal_angle_steps), ([0; 3], 0));
+        // A user's own file means today's defaults where it is silent.
+        let source = Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.5".into() };
+        assert_eq!(Config::resolve(Some(&source), &[]).unwrap().ppo.symmetry, Symmetry::Cube);
     }
 
     #[test]

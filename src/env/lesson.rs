@@ -107,19 +107,28 @@ mod tests {
     use super::*;
     use crate::config::{Config, Override};
 
+    /// Nothing that training adds.
+    const PLAIN: [&str; 8] = [
+        "training.task_reward=1",
+        "training.progress_reward=0",
+        "training.goal_reward=0",
+        "training.drop_reward=0",
+        "training.drop_reward_steps=0",
+        "training.tolerance_steps=0",
+        "training.hold_steps=0",
+        "training.goal_angle_steps=0",
+    ];
+
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {
-        let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
+        let sets: Vec<Override> = PLAIN.iter().chain(sets).map(|set| set.parse().unwrap()).collect();
         let config = Config::resolve(None, &sets).unwrap();
         Lesson::at(env_steps, &config.training, &config.env)
     }
 
     #[test]
     fn without_curricula_and_shaping_the_task_itself_is_trained() {
-        let off = ["training.tolerance_steps=0", "training.hold_steps=0", "training.goal_angle_steps=0"];
-        let plain = ["training.progress_reward=0", "training.goal_reward=0", "training.drop_reward=0"];
-        let sets = [&off[..], &plain, &["training.task_reward=1"]].concat();
         let task = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
-        assert_eq!([at(0, &sets), at(1 << 40, &sets)], [task; 2]);
+        assert_eq!([at(0, &[]), at(1 << 40, &[])], [task; 2]);
         assert_eq!(task.total(1.25, task.shaping(3.0, true, true)), 1.25);
     }
 

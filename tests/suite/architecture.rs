@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shadow_repose::config::Config;
+use shadow_repose::config::{Config, Source};
 
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).unwrap() {
@@ -70,7 +70,7 @@ fn every_configuration_that_comes_with_the_program_is_valid() {
     assert!(files.len() > 1);
     for path in files {
         let text = fs::read_to_string(&path).unwrap();
-        Config::from_text(&path, &text, &[]).unwrap();
+        Config::resolve(Some(&Source { path, text }), &[]).unwrap();
     }
 }
 

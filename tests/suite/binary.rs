@@ -78,6 +78,18 @@ fn the_newest_run_is_played_by_default_and_the_table_compares_it_with_zero_actio
 }
 
 #[test]
+fn where_there_is_no_run_the_built_in_policy_is_played_and_turns_the_cube() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["play", "--episodes", "32", "--json"];
+    let score = json(&succeeded(program(folder.path(), &args)));
+    assert_eq!(score["checkpoint"], "built into the program");
+    // A hand that holds still is 2.2 rad away, and never reaches a goal.
+    assert!(score["rot_dist"].as_f64().unwrap() < 1.7, "{score}");
+    assert!(include_bytes!("../../assets/policies/repose.safetensors").len() < 4 << 20);
+    assert!(names(folder.path()).is_empty());
+}
+
+#[test]
 fn scores_do_not_depend_on_threads_or_on_how_many_episodes_are_asked_for() {
     let folder = trained(&[]);
     let play = |threads: &str, episodes: &str, more: &[&str]| {

@@ -63,14 +63,25 @@ fn iterations(folder: &Path) -> u64 {
     metrics(&folder.join("run")).last().unwrap()[0].parse().unwrap_or(0)
 }
 
-/// Episodes with contacts, goals that are reached and drawn anew, and ends, of which some fall into every iteration; and
-/// evaluations that are rarer than checkpoints.
+/// Episodes with contacts, goals that are reached and drawn anew, and ends, of which some fall into every iteration;
+/// evaluations that are rarer than checkpoints; everything that training adds, with curricula that end on the way.
 const LONG: &[&str] = &[
     "--set=env.max_episode_seconds=2",
     "--set=env.success_tolerance=2",
     "--set=env.max_consecutive_successes=5",
     "--set=run.eval_every=7",
     "--set=run.checkpoint_every=3",
+    "--set=training.progress_reward=50",
+    "--set=training.goal_reward=20",
+    "--set=training.drop_reward_start=-9",
+    "--set=training.drop_reward_steps=2000",
+    "--set=training.tolerance_start=3",
+    "--set=training.tolerance_steps=4000",
+    "--set=training.hold_steps=3000",
+    "--set=training.goal_angle_start=1",
+    "--set=training.goal_angle_steps=3500",
+    "--set=ppo.symmetry=cube",
+    "--set=ppo.critic_learning_rate=1e-3",
 ];
 
 #[test]

@@ -105,7 +105,7 @@ fn fingertip_velocities_are_those_of_the_frames_origin() {
 
 #[test]
 fn actions_are_clipped_and_scaled_to_the_control_ranges() {
-    let task = task(&[]);
+    let task = task(&["env.act_moving_average=1"]);
     let hand = Hand::bind(task.scene()).unwrap();
     let (mut env, mut observation) = started(&task);
     let mut action = [0.0f32; 20];
