@@ -30,6 +30,7 @@ hold_steps = 0
 goal_angle_steps = 0
 [ppo]
 symmetry = "none"
+bounds_coef = 0.0
 "#;
 
 /// `env.model` of the scene that is built into the program.
@@ -133,6 +134,7 @@ pub struct PpoConfig {
     pub clip: f64,
     pub value_coef: f64,
     pub entropy_coef: f64,
+    pub bounds_coef: f64,
     pub max_grad_norm: f64,
     pub reward_scale: f64,
     pub init_std: f64,

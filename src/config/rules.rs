@@ -100,6 +100,7 @@ impl Config {
         rules.positive("ppo.clip", ppo.clip);
         rules.not_negative("ppo.value_coef", ppo.value_coef);
         rules.not_negative("ppo.entropy_coef", ppo.entropy_coef);
+        rules.not_negative("ppo.bounds_coef", ppo.bounds_coef);
         rules.positive("ppo.max_grad_norm", ppo.max_grad_norm);
         rules.positive("ppo.reward_scale", ppo.reward_scale);
         rules.positive("ppo.init_std", ppo.init_std);

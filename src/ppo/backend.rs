@@ -26,6 +26,8 @@ pub struct Losses {
     pub policy: f64,
     /// The clipped squared error of the values.
     pub value: f64,
+    /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
+    pub excess: f64,
     /// Mean entropy of the action distribution, nats.
     pub entropy: f64,
     /// Mean KL divergence of the present distribution from the one that acted, nats.
@@ -102,7 +104,7 @@ mod tests {
     fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
-        config.entropy_coef = 0.01;
+        (config.entropy_coef, config.bounds_coef) = (0.01, 0.1);
         let mut ppo = Ppo::new(&config, 157, 20, 3).unwrap();
         ppo.policy.normalizer.update(&[&[[0.3; 157], [0.9; 157]].concat()]);
         let mut rollout = Rollout::new(16, &[32, 32, 21], 157, 20);
@@ -160,6 +162,7 @@ mod tests {
                     ("total", fused.total, candle.total),
                     ("policy", fused.policy, candle.policy),
                     ("value", fused.value, candle.value),
+                    ("excess", fused.excess, candle.excess),
                     ("entropy", fused.entropy, candle.entropy),
                     ("kl", fused.kl, candle.kl),
                     ("ratio", fused.ratio_error, candle.ratio_error),

@@ -55,6 +55,8 @@ pub struct UpdateStats {
     pub policy_loss: f64,
     /// The clipped squared error of the values.
     pub value_loss: f64,
+    /// Squared distance of the mean actions from [-1, 1], beyond which they are clipped.
+    pub excess: f64,
     /// Entropy of the action distribution, nats.
     pub entropy: f64,
     /// KL divergence from the policy that collected, nats.
@@ -229,6 +231,7 @@ impl UpdateStats {
     fn add(&mut self, losses: &Losses) {
         self.policy_loss += losses.policy;
         self.value_loss += losses.value;
+        self.excess += losses.excess;
         self.entropy += losses.entropy;
         self.kl += losses.kl;
         self.clip_fraction += losses.clip_fraction;
@@ -239,6 +242,7 @@ impl UpdateStats {
         for sum in [
             &mut self.policy_loss,
             &mut self.value_loss,
+            &mut self.excess,
             &mut self.entropy,
             &mut self.kl,
             &mut self.clip_fraction,

@@ -30,7 +30,7 @@ pub enum Outcome {
 }
 
 /// The names under which an iteration is logged, in order.
-const TAGS: [&str; 36] = [
+const TAGS: [&str; 37] = [
     "episode/return",
     "episode/length",
     "episode/goals",
@@ -60,6 +60,7 @@ const TAGS: [&str; 36] = [
     "policy/first_kl",
     "policy/clip_fraction",
     "policy/std",
+    "policy/excess",
     "value/explained_variance",
     "optim/learning_rate",
     "optim/grad_norm",
@@ -342,7 +343,7 @@ impl Session {
         values.extend([lesson.tolerance, f64::from(lesson.hold), lesson.goal_angle]);
         values.extend([evaluation.goals, evaluation.drop_rate, evaluation.rot_dist, evaluation.episode_return]);
         values.extend([update.policy_loss, update.value_loss]);
-        values.extend([update.entropy, update.kl, update.first_kl, update.clip_fraction, update.std]);
+        values.extend([update.entropy, update.kl, update.first_kl, update.clip_fraction, update.std, update.excess]);
         values.extend([update.explained_variance, update.learning_rate, update.grad_norm]);
         values.extend([*collect_s, *update_s, steps_per_s, recent.diverged as f64]);
         assert_eq!(values.len(), TAGS.len(), "one value for each tag");

@@ -5,12 +5,14 @@
 use pulp::Arch;
 
 use super::super::rollout::{Rollout, RolloutBlock};
+use crate::config::PpoConfig;
 
 /// What the losses of a minibatch need besides the samples. A numbers in an action.
 pub struct Loss<'a> {
     rollout: &'a Rollout,
     clip: f32,
     value_coef: f32,
+    bounds_coef: f32,
     /// Of one sample in the means over the minibatch.
     share: f32,
     /// `[A]`: reciprocals of the standard deviations.
@@ -26,6 +28,8 @@ pub struct Sums {
     pub surrogate: f64,
     /// The clipped squared error of the values.
     pub value_error: f64,
+    /// Squared distances of the means from [-1, 1], beyond which actions are clipped.
+    pub excess: f64,
     /// Samples whose ratio was clipped.
     pub clipped: usize,
     /// The largest |ratio - 1|.
@@ -39,7 +43,8 @@ pub struct Sums {
 impl Sums {
     /// Of no samples.
     pub fn clear(&mut self, action_size: usize) {
-        (self.surrogate, self.value_error, self.clipped, self.ratio_error) = (0.0, 0.0, 0, 0.0);
+        (self.surrogate, self.value_error, self.excess) = (0.0, 0.0, 0.0);
+        (self.clipped, self.ratio_error) = (0, 0.0);
         for sums in [&mut self.moved, &mut self.log_std_grad] {
             sums.clear();
             sums.resize(action_size, 0.0);
@@ -49,11 +54,12 @@ impl Sums {
 
 impl<'a> Loss<'a> {
     /// For a minibatch of so many samples of `rollout`; logarithms of the standard deviations `[A]`.
-    pub fn new(rollout: &'a Rollout, samples: usize, clip: f64, value_coef: f64, log_std: &[f32]) -> Self {
+    pub fn new(rollout: &'a Rollout, samples: usize, config: &PpoConfig, log_std: &[f32]) -> Self {
         Self {
             rollout,
-            clip: clip as f32,
-            value_coef: value_coef as f32,
+            clip: config.clip as f32,
+            value_coef: config.value_coef as f32,
+            bounds_coef: config.bounds_coef as f32,
             share: 1.0 / samples as f32,
             precision: log_std.iter().map(|s| (-s).exp()).collect(),
             log_scale: log_std.iter().map(|s| s + 0.5 * std::f32::consts::TAU.ln()).sum(),
@@ -99,9 +105,13 @@ impl<'a> Loss<'a> {
         for ((sum, mean), old_mean) in sums.moved.iter_mut().zip(mean).zip(old_mean) {
             *sum += (mean - old_mean) * (mean - old_mean);
         }
-        for (z, precision) in grad.iter_mut().zip(&self.precision) {
-            *z *= slope * precision;
+        let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.share);
+        for ((z, precision), mean) in grad.iter_mut().zip(&self.precision).zip(mean) {
+            let beyond = mean - mean.clamp(-1.0, 1.0);
+            excess += beyond * beyond;
+            *z = *z * (slope * precision) + pull * beyond;
         }
+        sums.excess += f64::from(excess);
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
@@ -135,6 +145,7 @@ pub fn kl(moved: &[f64], samples: usize, old_log_std: &[f32], log_std: &[f32]) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
 
     fn assert_close(found: &[f32], expected: &[f32]) {
         let close = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
@@ -158,7 +169,9 @@ mod tests {
                 -0.5 * (z[0] * z[0] + z[1] * z[1]) - old_log_std[0] - old_log_std[1] - std::f32::consts::TAU.ln();
         }
         let log_std = [-0.5, 0.2];
-        let loss = Loss::new(&rollout, 3, 0.2, 2.0, &log_std);
+        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        (config.clip, config.value_coef, config.bounds_coef) = (0.2, 2.0, 0.5);
+        let loss = Loss::new(&rollout, 3, &config, &log_std);
         let mut sums = Sums::default();
         sums.clear(2);
         let mut grad = [0.0; 6];
@@ -176,5 +189,18 @@ mod tests {
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
         assert_close(&[sums.value_error as f32 / 3.0], &[0.26]);
+        assert_eq!(sums.excess, 0.0);
+
+        // Means beyond ±1 are pulled back by 2 · 0.5 · their distance, a third each, on top of what the surrogate says.
+        let grads = [[1.5, -0.2], [1.0, -0.2]].map(|mean| {
+            let mut grad = [0.0; 2];
+            loss.actor(&[2], &mean, &mut grad, &mut sums);
+            grad
+        });
+        assert!((sums.excess - 0.25).abs() < 1e-6);
+        config.bounds_coef = 0.0;
+        let mut free = [0.0; 2];
+        Loss::new(&rollout, 3, &config, &log_std).actor(&[2], &[1.5, -0.2], &mut free, &mut sums);
+        assert_close(&[grads[0][0] - free[0], grads[0][1] - free[1]], &[0.5 / 3.0, 0.0]);
     }
 }

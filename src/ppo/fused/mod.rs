@@ -157,7 +157,7 @@ impl Backend for Fused {
         let Grouping { size, groups, rows } = self.reserve(policy, samples.len());
         let nets = policy.fused_nets();
         let log_std: Vec<f32> = policy.log_std().to_vec1()?;
-        let loss = Loss::new(rollout, samples.len(), self.config.clip, self.config.value_coef, &log_std);
+        let loss = Loss::new(rollout, samples.len(), &self.config, &log_std);
         let tasks = samples.chunks(size).flat_map(|group| ROLES.map(|role| (group, role)));
         let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
         tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
@@ -183,14 +183,17 @@ impl Backend for Fused {
         let parts = &self.parts[..2 * groups];
         let mean = |of: fn(&Sums) -> f64| parts.iter().map(|part| of(&part.sums)).sum::<f64>() / samples.len() as f64;
         let (policy_loss, value) = (-mean(|sums| sums.surrogate), mean(|sums| sums.value_error));
+        let excess = mean(|sums| sums.excess);
         let entropy = entropy(&log_std);
         let moved: Vec<f64> = (0..log_std.len())
             .map(|i| parts.iter().step_by(2).map(|part| f64::from(part.sums.moved[i])).sum())
             .collect();
         Ok(Losses {
-            total: policy_loss + self.config.value_coef * value - self.config.entropy_coef * entropy,
+            total: policy_loss + self.config.value_coef * value - self.config.entropy_coef * entropy
+                + self.config.bounds_coef * excess,
             policy: policy_loss,
             value,
+            excess,
             entropy,
             kl: loss::kl(&moved, samples.len(), &self.old_log_std, &log_std),
             clip_fraction: mean(|sums| sums.clipped as f64),

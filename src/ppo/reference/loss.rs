@@ -32,6 +32,8 @@ pub struct Losses {
     pub policy: Tensor,
     /// The clipped squared error of the values.
     pub value: Tensor,
+    /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
+    pub excess: Tensor,
     /// Mean entropy of the action distribution, nats.
     pub entropy: Tensor,
     /// Mean KL divergence of the present distribution from the one that acted, nats.
@@ -86,9 +88,11 @@ pub fn losses(
     let value = error.mean_all()?;
 
     let entropy = (log_std.sum_all()? + 0.5 * (TAU * E).ln() * log_std.elem_count() as f64)?;
+    let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? - (&entropy * config.entropy_coef)?)?;
+    let total = (total + (&excess * config.bounds_coef)?)?;
     let kl = kl([&batch.old_means, old_std], [&means.detach(), &log_std.detach()])?;
-    Ok(Losses { total, policy, value, entropy, kl, ratios: ratios.detach() })
+    Ok(Losses { total, policy, value, excess, entropy, kl, ratios: ratios.detach() })
 }
 
 #[cfg(test)]
@@ -165,6 +169,29 @@ mod tests {
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
         assert_close(grads.get(&log_std).unwrap(), &[-0.113_067_5, -0.527_346_6]);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
+    }
+
+    #[test]
+    fn means_beyond_the_bounds_of_actions_are_pulled_back() {
+        let batch = Minibatch {
+            observations: tensor(&[0.0], &[1, 1]),
+            actions: tensor(&[0.2, 1.5], &[1, 2]),
+            old_means: tensor(&[-0.5, 0.5], &[1, 2]),
+            old_log_probs: tensor(&[-2.0], &[1]),
+            old_values: tensor(&[1.0], &[1]),
+            advantages: tensor(&[-2.0], &[1]),
+            returns: tensor(&[0.9], &[1]),
+        };
+        let (log_std, std, value) = (tensor(&[-0.5, 0.2], &[2]), tensor(&[0.7, 1.1], &[2]), tensor(&[1.4], &[1]));
+        let mean = Var::from_tensor(&tensor(&[1.5, -0.2], &[1, 2])).unwrap();
+        let with = |bounds_coef: f64| {
+            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            config.bounds_coef = bounds_coef;
+            let found = losses(&config, &batch, [&mean, &value], [&log_std, &std]).unwrap();
+            assert_close(&found.excess, &[0.25]);
+            found.total.backward().unwrap().get(&mean).unwrap().clone()
+        };
+        assert_close(&(with(0.5) - with(0.0)).unwrap(), &[0.5, 0.0]);
     }
 
     #[test]

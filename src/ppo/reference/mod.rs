@@ -82,6 +82,7 @@ impl Backend for Reference {
             total: scalar(&losses.total)?,
             policy: scalar(&losses.policy)?,
             value: scalar(&losses.value)?,
+            excess: scalar(&losses.excess)?,
             entropy: scalar(&losses.entropy)?,
             kl: scalar(&losses.kl)?,
             clip_fraction: errors().filter(|&error| error > self.config.clip).count() as f64 / ratios.len() as f64,
