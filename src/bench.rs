@@ -15,6 +15,7 @@ use crate::config::Config;
 use crate::env::{
     ACTION_SIZE, End, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
 };
+use crate::perception::perception;
 use crate::ppo::{Ppo, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng::{self, Rng};
 use crate::run;
@@ -296,7 +297,8 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
 }
 
 fn agent(task: &Arc<Task>, config: &Config) -> Result<(Ppo, EnvPool<Repose>)> {
-    let pool = EnvPool::new(config.run.seed, (0..config.env.num_envs).map(|_| Repose::new(task)).collect());
+    let mut pool = EnvPool::new(config.run.seed, (0..config.env.num_envs).map(|_| Repose::new(task)).collect());
+    pool.perceive_with(perception(config.ppo.symmetry));
     Ok((Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, config.run.seed)?, pool))
 }
 

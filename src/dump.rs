@@ -13,6 +13,8 @@ pub fn of(diverged: &Diverged, config: &EnvConfig, iteration: u64, env: usize) -
     let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
     let dump = json!({
         "model": config.model,
+        "friction_scale": config.friction_scale,
+        "cube_mass_scale": config.cube_mass_scale,
         "sim_dt": config.sim_dt,
         "ctrl_dt": config.ctrl_dt,
         "iteration": iteration,

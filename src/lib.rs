@@ -14,6 +14,7 @@
 //! | [`config`] | all settings, their defaults and rules |
 //! | [`train`] | the training, from top to bottom |
 //! | [`mod@collect`] | environments stepping under the policy: the only place where the two meet |
+//! | [`perception`] | what a policy makes of an observation before its nets see it: the symmetry of the cube |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
 //! | [`dump`] | what led to a diverged state, as JSON |
 //! | [`load`] | checkpoints and policies from files that nobody vouches for |
@@ -22,7 +23,7 @@
 //! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
 //! | [`plot`] | learning curves of runs |
 //! | [`mod@bench`] | what this machine can do |
-//! | [`mod@env`] | the task, its reward, and many of them in blocks |
+//! | [`mod@env`] | the task, its reward, the lessons that training makes of it, and many of them in blocks |
 //! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
 //! | [`sim`] | the fence around MuJoCo |
 //! | [`ppo`] | the fence around candle: policy, kernels and their reference, checkpoint as bytes |

@@ -178,7 +178,10 @@ impl Loaded {
         let path = found.clone().unwrap_or_else(|| SHIPPED_NAME.into());
         let (checkpoint, config) = match found {
             Some(path) => load::load(&path, overrides)?,
-            None => load::parse(&path, SHIPPED, overrides)?,
+            None => {
+                run::say("there is no run here: playing the policy that is built in");
+                load::parse(&path, SHIPPED, overrides)?
+            }
         };
         let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play {}", path.display()))?;
         Ok(Self { path, config, policy })

@@ -8,7 +8,7 @@ use crate::cli::{Along, PlotArgs};
 use crate::run::{self, Chart, Curve, Panel};
 
 /// What is drawn when nothing else is asked for: the headline, and what explains it.
-const DEFAULT: [&str; 3] = ["episode/goals", "episode/rot_dist", "episode/drop_rate"];
+const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];
 
 /// Pixels of a picture whose size is not asked for: its width, and the height of a panel.
 const SIZE: [u32; 2] = [800, 260];

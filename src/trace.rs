@@ -29,6 +29,8 @@ impl Trace {
             "max_consecutive_successes": config.max_consecutive_successes,
             "max_episode_steps": config.max_episode_steps(),
             "model": config.model,
+            "friction_scale": config.friction_scale,
+            "cube_mass_scale": config.cube_mass_scale,
             "checkpoint": checkpoint,
         });
         Self { header, episodes: Vec::new(), last: usize::MAX }

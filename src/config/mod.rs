@@ -337,6 +337,7 @@ mod tests {
         let TrainingConfig { task_reward, progress_reward, goal_reward, drop_reward, .. } = config.training;
         assert_eq!([task_reward, progress_reward, goal_reward, drop_reward], [1.0, 0.0, 0.0, 0.0]);
         let curricula = &config.training;
+        assert_eq!(config.ppo.bounds_coef, 0.0);
         let steps = [curricula.drop_reward_steps, curricula.tolerance_steps, curricula.hold_steps];
         assert_eq!((steps, curricula.goal_angle_steps), ([0; 3], 0));
         // A user's own file means today's defaults where it is silent.

@@ -49,13 +49,6 @@ impl Config {
         rules.not_negative("training.task_reward", training.task_reward);
         rules.positive("training.tolerance_start", training.tolerance_start);
         rules.at_least("training.hold_start", training.hold_start as usize, 1);
-        let most = env.max_consecutive_successes;
-        rules.check(
-            training.hold_start <= most || training.hold_steps == 0,
-            "training.hold_start",
-            training.hold_start,
-            &format!("be at most env.max_consecutive_successes = {most}"),
-        );
         rules.positive("training.goal_angle_start", training.goal_angle_start);
         let half_turn = training.goal_angle_start <= std::f64::consts::PI;
         rules.check(half_turn, "training.goal_angle_start", training.goal_angle_start, "be at most pi");

@@ -29,6 +29,9 @@ const ACTUATORS: [&str; ACTION_SIZE] = [
     "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
 ];
 
+/// The body that is turned.
+pub(super) const CUBE: &str = "cube";
+
 /// Fingertips in the order of the observation.
 const FINGERTIPS: [&str; 5] = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"];
 
@@ -74,7 +77,7 @@ impl Hand {
             driven,
             actuators,
             fingertips: each(FINGERTIPS, |tip| scene.body(tip))?,
-            cube: scene.free_body("cube")?,
+            cube: scene.free_body(CUBE)?,
             target: scene.mocap("target")?,
         })
     }

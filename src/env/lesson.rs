@@ -55,7 +55,8 @@ impl Lesson {
         // How much of a curriculum is behind us; one that lasts no steps is switched off.
         let share = |steps: u64| if steps == 0 { 1.0 } else { (env_steps as f64 / steps as f64).min(1.0) };
         let between = |start: f64, end: f64, share: f64| start * (1.0 - share) + end * share;
-        let hold = between(f64::from(training.hold_start), f64::from(task.hold), share(training.hold_steps));
+        let first_hold = training.hold_start.min(task.hold);
+        let hold = between(f64::from(first_hold), f64::from(task.hold), share(training.hold_steps));
         Self {
             // By equal factors in equal times: halving the error is as hard a step anywhere.
             tolerance: training.tolerance_start.powf(1.0 - share(training.tolerance_steps))

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 
+use super::hand::CUBE;
 use super::tail::{Recorder, Tail};
 use super::{
     ACTION_SIZE, End, Env, EnvState, EpisodeStats, Hand, Lesson, OBSERVATION_SIZE, Recent, Resumable, RewardTerms,
@@ -59,7 +60,7 @@ impl Task {
 }
 
 fn variation(config: &EnvConfig) -> Variation {
-    Variation { timestep: config.sim_dt, friction: config.friction_scale, load: config.cube_mass_scale }
+    Variation { timestep: config.sim_dt, friction: config.friction_scale, load: (CUBE, config.cube_mass_scale) }
 }
 
 /// One hand with its cube.
@@ -358,7 +359,7 @@ impl Env for Repose {
         let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
         let reward = match diverged {
             true => RewardTerms::default(),
-            false => RewardTerms::of_step(config, self.lesson.tolerance, rot_dist, goal_dist, &self.previous_action),
+            false => RewardTerms::of_step(config, rot_dist, goal_dist, &self.previous_action),
         };
         self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged };
 

@@ -24,14 +24,14 @@ impl RewardTerms {
     pub const NAMES: [&'static str; 5] = ["rotation", "distance", "action", "bonus", "fall"];
 
     /// The terms of a step that ends with the rotation error `rot_dist` (rad) and the distance `goal_dist` (m), after the
-    /// clipped `action`, where `tolerance` (rad) counts as being at the goal.
-    pub fn of_step(config: &EnvConfig, tolerance: f64, rot_dist: f64, goal_dist: f64, action: &[f32]) -> Self {
+    /// clipped `action`.
+    pub fn of_step(config: &EnvConfig, rot_dist: f64, goal_dist: f64, action: &[f32]) -> Self {
         let effort: f64 = action.iter().map(|&a| f64::from(a) * f64::from(a)).sum();
         Self {
             rotation: config.rot_reward_scale / (rot_dist + config.rot_eps),
             distance: config.dist_reward_scale * goal_dist,
             action: config.action_penalty_scale * effort,
-            bonus: if rot_dist <= tolerance { config.reach_goal_bonus } else { 0.0 },
+            bonus: if rot_dist <= config.success_tolerance { config.reach_goal_bonus } else { 0.0 },
             fall: if goal_dist >= config.fall_dist { config.fall_penalty } else { 0.0 },
         }
     }
@@ -72,7 +72,7 @@ mod tests {
     fn terms(rot_dist: f64, goal_dist: f64, action: &[f32]) -> RewardTerms {
         let mut config = Config::resolve(None, &[]).unwrap().env;
         config.fall_penalty = -7.0;
-        RewardTerms::of_step(&config, config.success_tolerance, rot_dist, goal_dist, action)
+        RewardTerms::of_step(&config, rot_dist, goal_dist, action)
     }
 
     #[test]

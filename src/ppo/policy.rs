@@ -17,7 +17,7 @@ const LAST_ACTOR_LAYER: f32 = 0.1;
 /// A Gaussian policy with diagonal covariance, and the value of states under it.
 pub struct Policy {
     parameters: Vec<(String, Var)>,
-    /// Reads raw observations.
+    /// Reads observations as the environments' pool gives them.
     pub normalizer: Normalizer,
     hidden: Vec<usize>,
     activation: Activation,

@@ -26,16 +26,16 @@ pub struct Scene {
 pub struct Variation {
     /// The physics timestep, s.
     pub timestep: f64,
-    /// Every coefficient of friction between two bodies is multiplied by it.
+    /// The coefficients of friction of every geom and every pair of them are multiplied by it.
     pub friction: f64,
-    /// The mass and the inertia of every body with a free joint are multiplied by it.
-    pub load: f64,
+    /// The mass and the inertia of this body, with all that hangs on it, are multiplied by this.
+    pub load: (&'static str, f64),
 }
 
 impl Variation {
     /// The scene's own physics, with this timestep in s.
     pub fn none(timestep: f64) -> Self {
-        Self { timestep, friction: 1.0, load: 1.0 }
+        Self { timestep, friction: 1.0, load: ("", 1.0) }
     }
 
     fn apply(self, model: &mut MjModel) {
@@ -43,12 +43,16 @@ impl Variation {
         let scale = |factors: &mut [f64]| factors.iter_mut().for_each(|x| *x *= self.friction);
         scale(model.geom_friction_mut().as_flattened_mut());
         scale(model.pair_friction_mut().as_flattened_mut());
-        if self.load != 1.0 {
-            for body in 0..model.nbody() as usize {
-                let joint = usize::try_from(model.body_jntadr()[body]).ok();
-                if joint.is_some_and(|joint| model.jnt_type()[joint] == MjtJoint::mjJNT_FREE) {
-                    model.body_mass_mut()[body] *= self.load;
-                    model.body_inertia_mut()[body].iter_mut().for_each(|x| *x *= self.load);
+        let (name, load) = self.load;
+        if load != 1.0 {
+            // Bodies are numbered so that each comes after the one that it hangs on.
+            let mut loaded = vec![false; model.nbody() as usize];
+            for body in 0..loaded.len() {
+                let named = model.id_to_name(MjtObjBase::mjOBJ_BODY, body) == Some(name);
+                loaded[body] = named || loaded[model.body_parentid()[body] as usize];
+                if loaded[body] {
+                    model.body_mass_mut()[body] *= load;
+                    model.body_inertia_mut()[body].iter_mut().for_each(|x| *x *= load);
                 }
             }
             // What MuJoCo works out from the masses once, as the scale of contact forces, must follow them.

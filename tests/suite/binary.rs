@@ -121,7 +121,7 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
     let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let header: Vec<&String> = lines[0].as_object().unwrap().keys().collect();
     let expected = "sim_dt ctrl_dt act_moving_average success_tolerance max_consecutive_successes max_episode_steps model \
-                    checkpoint";
+                    friction_scale cube_mass_scale checkpoint";
     assert_eq!(header.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" "), expected);
     let records = &lines[1..];
     // Episodes of 21 records: enough after 96 of them, without the 97th.

@@ -1,7 +1,7 @@
 //! What only training changes: lessons, and what a policy takes to be the same.
 
 use shadow_repose::config::Symmetry;
-use shadow_repose::env::{Env, Lesson, OBSERVATION_SIZE, Repose};
+use shadow_repose::env::{Env, EnvPool, Lesson, OBSERVATION_SIZE, Repose, StepBuffers};
 use shadow_repose::perception::perception;
 use shadow_repose::quat;
 use shadow_repose::rng;
@@ -86,7 +86,10 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let task = task(&[]);
     let (mut plain, mut observation) = started(&task);
     let (mut shaped, _) = started(&task);
-    shaped.set_lesson(lesson(0, &["training.task_reward=0.5", "training.progress_reward=100"]));
+    // A tolerance so wide that a task paid by it would pay a bonus all the time.
+    let wide = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_start=50"];
+    let paid = ["training.task_reward=0.5", "training.progress_reward=100", "training.hold_steps=0"];
+    shaped.set_lesson(lesson(0, &[&wide[..], &paid].concat()));
     for _ in 0..20 {
         let before = shaped.rot_dist();
         let expected = plain.step(&[0.3; 20], &mut observation);
@@ -137,4 +140,35 @@ fn friction_and_the_mass_of_the_cube_are_scaled_as_if_the_scene_said_so() {
     let slippery_in_the_scene = said(&[all, [r#"friction="1.2""#, r#"friction=".6 .0025 .00005""#]]);
     assert!(apart(&slippery, &slippery_in_the_scene) < 1e-4, "{slippery:?}\n{slippery_in_the_scene:?}");
     assert!(apart(&slippery, &unchanged) > 1e-3);
+}
+
+#[test]
+fn a_pool_gives_the_policy_what_it_looks_at_and_an_environment_what_is_there() {
+    let task = task(&["env.max_episode_seconds=0.05"]);
+    let rows = |perceive: fn(&mut [f32])| {
+        let mut pool = EnvPool::new(3, (0..4).map(|_| Repose::new(&task)).collect());
+        pool.perceive_with(perceive);
+        let mut all = Vec::new();
+        let (mut observations, mut last) = (vec![0.0; 4 * OBSERVATION_SIZE], vec![0.0; 4 * OBSERVATION_SIZE]);
+        pool.reset(vec![&mut observations]);
+        all.extend_from_slice(&observations);
+        let mut truncated = 0;
+        for _ in 0..6 {
+            let (rewards, ends) = (&mut [0.0; 4], &mut [None; 4]);
+            let buffers = StepBuffers { rewards, ends, observations: &mut observations, final_observations: &mut last };
+            pool.blocks_mut()[0].step(&[0.3; 80], buffers).unwrap();
+            truncated += ends.iter().flatten().count();
+            all.extend(observations.iter().chain(&last));
+        }
+        assert!(truncated >= 4, "{truncated}");
+        let saved = pool.save();
+        pool.restore(&saved, vec![&mut observations]).unwrap();
+        all.extend_from_slice(&observations);
+        all
+    };
+    let raw = rows(|_| {});
+    let mut expected = raw.clone();
+    expected.chunks_exact_mut(OBSERVATION_SIZE).for_each(perception(Symmetry::Cube));
+    assert!(expected != raw, "cubes lie in many ways");
+    assert!(rows(perception(Symmetry::Cube)) == expected);
 }
