@@ -81,6 +81,9 @@ pub struct TrainArgs {
     /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
+    /// Begin with the policy of a checkpoint or run, weights and normaliser; everything else is as in a new run
+    #[arg(long, value_name = "FILE|RUN", conflicts_with = "resume")]
+    pub init: Option<PathBuf>,
     /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
     #[arg(long, value_name = "N", value_parser = kept())]
     pub keep: Option<usize>,

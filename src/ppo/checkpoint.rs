@@ -236,6 +236,16 @@ impl Ppo {
         Ok(checkpoint)
     }
 
+    /// Begins with the policy of a checkpoint, or of a policy alone.
+    ///
+    /// # Errors
+    /// Another policy than the one of the configuration.
+    pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<()> {
+        let sizes = [self.policy.observation_size(), self.policy.action_size()];
+        self.policy = Policy::load(&self.config, sizes[0], sizes[1], checkpoint)?;
+        Ok(())
+    }
+
     /// Goes on from a checkpoint, and takes out of it what it needs.
     ///
     /// # Errors
@@ -341,6 +351,17 @@ mod tests {
             assert_eq!(numbers(a), numbers(b));
         }
         assert!(refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing"));
+    }
+
+    #[test]
+    fn a_learner_begins_with_the_policy_of_another_and_nothing_else_of_it() {
+        let from = learnt(Backend::Fused, 1);
+        let mut to = Ppo::new(&config(Backend::Fused, &[8]), 3, 2, 5).unwrap();
+        to.begin_with(&saved(&from)).unwrap();
+        assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
+        let fresh = config(Backend::Fused, &[8]).learning_rate;
+        assert_eq!((to.learning_rate, to.backend.moments(&to.policy).unwrap().steps), (fresh, 0));
+        assert!(learner(&[9]).begin_with(&saved(&from)).is_err());
     }
 
     #[test]

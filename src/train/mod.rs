@@ -160,7 +160,11 @@ impl Session {
         settle_model(&mut config)?;
         run::start_threads(config.run.threads)?;
         let folder = || RunFolder::create(args.run_dir.as_deref(), args.name.as_deref());
+        let init = args.init.as_deref().map(|place| saving::policy_to_begin_with(place, &config)).transpose()?;
         let mut session = Self::new(config, folder, args)?;
+        if let Some(policy) = init {
+            session.ppo.begin_with(&policy)?;
+        }
         let lesson = session.lesson();
         session.pool.envs_mut().for_each(|env| env.set_lesson(lesson));
         session.pool.reset(session.rollout.first_observations_mut());

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use anyhow::{Context, Error, Result, anyhow, ensure};
 
 use super::{Session, version};
-use crate::config::{Config, Override};
+use crate::config::{BUILTIN_MODEL, Config, Override, PpoConfig};
 use crate::dump;
-use crate::env::EnvState;
+use crate::env::{ACTION_SIZE, EnvState, OBSERVATION_SIZE};
 use crate::load::{self, MODEL};
 use crate::ppo::{Array, Checkpoint, Progress};
 use crate::run::{self, Report, RunFolder};
@@ -195,4 +195,24 @@ pub(super) fn first_sound(places: &[PathBuf], overrides: &[Override]) -> Result<
     }
     let (checkpoint, config) = load::load(last, overrides)?;
     Ok((last.clone(), checkpoint, config))
+}
+
+/// The policy of a checkpoint or run, for a training with this configuration to begin with.
+///
+/// # Errors
+/// A file that cannot be used, or a policy that the configuration does not describe.
+pub(super) fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Checkpoint> {
+    let path = run::resolve_checkpoint(place)?;
+    // Which scene it was trained in does not matter.
+    let any_scene = Override { key: MODEL.into(), value: BUILTIN_MODEL.into() };
+    let (checkpoint, of_it) = load::load(&path, &[any_scene])?;
+    let fitting = || {
+        checkpoint.expect_policy(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE)?;
+        let describe = |ppo: &PpoConfig| (ppo.activation, ppo.symmetry);
+        let (found, expected) = (describe(&of_it.ppo), describe(&config.ppo));
+        ensure!(found == expected, "its activation and symmetry are {found:?}, those of this training {expected:?}");
+        Ok(())
+    };
+    fitting().with_context(|| format!("cannot begin with {}", path.display()))?;
+    Ok(checkpoint)
 }

@@ -90,6 +90,25 @@ fn where_there_is_no_run_the_built_in_policy_is_played_and_turns_the_cube() {
 }
 
 #[test]
+fn a_training_can_begin_with_the_policy_of_another_if_it_fits() {
+    let folder = trained(&[]);
+    let args = train(&["--run-dir", "on", "--init", "run", "--total-steps", "128", "--seed", "9", "--keep", "9"]);
+    succeeded(program(folder.path(), &args));
+    let of = |path: &str, name: &str| {
+        let all = weights(folder.path().join(path));
+        all.into_iter().find(|(found, _)| found == name).expect("it is there").1
+    };
+    let begun = names(&folder.path().join("on/checkpoints")).into_iter().find(|name| name.starts_with("iteration"));
+    let begun = format!("on/checkpoints/{}", begun.unwrap());
+    assert_eq!(of(&begun, "actor.0.weight"), of("run/checkpoints/best.safetensors", "actor.0.weight"));
+    assert!(of(&begun, "adam.steps").iter().all(|&byte| byte == 0));
+    let other = train(&["--run-dir", "other", "--init", "run", "--set", "ppo.symmetry=none"]);
+    let refused = program(folder.path(), &other);
+    assert!(!refused.status.success() && stderr(&refused).contains("symmetry"), "{}", stderr(&refused));
+    assert!(!folder.path().join("other").exists(), "nothing is begun");
+}
+
+#[test]
 fn scores_do_not_depend_on_threads_or_on_how_many_episodes_are_asked_for() {
     let folder = trained(&[]);
     let play = |threads: &str, episodes: &str, more: &[&str]| {
