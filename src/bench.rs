@@ -157,6 +157,10 @@ impl Env for Recorder {
         transition
     }
 
+    fn redirect(&mut self, observation: &mut [f32]) {
+        self.env.redirect(observation);
+    }
+
     fn episode(&self) -> EpisodeStats {
         self.env.episode()
     }

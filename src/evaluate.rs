@@ -215,7 +215,7 @@ impl Player {
 
     /// Draws another goal.
     pub fn new_goal(&mut self) {
-        self.lane.env.new_goal(&mut self.observation);
+        self.lane.env.redirect(&mut self.observation);
     }
 
     /// The environment.

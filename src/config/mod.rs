@@ -21,13 +21,16 @@ pub const BASE: &str = include_str!("../../configs/repose.toml");
 const BEFORE: &str = r#"
 [training]
 task_reward = 1.0
+task_reward_steps = 0
 progress_reward = 0.0
+hold_reward = 0.0
 goal_reward = 0.0
 drop_reward = 0.0
 drop_reward_steps = 0
 tolerance_steps = 0
 hold_steps = 0
 goal_angle_steps = 0
+goal_lifetime = 0
 [ppo]
 symmetry = "none"
 bounds_coef = 0.0
@@ -99,7 +102,10 @@ pub enum SuccessHold {
 #[serde(deny_unknown_fields)]
 pub struct TrainingConfig {
     pub task_reward: f64,
+    pub task_reward_start: f64,
+    pub task_reward_steps: u64,
     pub progress_reward: f64,
+    pub hold_reward: f64,
     pub goal_reward: f64,
     pub drop_reward: f64,
     pub drop_reward_start: f64,
@@ -110,6 +116,7 @@ pub struct TrainingConfig {
     pub hold_steps: u64,
     pub goal_angle_start: f64,
     pub goal_angle_steps: u64,
+    pub goal_lifetime: u64,
 }
 
 /// The learner; `configs/repose.toml` says what each key means.
@@ -311,6 +318,7 @@ impl Config {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::env::Lesson;
 
     fn set(text: &str) -> Override {
         text.parse().unwrap()
@@ -334,12 +342,9 @@ mod tests {
     fn a_run_from_before_a_setting_existed_goes_on_as_it_was() {
         let config = Config::from_text(Path::new("config.toml"), "[ppo]\ngamma = 0.5", &[]).unwrap();
         assert_eq!((config.ppo.symmetry, config.ppo.gamma), (Symmetry::None, 0.5));
-        let TrainingConfig { task_reward, progress_reward, goal_reward, drop_reward, .. } = config.training;
-        assert_eq!([task_reward, progress_reward, goal_reward, drop_reward], [1.0, 0.0, 0.0, 0.0]);
-        let curricula = &config.training;
+        // What was trained then is the task itself.
+        assert_eq!(Lesson::at(0, &config.training, &config.env), Lesson::task(&config.env));
         assert_eq!(config.ppo.bounds_coef, 0.0);
-        let steps = [curricula.drop_reward_steps, curricula.tolerance_steps, curricula.hold_steps];
-        assert_eq!((steps, curricula.goal_angle_steps), ([0; 3], 0));
         // A user's own file means today's defaults where it is silent.
         let source = Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.5".into() };
         assert_eq!(Config::resolve(Some(&source), &[]).unwrap().ppo.symmetry, Symmetry::Cube);

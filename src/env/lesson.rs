@@ -14,10 +14,14 @@ pub struct Lesson {
     pub hold: u32,
     /// A new goal is at most so far from the cube's orientation, rad.
     pub goal_angle: f64,
+    /// Chance that the goal is replaced after a step, reached or not.
+    pub redirect_chance: f64,
     /// Weight of the task's own reward.
-    task_reward: f64,
+    pub task_reward: f64,
     /// Paid for each rad by which the rotation error shrinks, taken back where it grows.
     progress_reward: f64,
+    /// Paid on every step within the tolerance.
+    hold_reward: f64,
     /// Paid on the step on which a goal is reached.
     goal_reward: f64,
     /// Paid on the step on which the cube is dropped.
@@ -29,6 +33,8 @@ pub struct Lesson {
 pub struct Shaping {
     /// For turning towards the goal.
     pub progress: f64,
+    /// For being within the tolerance.
+    pub within: f64,
     /// For reaching a goal.
     pub goal: f64,
     /// For dropping the cube.
@@ -42,8 +48,10 @@ impl Lesson {
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
             goal_angle: PI,
+            redirect_chance: 0.0,
             task_reward: 1.0,
             progress_reward: 0.0,
+            hold_reward: 0.0,
             goal_reward: 0.0,
             drop_reward: 0.0,
         }
@@ -63,17 +71,20 @@ impl Lesson {
                 * task.tolerance.powf(share(training.tolerance_steps)),
             hold: hold.round() as u32,
             goal_angle: between(training.goal_angle_start, task.goal_angle, share(training.goal_angle_steps)),
-            task_reward: training.task_reward,
+            redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
+            task_reward: between(training.task_reward_start, training.task_reward, share(training.task_reward_steps)),
             progress_reward: training.progress_reward,
+            hold_reward: training.hold_reward,
             goal_reward: training.goal_reward,
             drop_reward: between(training.drop_reward_start, training.drop_reward, share(training.drop_reward_steps)),
         }
     }
 
     /// What a step pays that has turned the cube `progress` rad towards the goal.
-    pub(super) fn shaping(&self, progress: f64, reached: bool, dropped: bool) -> Shaping {
+    pub(super) fn shaping(&self, progress: f64, within: bool, reached: bool, dropped: bool) -> Shaping {
         Shaping {
             progress: self.progress_reward * progress,
+            within: if within { self.hold_reward } else { 0.0 },
             goal: if reached { self.goal_reward } else { 0.0 },
             drop: if dropped { self.drop_reward } else { 0.0 },
         }
@@ -87,17 +98,18 @@ impl Lesson {
 
 impl Shaping {
     /// The names under which the terms are logged, in the order of [`Shaping::values`].
-    pub const NAMES: [&'static str; 3] = ["progress", "goal", "drop"];
+    pub const NAMES: [&'static str; 4] = ["progress", "within", "goal", "drop"];
 
     /// The terms in the order of [`Shaping::NAMES`].
-    pub fn values(&self) -> [f64; 3] {
-        [self.progress, self.goal, self.drop]
+    pub fn values(&self) -> [f64; 4] {
+        [self.progress, self.within, self.goal, self.drop]
     }
 }
 
 impl AddAssign for Shaping {
     fn add_assign(&mut self, other: Self) {
         self.progress += other.progress;
+        self.within += other.within;
         self.goal += other.goal;
         self.drop += other.drop;
     }
@@ -109,15 +121,18 @@ mod tests {
     use crate::config::{Config, Override};
 
     /// Nothing that training adds.
-    const PLAIN: [&str; 8] = [
+    const PLAIN: [&str; 11] = [
         "training.task_reward=1",
+        "training.task_reward_steps=0",
         "training.progress_reward=0",
+        "training.hold_reward=0",
         "training.goal_reward=0",
         "training.drop_reward=0",
         "training.drop_reward_steps=0",
         "training.tolerance_steps=0",
         "training.hold_steps=0",
         "training.goal_angle_steps=0",
+        "training.goal_lifetime=0",
     ];
 
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {
@@ -130,7 +145,7 @@ mod tests {
     fn without_curricula_and_shaping_the_task_itself_is_trained() {
         let task = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
         assert_eq!([at(0, &[]), at(1 << 40, &[])], [task; 2]);
-        assert_eq!(task.total(1.25, task.shaping(3.0, true, true)), 1.25);
+        assert_eq!(task.total(1.25, task.shaping(3.0, true, true, true)), 1.25);
     }
 
     #[test]
@@ -148,13 +163,16 @@ mod tests {
     #[test]
     fn training_pays_for_progress_goals_and_drops_besides_the_weighted_task() {
         let sets = ["training.task_reward=0.5", "training.progress_reward=10", "training.goal_reward=7"];
-        let lesson = at(0, &[&sets[..], &["training.drop_reward=-3"]].concat());
-        let shaping = lesson.shaping(-0.2, true, false);
-        assert_eq!(shaping.values(), [-2.0, 7.0, 0.0]);
-        assert_eq!(lesson.total(4.0, shaping), 7.0);
-        assert_eq!(lesson.shaping(0.1, false, true).values(), [1.0, 0.0, -3.0]);
+        let lesson = at(0, &[&sets[..], &["training.drop_reward=-3", "training.hold_reward=2"]].concat());
+        let shaping = lesson.shaping(-0.2, true, true, false);
+        assert_eq!(shaping.values(), [-2.0, 2.0, 7.0, 0.0]);
+        assert_eq!(lesson.total(4.0, shaping), 9.0);
+        assert_eq!(lesson.shaping(0.1, false, false, true).values(), [1.0, 0.0, 0.0, -3.0]);
         let sets = ["training.drop_reward=-3", "training.drop_reward_start=1", "training.drop_reward_steps=100"];
-        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).shaping(0.0, false, true).drop);
+        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).shaping(0.0, false, false, true).drop);
         assert_eq!(drops, [1.0, -1.0, -3.0, -3.0]);
+        let sets = ["training.task_reward=0", "training.task_reward_start=1", "training.task_reward_steps=100"];
+        let weights = [0, 50, 100, 500].map(|steps| at(steps, &sets).total(1.0, Shaping::default()));
+        assert_eq!(weights, [1.0, 0.5, 0.0, 0.0]);
     }
 }

@@ -24,21 +24,24 @@ use anyhow::Result;
 
 use crate::rng::Rng;
 
-/// Why an episode is over.
+/// Why what can be earned ends here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
     /// There is no future: nothing can be earned after this step.
     Terminated,
     /// Only time is up: the value of the final observation stands for what would have come.
     Truncated,
+    /// The episode goes on, but under another goal: the value of the observation under the old one stands for what would have
+    /// come.
+    Redirected,
 }
 
-/// What one step earned and whether it was the last.
+/// What one step earned and whether it was a last one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// Reward, before any scaling.
     pub reward: f32,
-    /// Set on the last step of an episode.
+    /// Set on the last step of an episode, or under a goal.
     pub end: Option<End>,
 }
 
@@ -61,6 +64,9 @@ pub trait Env: Send {
 
     /// Takes one step and writes the observation after it, also where it ends the episode.
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition;
+
+    /// Goes on under another goal after a step that ended with [`End::Redirected`], and writes the observation that shows it.
+    fn redirect(&mut self, observation: &mut [f32]);
 
     /// The episode so far.
     fn episode(&self) -> Self::Episode;

@@ -194,13 +194,17 @@ impl<E: Env> EnvBlock<E> {
             let step = || {
                 let transition: Transition = slot.env.step(action, row);
                 (*reward, *end) = (transition.reward, transition.end);
-                if let Some(end) = transition.end {
-                    if end == End::Truncated {
-                        final_row.copy_from_slice(row);
-                        (self.perceive)(final_row);
+                if let Some(End::Truncated | End::Redirected) = transition.end {
+                    final_row.copy_from_slice(row);
+                    (self.perceive)(final_row);
+                }
+                match transition.end {
+                    None => {}
+                    Some(End::Redirected) => slot.env.redirect(row),
+                    Some(End::Truncated | End::Terminated) => {
+                        self.finished.push(slot.env.episode());
+                        slot.start(self.seed, self.stride, row);
                     }
-                    self.finished.push(slot.env.episode());
-                    slot.start(self.seed, self.stride, row);
                 }
                 (self.perceive)(row);
             };

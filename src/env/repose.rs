@@ -164,14 +164,6 @@ impl Repose {
         &mut self.sim
     }
 
-    /// Draws another goal, which must be held anew, and writes the observation that shows it.
-    pub fn new_goal(&mut self, observation: &mut [f32]) {
-        self.set_goal();
-        self.held = 0;
-        self.sim.refresh();
-        self.observe(observation);
-    }
-
     /// The settings of the task.
     pub fn config(&self) -> &EnvConfig {
         &self.task.config
@@ -246,6 +238,12 @@ impl Repose {
             self.sim.refresh();
         }
         reached
+    }
+
+    /// Whether the lesson replaces the goal now, reached or not. Chance decides, so that the state needs no clock.
+    fn gives_up(&mut self) -> bool {
+        let chance = self.lesson.redirect_chance;
+        chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
     }
 
     /// Writes the observation `[157]` of the present state, in the order of the task.
@@ -378,18 +376,28 @@ impl Env for Repose {
         } else {
             self.episode.rot_dist_sum += rot_dist;
             self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
-            let reached = self.hold(rot_dist <= self.lesson.tolerance);
-            shaping = self.lesson.shaping(rot_dist_before - rot_dist, reached, self.episode.dropped);
+            let within = rot_dist <= self.lesson.tolerance;
+            let reached = self.hold(within);
+            shaping = self.lesson.shaping(rot_dist_before - rot_dist, within, reached, self.episode.dropped);
             self.recent.shaping += shaping;
         }
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
         } else {
-            (self.age >= self.task.config.max_episode_steps()).then_some(End::Truncated)
+            let time_is_up = self.age >= self.task.config.max_episode_steps();
+            time_is_up.then_some(End::Truncated).or_else(|| self.gives_up().then_some(End::Redirected))
         };
         self.observe(observation);
         Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }
+    }
+
+    /// Draws another goal, which must be held anew.
+    fn redirect(&mut self, observation: &mut [f32]) {
+        self.set_goal();
+        self.held = 0;
+        self.sim.refresh();
+        self.observe(observation);
     }
 
     fn episode(&self) -> EpisodeStats {

@@ -1,7 +1,7 @@
 //! What only training changes: lessons, and what a policy takes to be the same.
 
 use shadow_repose::config::Symmetry;
-use shadow_repose::env::{Env, EnvPool, Lesson, OBSERVATION_SIZE, Repose, StepBuffers};
+use shadow_repose::env::{End, Env, EnvPool, GOAL_ORIENTATION, Lesson, OBSERVATION_SIZE, Repose, StepBuffers};
 use shadow_repose::perception::perception;
 use shadow_repose::quat;
 use shadow_repose::rng;
@@ -171,4 +171,41 @@ fn a_pool_gives_the_policy_what_it_looks_at_and_an_environment_what_is_there() {
     expected.chunks_exact_mut(OBSERVATION_SIZE).for_each(perception(Symmetry::Cube));
     assert!(expected != raw, "cubes lie in many ways");
     assert!(rows(perception(Symmetry::Cube)) == expected);
+}
+
+#[test]
+fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_what_it_had_and_what_it_gets() {
+    let task = task(&[]);
+    let lesson = lesson(0, &["training.goal_lifetime=20"]);
+    let envs = (0..8).map(|_| Repose::new(&task)).map(|mut env| {
+        env.set_lesson(lesson);
+        env
+    });
+    let mut pool = EnvPool::new(3, envs.collect());
+    let (mut observations, mut last) = (vec![0.0; 8 * OBSERVATION_SIZE], vec![0.0; 8 * OBSERVATION_SIZE]);
+    pool.reset(vec![&mut observations]);
+    let mut redirected = 0;
+    for _ in 0..200 {
+        let before: Vec<_> = pool.envs_mut().map(|env| (env.goal(), env.episode().length)).collect();
+        let (rewards, ends) = (&mut [0.0; 8], &mut [None; 8]);
+        let buffers = StepBuffers { rewards, ends, observations: &mut observations, final_observations: &mut last };
+        pool.blocks_mut()[0].step(&[0.0; 160], buffers).unwrap();
+        for (i, (env, (goal, length))) in pool.envs_mut().zip(before).enumerate() {
+            let row = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
+            let (seen, under_the_old) = (&observations[row.clone()], &last[row]);
+            let shown = quat::canonical(env.goal()).map(|x| x as f32);
+            assert_eq!(seen[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
+            if ends[i] != Some(End::Redirected) {
+                continue;
+            }
+            redirected += 1;
+            assert!(env.goal() != goal && env.episode().length == length + 1, "the episode goes on");
+            let old = quat::canonical(goal).map(|x| x as f32);
+            assert_eq!(under_the_old[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], old);
+            for same in [0..GOAL_ORIENTATION, GOAL_ORIENTATION + 8..OBSERVATION_SIZE] {
+                assert_eq!(seen[same.clone()], under_the_old[same], "nothing has moved");
+            }
+        }
+    }
+    assert!((50..120).contains(&redirected), "80 are expected: {redirected}");
 }
