@@ -34,6 +34,7 @@ goal_lifetime = 0
 [ppo]
 symmetry = "none"
 bounds_coef = 0.0
+max_std_steps = 0
 "#;
 
 /// `env.model` of the scene that is built into the program.
@@ -145,6 +146,8 @@ pub struct PpoConfig {
     pub max_grad_norm: f64,
     pub reward_scale: f64,
     pub init_std: f64,
+    pub max_std: f64,
+    pub max_std_steps: u64,
 }
 
 /// The function after each hidden layer.
@@ -201,6 +204,19 @@ pub struct RunConfig {
     pub eval_episodes: usize,
     pub seed: u64,
     pub threads: usize,
+}
+
+impl PpoConfig {
+    /// The upper bound of the standard deviations of the actions after `env_steps` control steps of the whole run, if there is one.
+    pub fn std_bound(&self, env_steps: u64) -> Option<f64> {
+        let share = share(env_steps, self.max_std_steps);
+        (self.max_std_steps > 0).then(|| self.init_std.powf(1.0 - share) * self.max_std.powf(share))
+    }
+}
+
+/// How much of a schedule of so many steps is behind us, from 0 to 1; one that lasts no steps is over.
+pub fn share(env_steps: u64, steps: u64) -> f64 {
+    if steps == 0 { 1.0 } else { (env_steps as f64 / steps as f64).min(1.0) }
 }
 
 impl EnvConfig {
@@ -344,7 +360,7 @@ mod tests {
         assert_eq!((config.ppo.symmetry, config.ppo.gamma), (Symmetry::None, 0.5));
         // What was trained then is the task itself.
         assert_eq!(Lesson::at(0, &config.training, &config.env), Lesson::task(&config.env));
-        assert_eq!(config.ppo.bounds_coef, 0.0);
+        assert_eq!((config.ppo.bounds_coef, config.ppo.std_bound(0)), (0.0, None));
         // A user's own file means today's defaults where it is silent.
         let source = Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.5".into() };
         assert_eq!(Config::resolve(Some(&source), &[]).unwrap().ppo.symmetry, Symmetry::Cube);

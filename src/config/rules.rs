@@ -98,6 +98,7 @@ impl Config {
         rules.positive("ppo.max_grad_norm", ppo.max_grad_norm);
         rules.positive("ppo.reward_scale", ppo.reward_scale);
         rules.positive("ppo.init_std", ppo.init_std);
+        rules.positive("ppo.max_std", ppo.max_std);
 
         rules.at_least("run.total_steps", run.total_steps as usize, 1);
         rules.at_least("run.checkpoint_every", run.checkpoint_every as usize, 1);

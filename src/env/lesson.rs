@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 use std::ops::AddAssign;
 
-use crate::config::{EnvConfig, TrainingConfig};
+use crate::config::{EnvConfig, TrainingConfig, share};
 
 /// The task as it is trained at some moment: what counts as reaching a goal, which goals are drawn, what is paid.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,8 +60,7 @@ impl Lesson {
     /// The lesson that training gives after `env_steps` control steps of the whole run.
     pub fn at(env_steps: u64, training: &TrainingConfig, env: &EnvConfig) -> Self {
         let task = Self::task(env);
-        // How much of a curriculum is behind us; one that lasts no steps is switched off.
-        let share = |steps: u64| if steps == 0 { 1.0 } else { (env_steps as f64 / steps as f64).min(1.0) };
+        let share = |steps| share(env_steps, steps);
         let between = |start: f64, end: f64, share: f64| start * (1.0 - share) + end * share;
         let first_hold = training.hold_start.min(task.hold);
         let hold = between(f64::from(first_hold), f64::from(task.hold), share(training.hold_steps));

@@ -149,6 +149,12 @@ impl Policy {
     pub fn std(&self) -> Result<Vec<f32>> {
         Ok(self.log_std().as_detached_tensor().exp()?.to_vec1()?)
     }
+
+    /// Lowers each standard deviation that is above `bound` to it.
+    pub(super) fn limit_std(&self, bound: f64) -> Result<()> {
+        let within = self.log_std().as_detached_tensor().minimum(bound.ln())?;
+        Ok(self.log_std().set(&within)?)
+    }
 }
 
 /// The name of the logarithm of the standard deviations.

@@ -264,6 +264,7 @@ impl Session {
         let started = Instant::now();
         let lesson = self.lesson();
         self.pool.envs_mut().for_each(|env| env.set_lesson(lesson));
+        self.ppo.limit_std(self.progress.env_steps)?;
         if !collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)? {
             return Ok(false);
         }

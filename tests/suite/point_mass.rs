@@ -133,6 +133,22 @@ fn ppo_learns_on_tiles_where_there_are_any() {
 }
 
 #[test]
+fn standard_deviations_stay_within_a_bound_that_falls_by_equal_factors() {
+    let settings = PpoConfig { max_std: 0.125, max_std_steps: 100, ..settings() };
+    let mut ppo = Ppo::new(&settings, 2, 2, 0).unwrap();
+    let mut std_at = |env_steps| {
+        ppo.limit_std(env_steps).unwrap();
+        ppo.policy().std().unwrap()
+    };
+    for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.125)] {
+        assert!(std_at(env_steps).iter().all(|std| (std - expected).abs() < 1e-6), "{env_steps}");
+    }
+    let mut free = Ppo::new(&PpoConfig { max_std_steps: 0, ..settings }, 2, 2, 0).unwrap();
+    free.limit_std(1000).unwrap();
+    assert!(free.policy().std().unwrap().iter().all(|std| (std - 0.5).abs() < 1e-6));
+}
+
+#[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings(), 2, 2, 3).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
