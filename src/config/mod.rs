@@ -35,6 +35,7 @@ goal_lifetime = 0
 symmetry = "none"
 bounds_coef = 0.0
 max_std_steps = 0
+exploring_share = 0.0
 "#;
 
 /// `env.model` of the scene that is built into the program.
@@ -148,6 +149,8 @@ pub struct PpoConfig {
     pub init_std: f64,
     pub max_std: f64,
     pub max_std_steps: u64,
+    pub exploring_share: f64,
+    pub exploring_scale: f64,
 }
 
 /// The function after each hidden layer.

@@ -99,6 +99,8 @@ impl Config {
         rules.positive("ppo.reward_scale", ppo.reward_scale);
         rules.positive("ppo.init_std", ppo.init_std);
         rules.positive("ppo.max_std", ppo.max_std);
+        rules.between("ppo.exploring_share", ppo.exploring_share, 0.0, 1.0);
+        rules.positive("ppo.exploring_scale", ppo.exploring_scale);
 
         rules.at_least("run.total_steps", run.total_steps as usize, 1);
         rules.at_least("run.checkpoint_every", run.checkpoint_every as usize, 1);

@@ -25,13 +25,14 @@ impl Acting<'_> {
         let std = self.policy.std();
         let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
         let rows = step.actions.chunks_exact_mut(std.len()).zip(step.means.chunks_exact(std.len()));
-        for ((actions, means), log_prob) in rows.zip(step.log_probs.iter_mut()) {
+        for (((actions, means), log_prob), scale) in rows.zip(step.log_probs.iter_mut()).zip(step.noise_scales) {
             let mut squares = 0.0;
             for ((action, mean), std) in actions.iter_mut().zip(means).zip(std) {
                 let drawn: f32 = StandardNormal.sample(noise);
-                *action = mean + std * drawn;
-                squares += ((*action - mean) / std).powi(2);
+                *action = mean + scale * std * drawn;
+                squares += ((*action - mean) / (scale * std)).powi(2);
             }
+            // The density lacks the scale, here and in the losses: it is the same in both, and only their ratio counts.
             *log_prob = -0.5 * squares - constant;
         }
         Ok(())

@@ -129,6 +129,15 @@ impl Ppo {
         rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
     }
 
+    /// Writes by how much the noise of each environment `[n]` of a block is scaled in an iteration.
+    pub fn scale_noise(&self, scales: &mut [f32], iteration: u64, block: usize) {
+        let mut rng = rng::stream(self.seed, "exploring", iteration << 32 | block as u64);
+        for scale in scales {
+            let explores = rng::uniform(&mut rng, 0.0, 1.0) < self.config.exploring_share;
+            *scale = if explores { self.config.exploring_scale as f32 } else { 1.0 };
+        }
+    }
+
     /// Learns from a rollout that this policy has collected, then takes its observations into the normaliser, which stays
     /// the same during collection and update: so the first minibatch still sees the very policy that acted. `None` if `stop`
     /// was set meanwhile; then the learner must be restored before it is used again.

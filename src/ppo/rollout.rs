@@ -21,6 +21,8 @@ pub struct RolloutBlock {
     pub means: Vec<f32>,
     /// `[T, n]`, of the actions
     pub log_probs: Vec<f32>,
+    /// `[n]`, times the standard deviations of the policy are those of the actions
+    pub noise_scales: Vec<f32>,
     /// `[T + 1, n]`
     pub values: Vec<f32>,
     /// `[T, n]`, scaled, and bootstrapped where truncated
@@ -44,6 +46,8 @@ pub struct RolloutStep<'a> {
     pub actions: &'a mut [f32],
     /// `[n, A]`
     pub means: &'a mut [f32],
+    /// `[n]`
+    pub noise_scales: &'a [f32],
     /// `[n]`
     pub log_probs: &'a mut [f32],
     /// `[n]`
@@ -99,6 +103,7 @@ impl RolloutBlock {
             actions: vec![0.0; steps * action_size],
             means: vec![0.0; steps * action_size],
             log_probs: vec![0.0; steps],
+            noise_scales: vec![1.0; envs],
             values: vec![0.0; steps + envs],
             rewards: vec![0.0; steps],
             dones: vec![false; steps],
@@ -124,6 +129,11 @@ impl RolloutBlock {
         sample * width..(sample + 1) * width
     }
 
+    /// The noise scale of a sample.
+    pub fn noise_scale(&self, sample: usize) -> f32 {
+        self.noise_scales[sample % self.noise_scales.len()]
+    }
+
     /// The observations `[n, O]` that the first step acts on.
     pub fn first_observations_mut(&mut self) -> &mut [f32] {
         let [_, envs, size, _] = self.sizes;
@@ -145,6 +155,7 @@ impl RolloutBlock {
             next_observations: &mut after[..n * o],
             actions: &mut self.actions[t * n * a..][..n * a],
             means: &mut self.means[t * n * a..][..n * a],
+            noise_scales: &self.noise_scales,
             log_probs: &mut self.log_probs[t * n..][..n],
             values: &mut self.values[t * n..][..n],
             rewards: &mut self.rewards[t * n..][..n],

@@ -150,7 +150,8 @@ fn standard_deviations_stay_within_a_bound_that_falls_by_equal_factors() {
 
 #[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
-    let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings(), 2, 2, 3).unwrap());
+    let settings = PpoConfig { exploring_share: 0.5, exploring_scale: 3.0, ..settings() };
+    let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings, 2, 2, 3).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
     pool.reset(rollout.first_observations_mut());
     for iteration in 1..=5 {
@@ -161,6 +162,35 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
         assert!(stats.first_ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first_ratio_error);
         assert!(stats.kl > 1e-4, "later minibatches must have moved on: {}", stats.kl);
     }
+}
+
+#[test]
+fn the_share_of_environments_that_explores_changes_with_each_iteration_and_acts_with_scaled_noise() {
+    let settings = PpoConfig { exploring_share: 0.25, exploring_scale: 3.0, ..settings() };
+    let (mut pool, ppo) = (pool_of(1024, 3), Ppo::new(&settings, 2, 2, 3).unwrap());
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+    pool.reset(rollout.first_observations_mut());
+    let scales = [1, 2].map(|iteration| {
+        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &NEVER).unwrap();
+        // Squares of the distances from the mean, and numbers of them, of those that explore and of the others.
+        let mut spread = [[0.0f64; 2]; 2];
+        for block in &rollout.blocks {
+            for (i, (action, mean)) in block.actions.chunks_exact(2).zip(block.means.chunks_exact(2)).enumerate() {
+                let [sum, count] = &mut spread[usize::from(block.noise_scale(i) > 1.0)];
+                *sum += f64::from((action[0] - mean[0]).powi(2) + (action[1] - mean[1]).powi(2));
+                *count += 2.0;
+            }
+        }
+        let [quiet, exploring] = spread;
+        let share = exploring[1] / (quiet[1] + exploring[1]);
+        assert!((0.2..0.3).contains(&share), "{share}");
+        for ([sum, count], expected) in [(quiet, 0.5), (exploring, 1.5)] {
+            let std = (sum / count).sqrt();
+            assert!((std / expected - 1.0).abs() < 0.05, "{std} instead of {expected}");
+        }
+        rollout.blocks.iter().flat_map(|block| &block.noise_scales).copied().collect::<Vec<f32>>()
+    });
+    assert!(scales[0].iter().all(|&scale| scale == 1.0 || scale == 3.0) && scales[0] != scales[1]);
 }
 
 #[test]

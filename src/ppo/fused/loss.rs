@@ -34,7 +34,7 @@ pub struct Sums {
     pub clipped: usize,
     /// The largest |ratio - 1|.
     pub ratio_error: f32,
-    /// `[A]`, squared differences of the means from those that acted.
+    /// `[A]`, squared differences of the means from those that acted, over the squares of the noise scales.
     pub moved: Vec<f32>,
     /// `[A]`, the gradient with respect to the logarithm of the standard deviations.
     pub log_std_grad: Vec<f32>,
@@ -86,8 +86,9 @@ impl<'a> Loss<'a> {
         let row = RolloutBlock::row(mean.len(), i);
         let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
         // First the distance from the mean in standard deviations, then the gradient in its place.
+        let sharpness = 1.0 / block.noise_scale(i);
         for (((z, action), mean), precision) in grad.iter_mut().zip(action).zip(mean).zip(&self.precision) {
-            *z = (action - mean) * precision;
+            *z = (action - mean) * (precision * sharpness);
         }
         let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
         let ratio = (log_prob - block.log_probs[i]).exp();
@@ -103,13 +104,14 @@ impl<'a> Loss<'a> {
             *sum += slope * (z * z - 1.0);
         }
         for ((sum, mean), old_mean) in sums.moved.iter_mut().zip(mean).zip(old_mean) {
-            *sum += (mean - old_mean) * (mean - old_mean);
+            let moved = (mean - old_mean) * sharpness;
+            *sum += moved * moved;
         }
         let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.share);
         for ((z, precision), mean) in grad.iter_mut().zip(&self.precision).zip(mean) {
             let beyond = mean - mean.clamp(-1.0, 1.0);
             excess += beyond * beyond;
-            *z = *z * (slope * precision) + pull * beyond;
+            *z = *z * (slope * sharpness * precision) + pull * beyond;
         }
         sums.excess += f64::from(excess);
     }
@@ -162,9 +164,11 @@ mod tests {
         block.advantages = vec![1.0, 0.5, -2.0];
         block.values[..3].copy_from_slice(&[0.2, -0.1, 1.0]);
         block.returns = vec![0.5, 0.1, 0.9];
+        block.noise_scales = vec![1.0, 1.5, 0.8];
         let old_log_std = [0.7f32.ln(), 1.1f32.ln()];
         for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
-            let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / old_log_std[j].exp());
+            let std = old_log_std.map(|log_std| block.noise_scales[i] * log_std.exp());
+            let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std[j]);
             *log_prob =
                 -0.5 * (z[0] * z[0] + z[1] * z[1]) - old_log_std[0] - old_log_std[1] - std::f32::consts::TAU.ln();
         }
@@ -176,15 +180,15 @@ mod tests {
         sums.clear(2);
         let mut grad = [0.0; 6];
         loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums);
-        assert_close(&grad, &[0.0, 0.0, 0.246_434_33, -0.045_577_466, 1.465_282_9, 0.421_556_7]);
-        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.385_089_8]);
+        assert_close(&grad, &[0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_27]);
+        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.496_272_44]);
         // The entropy's share, with its coefficient of 0.01, is added once for the minibatch.
         let log_std_grad: Vec<f32> = sums.log_std_grad.iter().map(|x| x - 0.01).collect();
-        assert_close(&log_std_grad, &[-0.113_067_5, -0.527_346_6]);
-        assert_close(&[sums.ratio_error], &[0.347_618_7]);
-        assert_eq!(sums.clipped, 3);
+        assert_close(&log_std_grad, &[0.572_585_3, -0.388_056_3]);
+        assert_close(&[sums.ratio_error], &[0.559_589_3]);
+        assert_eq!(sums.clipped, 2);
         let moved: Vec<f64> = sums.moved.iter().map(|&x| f64::from(x)).collect();
-        assert_close(&[kl(&moved, 3, &old_log_std, &log_std) as f32], &[0.062_119_63]);
+        assert_close(&[kl(&moved, 3, &old_log_std, &log_std) as f32], &[0.065_324_254]);
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);

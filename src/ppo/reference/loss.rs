@@ -14,6 +14,8 @@ pub struct Minibatch {
     pub actions: Tensor,
     /// `[M, A]`, of the distribution that the actions were drawn from
     pub old_means: Tensor,
+    /// `[M, 1]`, times the standard deviations of the policy were those of that distribution
+    pub noise_scales: Tensor,
     /// `[M]`, of the actions under that distribution
     pub old_log_probs: Tensor,
     /// `[M]`, of the critic at that time
@@ -43,24 +45,25 @@ pub struct Losses {
 }
 
 /// Logarithm of the probability density of `actions` `[M, A]` under Gaussians with `means` `[M, A]` and standard
-/// deviations exp(`log_std`) `[A]` → `[M]`.
+/// deviations `scales` `[M, 1]` · exp(`log_std`) `[A]` → `[M]`; without the scales themselves, of which a ratio is free.
 ///
 /// # Errors
 /// Shapes that do not fit.
-pub fn log_prob(actions: &Tensor, means: &Tensor, log_std: &Tensor) -> Result<Tensor> {
-    let z = (actions - means)?.broadcast_div(&log_std.exp()?)?;
+pub fn log_prob(actions: &Tensor, means: &Tensor, log_std: &Tensor, scales: &Tensor) -> Result<Tensor> {
+    let z = (actions - means)?.broadcast_div(&log_std.exp()?)?.broadcast_div(scales)?;
     let constant = 0.5 * TAU.ln() * actions.dim(D::Minus1)? as f64;
     let log_scale = (log_std.sum_all()? + constant)?;
     (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
 }
 
-/// Mean over the samples of the KL divergence KL(old ‖ new) of diagonal Gaussians; standard deviations `[A]`.
+/// Mean over the samples of the KL divergence KL(old ‖ new) of diagonal Gaussians; standard deviations `[A]`, which both are
+/// multiplied by `scales` `[M, 1]`.
 ///
 /// # Errors
 /// Shapes that do not fit.
-pub fn kl([old_means, old_std]: [&Tensor; 2], [means, log_std]: [&Tensor; 2]) -> Result<Tensor> {
+pub fn kl([old_means, old_std]: [&Tensor; 2], [means, log_std]: [&Tensor; 2], scales: &Tensor) -> Result<Tensor> {
     let variance = (log_std * 2.0)?.exp()?;
-    let moved = (old_means - means)?.sqr()?.mean(0)?;
+    let moved = (old_means - means)?.broadcast_div(scales)?.sqr()?.mean(0)?;
     let spread = ((old_std.sqr()? + moved)? / variance)?;
     ((log_std - old_std.log()?)? + (spread * 0.5)?)?.sum_all()? - 0.5 * log_std.elem_count() as f64
 }
@@ -77,7 +80,7 @@ pub fn losses(
     [means, values]: [&Tensor; 2],
     [log_std, old_std]: [&Tensor; 2],
 ) -> Result<Losses> {
-    let ratios = (log_prob(&batch.actions, means, log_std)? - &batch.old_log_probs)?.exp()?;
+    let ratios = (log_prob(&batch.actions, means, log_std, &batch.noise_scales)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
     let policy = surrogate.mean_all()?.neg()?;
@@ -91,7 +94,7 @@ pub fn losses(
     let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? - (&entropy * config.entropy_coef)?)?;
     let total = (total + (&excess * config.bounds_coef)?)?;
-    let kl = kl([&batch.old_means, old_std], [&means.detach(), &log_std.detach()])?;
+    let kl = kl([&batch.old_means, old_std], [&means.detach(), &log_std.detach()], &batch.noise_scales)?;
     Ok(Losses { total, policy, value, excess, entropy, kl, ratios: ratios.detach() })
 }
 
@@ -112,7 +115,8 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The numbers are those of this program (PyTorch). One sample's ratio is clipped, two are not; one value is clipped:
+    /// The numbers are those of this program (PyTorch). One sample's ratio is clipped, two are not; one value is clipped; the
+    /// noise of each sample has a scale of its own:
     /// ```python
     /// import torch
     /// from torch.distributions import Normal, kl_divergence
@@ -121,20 +125,21 @@ mod tests {
     /// value = torch.tensor([0.3, -0.6, 1.4], requires_grad=True)
     /// old_mean = torch.tensor([[0.0, -0.1], [0.4, 0.5], [-0.5, 0.5]])
     /// old_std = torch.tensor([0.7, 1.1])
+    /// scale = torch.tensor([[1.0], [1.5], [0.8]])
     /// old_value = torch.tensor([0.2, -0.1, 1.0])
     /// action = torch.tensor([[0.5, -1.0], [-0.3, 0.9], [0.2, 1.5]])
     /// advantage = torch.tensor([1.0, 0.5, -2.0])
     /// returns = torch.tensor([0.5, 0.1, 0.9])
-    /// dist, old = Normal(mean, log_std.exp()), Normal(old_mean, old_std)
+    /// dist, old = Normal(mean, scale * log_std.exp()), Normal(old_mean, scale * old_std)
     /// log_prob = dist.log_prob(action).sum(1)
     /// ratio = (log_prob - old.log_prob(action).sum(1)).exp()
     /// policy = -torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
     /// clipped = old_value + (value - old_value).clamp(-0.2, 0.2)
     /// critic = torch.max((value - returns) ** 2, (clipped - returns) ** 2).mean()
-    /// entropy = dist.entropy().sum(1).mean()
+    /// entropy = Normal(mean, log_std.exp()).entropy().sum(1).mean()
     /// kl = kl_divergence(old, dist).sum(1).mean()
     /// (policy + 2.0 * critic - 0.01 * entropy).backward()
-    /// for x in (log_prob, ratio, policy, critic, entropy, kl, mean.grad, log_std.grad, value.grad):
+    /// for x in (log_prob + 2 * scale.log()[:, 0], ratio, policy, critic, entropy, kl, mean.grad, log_std.grad, value.grad):
     ///     print(x.tolist())
     /// ```
     #[test]
@@ -147,9 +152,11 @@ mod tests {
         let old_std = tensor(&[0.7, 1.1], &[2]);
         let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
         let old_means = tensor(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[3, 2]);
+        let noise_scales = tensor(&[1.0, 1.5, 0.8], &[3, 1]);
         let batch = Minibatch {
             observations: tensor(&[0.0; 3], &[3, 1]),
-            old_log_probs: log_prob(&actions, &old_means, &old_std.log().unwrap()).unwrap(),
+            old_log_probs: log_prob(&actions, &old_means, &old_std.log().unwrap(), &noise_scales).unwrap(),
+            noise_scales,
             actions,
             old_means,
             old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
@@ -157,17 +164,17 @@ mod tests {
             returns: tensor(&[0.5, 0.1, 0.9], &[3]),
         };
         let found = losses(&config, &batch, [&mean, &value], [&log_std, &old_std]).unwrap();
-        let log_probs = log_prob(&batch.actions, &mean, &log_std).unwrap();
-        assert_close(&log_probs, &[-1.969_842_1, -2.528_385, -2.191_396_2]);
-        assert_close(&found.ratios, &[1.217_114_7, 0.679_935_9, 1.347_618_7]);
-        assert_close(&found.policy, &[0.385_089_8]);
+        let log_probs = log_prob(&batch.actions, &mean, &log_std, &batch.noise_scales).unwrap();
+        assert_close(&log_probs, &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
+        assert_close(&found.ratios, &[1.217_114_7, 0.860_722_24, 1.559_589_3]);
+        assert_close(&found.policy, &[0.496_272_44]);
         assert_close(&found.value, &[0.26]);
         assert_close(&found.entropy, &[2.537_877]);
-        assert_close(&found.kl, &[0.062_119_63]);
+        assert_close(&found.kl, &[0.065_324_254]);
         let grads = found.total.backward().unwrap();
-        let mean_grad = [0.0, 0.0, 0.246_434_33, -0.045_577_466, 1.465_282_9, 0.421_556_7];
+        let mean_grad = [0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_27];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
-        assert_close(grads.get(&log_std).unwrap(), &[-0.113_067_5, -0.527_346_6]);
+        assert_close(grads.get(&log_std).unwrap(), &[0.572_585_3, -0.388_056_3]);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
     }
 
@@ -177,6 +184,7 @@ mod tests {
             observations: tensor(&[0.0], &[1, 1]),
             actions: tensor(&[0.2, 1.5], &[1, 2]),
             old_means: tensor(&[-0.5, 0.5], &[1, 2]),
+            noise_scales: tensor(&[1.0], &[1, 1]),
             old_log_probs: tensor(&[-2.0], &[1]),
             old_values: tensor(&[1.0], &[1]),
             advantages: tensor(&[-2.0], &[1]),
@@ -197,7 +205,7 @@ mod tests {
     #[test]
     fn a_distribution_has_no_divergence_from_itself() {
         let (means, std) = (tensor(&[0.3, -2.0], &[1, 2]), tensor(&[0.5, 2.0], &[2]));
-        let kl = kl([&means, &std], [&means, &std.log().unwrap()]).unwrap();
+        let kl = kl([&means, &std], [&means, &std.log().unwrap()], &tensor(&[3.0], &[1, 1])).unwrap();
         assert!(kl.to_scalar::<f32>().unwrap().abs() < 1e-6);
     }
 }

@@ -53,10 +53,13 @@ impl Backend for Reference {
         let raw = array(RolloutBlock::acted_on);
         let mut observations = vec![0.0; raw.len()];
         policy.normalizer.scaling().apply(&raw, &mut observations);
+        let scale_of_each =
+            |block: &RolloutBlock| (0..block.samples()).map(|i| block.noise_scale(i)).collect::<Vec<_>>();
         self.batch = Some(Minibatch {
             observations: rows(observations)?,
             actions: rows(array(|block| &block.actions))?,
             old_means: rows(array(|block| &block.means))?,
+            noise_scales: rows(rollout.blocks.iter().flat_map(scale_of_each).collect())?,
             old_log_probs: column(array(|block| &block.log_probs))?,
             old_values: column(array(|block| &block.values[..block.samples()]))?,
             advantages: column(array(|block| &block.advantages))?,
@@ -116,6 +119,7 @@ impl Minibatch {
             observations: pick(&self.observations)?,
             actions: pick(&self.actions)?,
             old_means: pick(&self.old_means)?,
+            noise_scales: pick(&self.noise_scales)?,
             old_log_probs: pick(&self.old_log_probs)?,
             old_values: pick(&self.old_values)?,
             advantages: pick(&self.advantages)?,
