@@ -27,6 +27,7 @@ hold_reward = 0.0
 goal_reward = 0.0
 drop_reward = 0.0
 drop_reward_steps = 0
+tolerance_scale = 1.0
 tolerance_steps = 0
 hold_steps = 0
 goal_angle_steps = 0
@@ -112,6 +113,7 @@ pub struct TrainingConfig {
     pub drop_reward: f64,
     pub drop_reward_start: f64,
     pub drop_reward_steps: u64,
+    pub tolerance_scale: f64,
     pub tolerance_start: f64,
     pub tolerance_steps: u64,
     pub hold_start: u32,

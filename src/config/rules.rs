@@ -48,6 +48,7 @@ impl Config {
 
         rules.not_negative("training.task_reward", training.task_reward);
         rules.not_negative("training.task_reward_start", training.task_reward_start);
+        rules.positive("training.tolerance_scale", training.tolerance_scale);
         rules.positive("training.tolerance_start", training.tolerance_start);
         rules.at_least("training.hold_start", training.hold_start as usize, 1);
         rules.positive("training.goal_angle_start", training.goal_angle_start);

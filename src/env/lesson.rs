@@ -67,7 +67,7 @@ impl Lesson {
         Self {
             // By equal factors in equal times: halving the error is as hard a step anywhere.
             tolerance: training.tolerance_start.powf(1.0 - share(training.tolerance_steps))
-                * task.tolerance.powf(share(training.tolerance_steps)),
+                * (training.tolerance_scale * task.tolerance).powf(share(training.tolerance_steps)),
             hold: hold.round() as u32,
             goal_angle: between(training.goal_angle_start, task.goal_angle, share(training.goal_angle_steps)),
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
@@ -120,7 +120,7 @@ mod tests {
     use crate::config::{Config, Override};
 
     /// Nothing that training adds.
-    const PLAIN: [&str; 11] = [
+    const PLAIN: [&str; 12] = [
         "training.task_reward=1",
         "training.task_reward_steps=0",
         "training.progress_reward=0",
@@ -128,6 +128,7 @@ mod tests {
         "training.goal_reward=0",
         "training.drop_reward=0",
         "training.drop_reward_steps=0",
+        "training.tolerance_scale=1",
         "training.tolerance_steps=0",
         "training.hold_steps=0",
         "training.goal_angle_steps=0",
@@ -155,6 +156,8 @@ mod tests {
         let found = [0, 500, 1000, 2000, 9000].map(|steps| at(steps, &sets));
         let tolerances = found.map(|lesson| (lesson.tolerance * 1e6).round() / 1e6);
         assert_eq!(tolerances, [0.4, 0.2, 0.1, 0.1, 0.1]);
+        let aims_better = at(1000, &[&sets[..], &["training.tolerance_scale=0.5"]].concat());
+        assert!((aims_better.tolerance - 0.05).abs() < 1e-9, "{}", aims_better.tolerance);
         assert_eq!(found.map(|lesson| lesson.hold), [1, 13, 26, 50, 50]);
         assert_eq!(found.map(|lesson| lesson.goal_angle), [1.0, PI, PI, PI, PI]);
     }
