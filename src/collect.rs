@@ -61,7 +61,7 @@ pub fn collect<E: Env>(
     let parts = pool.blocks_mut().iter_mut().zip(&mut rollout.blocks).zip(&mut scratch.blocks).enumerate();
     let blocks = parts.map(|(i, ((envs, rollout), scratch))| {
         let noise = ppo.noise(iteration, i);
-        ppo.scale_noise(&mut rollout.noise_scales, iteration, i);
+        ppo.explore(rollout, iteration, i);
         Collecting { envs, rollout, scratch, noise, result: Ok(()) }
     });
     let collected = in_rounds(blocks, horizon, |block, t| {

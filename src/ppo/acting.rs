@@ -25,10 +25,11 @@ impl Acting<'_> {
         let std = self.policy.std();
         let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
         let rows = step.actions.chunks_exact_mut(std.len()).zip(step.means.chunks_exact(std.len()));
-        for (((actions, means), log_prob), scale) in rows.zip(step.log_probs.iter_mut()).zip(step.noise_scales) {
+        let noises = step.noise_scales.iter().zip(step.steady_noise.chunks_exact(std.len()));
+        for (((actions, means), log_prob), (scale, steady)) in rows.zip(step.log_probs.iter_mut()).zip(noises) {
             let mut squares = 0.0;
-            for ((action, mean), std) in actions.iter_mut().zip(means).zip(std) {
-                let drawn: f32 = StandardNormal.sample(noise);
+            for (((action, mean), std), steady) in actions.iter_mut().zip(means).zip(std).zip(steady) {
+                let drawn: f32 = if *scale == 1.0 { StandardNormal.sample(noise) } else { *steady };
                 *action = mean + scale * std * drawn;
                 squares += ((*action - mean) / (scale * std)).powi(2);
             }

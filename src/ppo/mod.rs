@@ -21,6 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail, ensure};
 use rand::seq::SliceRandom;
+use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 pub use acting::Acting;
@@ -129,12 +130,21 @@ impl Ppo {
         rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
     }
 
-    /// Writes by how much the noise of each environment `[n]` of a block is scaled in an iteration.
-    pub fn scale_noise(&self, scales: &mut [f32], iteration: u64, block: usize) {
-        let mut rng = rng::stream(self.seed, "exploring", iteration << 32 | block as u64);
-        for scale in scales {
+    /// Draws which environments of a block explore in an iteration, and the one noise that each of them keeps through it: what
+    /// changes from step to step is smoothed away by the hand, what stays moves it to another place. To the losses it is noise like
+    /// any other, of a larger standard deviation.
+    ///
+    /// On noise correlated in time: J. Hollenstein et al., "Colored noise in PPO: improved exploration and performance through
+    /// correlated action sampling" (2024).
+    pub fn explore(&self, block: &mut RolloutBlock, iteration: u64, index: usize) {
+        let mut rng = rng::stream(self.seed, "exploring", iteration << 32 | index as u64);
+        let noises = block.steady_noise.chunks_exact_mut(self.policy.action_size());
+        for (scale, noise) in block.noise_scales.iter_mut().zip(noises) {
             let explores = rng::uniform(&mut rng, 0.0, 1.0) < self.config.exploring_share;
             *scale = if explores { self.config.exploring_scale as f32 } else { 1.0 };
+            if explores {
+                noise.fill_with(|| StandardNormal.sample(&mut rng));
+            }
         }
     }
 

@@ -23,6 +23,8 @@ pub struct RolloutBlock {
     pub log_probs: Vec<f32>,
     /// `[n]`, times the standard deviations of the policy are those of the actions
     pub noise_scales: Vec<f32>,
+    /// `[n, A]`, the noise, in its own standard deviations, of those whose scale is not 1
+    pub steady_noise: Vec<f32>,
     /// `[T + 1, n]`
     pub values: Vec<f32>,
     /// `[T, n]`, scaled, and bootstrapped where truncated
@@ -48,6 +50,8 @@ pub struct RolloutStep<'a> {
     pub means: &'a mut [f32],
     /// `[n]`
     pub noise_scales: &'a [f32],
+    /// `[n, A]`
+    pub steady_noise: &'a [f32],
     /// `[n]`
     pub log_probs: &'a mut [f32],
     /// `[n]`
@@ -104,6 +108,7 @@ impl RolloutBlock {
             means: vec![0.0; steps * action_size],
             log_probs: vec![0.0; steps],
             noise_scales: vec![1.0; envs],
+            steady_noise: vec![0.0; envs * action_size],
             values: vec![0.0; steps + envs],
             rewards: vec![0.0; steps],
             dones: vec![false; steps],
@@ -156,6 +161,7 @@ impl RolloutBlock {
             actions: &mut self.actions[t * n * a..][..n * a],
             means: &mut self.means[t * n * a..][..n * a],
             noise_scales: &self.noise_scales,
+            steady_noise: &self.steady_noise,
             log_probs: &mut self.log_probs[t * n..][..n],
             values: &mut self.values[t * n..][..n],
             rewards: &mut self.rewards[t * n..][..n],

@@ -165,7 +165,7 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
 }
 
 #[test]
-fn the_share_of_environments_that_explores_changes_with_each_iteration_and_acts_with_scaled_noise() {
+fn the_environments_that_explore_change_with_each_iteration_and_hold_a_larger_noise_through_it() {
     let settings = PpoConfig { exploring_share: 0.25, exploring_scale: 3.0, ..settings() };
     let (mut pool, ppo) = (pool_of(1024, 3), Ppo::new(&settings, 2, 2, 3).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
@@ -175,10 +175,15 @@ fn the_share_of_environments_that_explores_changes_with_each_iteration_and_acts_
         // Squares of the distances from the mean, and numbers of them, of those that explore and of the others.
         let mut spread = [[0.0f64; 2]; 2];
         for block in &rollout.blocks {
-            for (i, (action, mean)) in block.actions.chunks_exact(2).zip(block.means.chunks_exact(2)).enumerate() {
-                let [sum, count] = &mut spread[usize::from(block.noise_scale(i) > 1.0)];
-                *sum += f64::from((action[0] - mean[0]).powi(2) + (action[1] - mean[1]).powi(2));
+            let envs = block.noise_scales.len();
+            let away = |i: usize| [0, 1].map(|j| block.actions[2 * i + j] - block.means[2 * i + j]);
+            for i in 0..block.samples() {
+                let explores = block.noise_scale(i) > 1.0;
+                let [sum, count] = &mut spread[usize::from(explores)];
+                *sum += f64::from(away(i)[0].powi(2) + away(i)[1].powi(2));
                 *count += 2.0;
+                let same = (away(i)[0] - away(i % envs)[0]).abs() < 1e-5;
+                assert_eq!(same, explores || i < envs, "sample {i}: {:?} {:?}", away(i), away(i % envs));
             }
         }
         let [quiet, exploring] = spread;
@@ -186,7 +191,7 @@ fn the_share_of_environments_that_explores_changes_with_each_iteration_and_acts_
         assert!((0.2..0.3).contains(&share), "{share}");
         for ([sum, count], expected) in [(quiet, 0.5), (exploring, 1.5)] {
             let std = (sum / count).sqrt();
-            assert!((std / expected - 1.0).abs() < 0.05, "{std} instead of {expected}");
+            assert!((std / expected - 1.0).abs() < 0.15, "{std} instead of {expected}");
         }
         rollout.blocks.iter().flat_map(|block| &block.noise_scales).copied().collect::<Vec<f32>>()
     });

@@ -244,9 +244,10 @@ fn a_second_signal_ends_the_program_at_once_and_one_that_follows_the_first_immed
     }
     // It is still at its minibatch, so the second signal has not ended it.
     send("TERM", &child);
-    let asked = Instant::now();
     assert_eq!(child.wait().unwrap().code(), Some(143));
-    assert!(asked.elapsed() < Duration::from_millis(1500), "{:?}", asked.elapsed());
+    // The first signal alone would have let it come to a place where it can save.
+    let said: Vec<String> = lines.map_while(|line| line.ok()).collect();
+    assert!(!said.iter().any(|line| line.contains("stopped after")), "{said:?}");
 }
 
 #[test]
