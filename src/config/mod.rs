@@ -372,6 +372,20 @@ mod tests {
     }
 
     #[test]
+    fn the_other_files_that_come_with_the_program_are_valid() {
+        let large = include_str!("../../configs/repose-large.toml");
+        let going_on = include_str!("../../configs/repose-continue.toml");
+        let [large, going_on] = [large, going_on].map(|text| {
+            let source = Source { path: "file.toml".into(), text: text.into() };
+            Config::resolve(Some(&source), &[]).unwrap()
+        });
+        assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
+        assert_eq!(going_on.training.goal_lifetime, 300);
+        let tolerance = Lesson::at(0, &going_on.training, &going_on.env).tolerance;
+        assert!((tolerance - 0.07).abs() < 1e-9, "{tolerance}");
+    }
+
+    #[test]
     fn a_users_file_holds_only_what_differs_and_set_wins_over_it() {
         let source =
             Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8".into() };
