@@ -82,8 +82,8 @@ impl<E: Env> Collecting<'_, E> {
             StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };
         self.envs.step(step.actions, buffers)?;
         step.dones.iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
-        let truncated = ends.iter().map(|&end| matches!(end, Some(End::Truncated | End::Redirected)));
-        acting.settle(step.rewards, truncated, final_observations, work)?;
+        let cut_off = ends.iter().map(|&end| matches!(end, Some(End::Truncated | End::Redirected)));
+        acting.settle(step.rewards, cut_off, final_observations, work)?;
         if last { acting.finish(self.rollout, work) } else { Ok(()) }
     }
 }

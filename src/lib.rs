@@ -39,7 +39,7 @@
 //! ```text
 //! observations[t] --acting.act--> actions[t], log_probs[t], values[t]
 //! actions[t] --envs.step--> rewards[t], ends, observations[t + 1] (of the new episode where one ended), final observations
-//! rewards[t] --acting.settle--> scaled; + γ V(final observation) where the episode was truncated
+//! rewards[t] --acting.settle--> scaled; + γ V(final observation) where the episode was truncated or its goal replaced
 //! ```
 //! Then the learner takes all blocks together:
 //! ```text

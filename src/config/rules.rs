@@ -101,7 +101,10 @@ impl Config {
         rules.positive("ppo.init_std", ppo.init_std);
         rules.positive("ppo.max_std", ppo.max_std);
         rules.between("ppo.exploring_share", ppo.exploring_share, 0.0, 1.0);
-        rules.positive("ppo.exploring_scale", ppo.exploring_scale);
+        rules.between("ppo.exploring_scale", ppo.exploring_scale, 0.01, 100.0);
+        let falls = ppo.max_std_steps == 0 || ppo.max_std <= ppo.init_std;
+        let rule = format!("be at most ppo.init_std = {} unless ppo.max_std_steps = 0", ppo.init_std);
+        rules.check(falls, "ppo.max_std", ppo.max_std, &rule);
 
         rules.at_least("run.total_steps", run.total_steps as usize, 1);
         rules.at_least("run.checkpoint_every", run.checkpoint_every as usize, 1);

@@ -42,9 +42,10 @@ pub struct StepBuffers<'a> {
     pub rewards: &'a mut [f32],
     /// `[n]`
     pub ends: &'a mut [Option<End>],
-    /// `[n, O]`, the observation to act on next: of the new episode where one ended.
+    /// `[n, O]`, the observation to act on next: of the new episode where one ended, under the new goal where it was replaced.
     pub observations: &'a mut [f32],
-    /// `[n, O]`, the last observation of the episode where one was truncated; other rows are left alone.
+    /// `[n, O]`, the last observation of the episode where one was truncated, or under the goal that was replaced; other rows
+    /// are left alone.
     pub final_observations: &'a mut [f32],
 }
 
@@ -175,7 +176,7 @@ impl<E: Env> EnvBlock<E> {
         self.slots.is_empty()
     }
 
-    /// Steps every environment with its row of `actions` `[n, A]`, and starts a new episode where one ended.
+    /// Steps every environment with its row of `actions` `[n, A]`, and starts a new episode where one ended, or goes on under another goal.
     ///
     /// # Errors
     /// A panic in an environment, with its number; the pool cannot be stepped any further.

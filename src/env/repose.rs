@@ -369,7 +369,7 @@ impl Env for Repose {
         self.recent.steps += 1;
         self.recent.reward += reward;
         self.recent.diverged += u64::from(diverged);
-        let mut shaping = Shaping::default();
+        let (mut shaping, mut reached) = (Shaping::default(), false);
         if diverged {
             let length = self.episode.length;
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, tail });
@@ -377,7 +377,7 @@ impl Env for Repose {
             self.episode.rot_dist_sum += rot_dist;
             self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
             let within = rot_dist <= self.lesson.tolerance;
-            let reached = self.hold(within);
+            reached = self.hold(within);
             shaping = self.lesson.shaping(rot_dist_before - rot_dist, within, reached, self.episode.dropped);
             self.recent.shaping += shaping;
         }
@@ -386,7 +386,9 @@ impl Env for Repose {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
-            time_is_up.then_some(End::Truncated).or_else(|| self.gives_up().then_some(End::Redirected))
+            // A goal that was just reached has been replaced already.
+            let gives_up = !reached && self.gives_up();
+            time_is_up.then_some(End::Truncated).or(gives_up.then_some(End::Redirected))
         };
         self.observe(observation);
         Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }

@@ -39,24 +39,24 @@ impl Acting<'_> {
         Ok(())
     }
 
-    /// Scales the rewards of a step and, for each truncated environment, adds the discounted value of its final observation,
-    /// so that the advantages need one array of ends only. `truncated` `[n]`, `final_observations` `[n, O]`.
+    /// Scales the rewards of a step and, for each environment whose future was cut off, adds the discounted value of its final
+    /// observation, so that the advantages need one array of ends only. `cut_off` `[n]`, `final_observations` `[n, O]`.
     ///
     /// # Errors
     /// Only if candle cannot allocate.
     pub fn settle(
         &self,
         rewards: &mut [f32],
-        truncated: impl Iterator<Item = bool>,
+        cut_off: impl Iterator<Item = bool>,
         final_observations: &[f32],
         work: &mut Workspace,
     ) -> Result<()> {
         let size = final_observations.len() / rewards.len();
-        for ((reward, truncated), observation) in
-            rewards.iter_mut().zip(truncated).zip(final_observations.chunks_exact(size))
+        for ((reward, cut_off), observation) in
+            rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size))
         {
             *reward *= self.reward_scale;
-            if truncated {
+            if cut_off {
                 let mut value = [0.0];
                 self.policy.forward(observation, [None, Some(&mut value)], work)?;
                 *reward += self.gamma * value[0];

@@ -132,7 +132,7 @@ impl Ppo {
 
     /// Draws which environments of a block explore in an iteration, and the one noise that each of them keeps through it: what
     /// changes from step to step is smoothed away by the hand, what stays moves it to another place. To the losses it is noise like
-    /// any other, of a larger standard deviation.
+    /// any other, of a larger standard deviation: an approximation, since what stays can be seen in the states that follow.
     ///
     /// On noise correlated in time: J. Hollenstein et al., "Colored noise in PPO: improved exploration and performance through
     /// correlated action sampling" (2024).

@@ -27,7 +27,7 @@ pub struct RolloutBlock {
     pub steady_noise: Vec<f32>,
     /// `[T + 1, n]`
     pub values: Vec<f32>,
-    /// `[T, n]`, scaled, and bootstrapped where truncated
+    /// `[T, n]`, scaled, and bootstrapped where the future was cut off
     pub rewards: Vec<f32>,
     /// `[T, n]`
     pub dones: Vec<bool>,

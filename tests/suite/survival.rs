@@ -82,6 +82,13 @@ const LONG: &[&str] = &[
     "--set=training.goal_angle_steps=3500",
     "--set=ppo.symmetry=cube",
     "--set=ppo.critic_learning_rate=1e-3",
+    "--set=training.goal_lifetime=20",
+    "--set=training.hold_reward=1",
+    "--set=training.task_reward_start=1",
+    "--set=training.task_reward_steps=4000",
+    "--set=ppo.max_std=0.4",
+    "--set=ppo.max_std_steps=4000",
+    "--set=ppo.exploring_share=0.25",
 ];
 
 #[test]
