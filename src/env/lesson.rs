@@ -14,7 +14,7 @@ pub struct Lesson {
     pub hold: u32,
     /// A new goal is at most so far from the cube's orientation, rad.
     pub goal_angle: f64,
-    /// Chance that the goal is replaced after a step, reached or not.
+    /// Chance that the goal is replaced after a step on which it was not reached.
     pub redirect_chance: f64,
     /// Weight of the task's own reward.
     pub task_reward: f64,

@@ -2,7 +2,8 @@
 
 /// Computes advantages and returns of a rollout of T steps of N environments, all arrays time-major.
 ///
-/// `rewards` `[T, N]` (where an episode, or the time under a goal, was cut off, with the discounted value of its final observation already added),
+/// `rewards` `[T, N]` (where an episode, or the time under a goal, was cut off, with the discounted value of its final
+/// observation already added),
 /// `values` `[T + 1, N]`, `dones` `[T, N]` (what can be earned ended with this step, however) → `advantages`, `returns` `[T, N]`.
 ///
 /// J. Schulman et al., "High-dimensional continuous control using generalized advantage estimation" (2016), eq. 16.
