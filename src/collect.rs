@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::Result;
 
 use crate::env::{End, Env, EnvBlock, EnvPool, StepBuffers};
+use crate::perception::rotation_error;
 use crate::ppo::{Acting, Ppo, Rollout, RolloutBlock, Workspace};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
@@ -77,6 +78,7 @@ impl<E: Env> Collecting<'_, E> {
     fn step(&mut self, acting: &Acting, t: usize, last: bool) -> Result<()> {
         let BlockScratch { ends, final_observations, work } = &mut *self.scratch;
         let mut step = self.rollout.step_mut(t);
+        acting.spread(&mut step, rotation_error);
         acting.act(&mut step, &mut self.noise, work)?;
         let buffers =
             StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };

@@ -32,10 +32,12 @@ tolerance_steps = 0
 hold_steps = 0
 goal_angle_steps = 0
 goal_lifetime = 0
+bootstrap_reached = false
 [ppo]
 symmetry = "none"
 bounds_coef = 0.0
 max_std_steps = 0
+away_std = 0.0
 exploring_share = 0.0
 "#;
 
@@ -121,6 +123,7 @@ pub struct TrainingConfig {
     pub goal_angle_start: f64,
     pub goal_angle_steps: u64,
     pub goal_lifetime: u64,
+    pub bootstrap_reached: bool,
 }
 
 /// The learner; `configs/repose.toml` says what each key means.
@@ -151,6 +154,8 @@ pub struct PpoConfig {
     pub init_std: f64,
     pub max_std: f64,
     pub max_std_steps: u64,
+    pub away_std: f64,
+    pub away_range: [f64; 2],
     pub exploring_share: f64,
     pub exploring_scale: f64,
 }
@@ -429,6 +434,8 @@ mod tests {
             ("ppo.hidden=[]", "must hold one to 64 sizes"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
+            ("training.bootstrap_reached=1", "must be true or false"),
+            ("ppo.away_range=[0.5,0.5]", "must rise from 0 or more"),
             ("env.goal_position=[1,2]", "goal_position"),
             ("nonsense=1", "nonsense: unknown key"),
             ("learning_rate=1", "did you mean ppo.learning_rate?"),

@@ -64,7 +64,9 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
 fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     match (expected, value) {
         (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
-        (Value::Float(_), Value::Float(_)) | (Value::String(_), Value::String(_)) => Ok(value.clone()),
+        (Value::Float(_), Value::Float(_))
+        | (Value::String(_), Value::String(_))
+        | (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
         (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(*i as f64)),
         (Value::Integer(_), Value::Integer(i)) if *i >= 0 => Ok(value.clone()),
         // 1e8 is how people write a large number of steps.
@@ -78,6 +80,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::Float(_), _) => Err("a number".into()),
         (Value::Integer(_), _) => Err("a whole number, not negative".into()),
         (Value::String(_), _) => Err("a string".into()),
+        (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Array(_), _) => Err("an array".into()),
         (Value::Table(_), _) => Err("a section with keys".into()),
         _ => Err("of another type".into()),

@@ -17,6 +17,9 @@ pub const CUBE_ORIENTATION: usize = 51;
 /// Where the goal's orientation stands in an observation.
 pub const GOAL_ORIENTATION: usize = 64;
 
+/// Where the rotation that is left to the goal stands in an observation.
+pub const RELATIVE_ROTATION: usize = 68;
+
 /// Joints in the order of the observation.
 const JOINTS: [&str; 24] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",

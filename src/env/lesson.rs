@@ -16,6 +16,8 @@ pub struct Lesson {
     pub goal_angle: f64,
     /// Chance that the goal is replaced after a step on which it was not reached.
     pub redirect_chance: f64,
+    /// Whether the value of going on with a goal that was reached is bootstrapped, as if it stayed.
+    pub bootstrap_reached: bool,
     /// Weight of the task's own reward.
     pub task_reward: f64,
     /// Paid for each rad by which the rotation error shrinks, taken back where it grows.
@@ -49,6 +51,7 @@ impl Lesson {
             hold: env.max_consecutive_successes,
             goal_angle: PI,
             redirect_chance: 0.0,
+            bootstrap_reached: false,
             task_reward: 1.0,
             progress_reward: 0.0,
             hold_reward: 0.0,
@@ -71,6 +74,7 @@ impl Lesson {
             hold: hold.round() as u32,
             goal_angle: between(training.goal_angle_start, task.goal_angle, share(training.goal_angle_steps)),
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
+            bootstrap_reached: training.bootstrap_reached,
             task_reward: between(training.task_reward_start, training.task_reward, share(training.task_reward_steps)),
             progress_reward: training.progress_reward,
             hold_reward: training.hold_reward,
@@ -120,7 +124,7 @@ mod tests {
     use crate::config::{Config, Override};
 
     /// Nothing that training adds.
-    const PLAIN: [&str; 12] = [
+    const PLAIN: [&str; 13] = [
         "training.task_reward=1",
         "training.task_reward_steps=0",
         "training.progress_reward=0",
@@ -133,6 +137,7 @@ mod tests {
         "training.hold_steps=0",
         "training.goal_angle_steps=0",
         "training.goal_lifetime=0",
+        "training.bootstrap_reached=false",
     ];
 
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {

@@ -12,7 +12,7 @@ mod state;
 mod tail;
 
 pub use episode::{EpisodeStats, Recent, Score};
-pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE};
+pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE, RELATIVE_ROTATION};
 pub use lesson::{Lesson, Shaping};
 pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message, stepping};
 pub use repose::{Diverged, Repose, StepDetails, Task};

@@ -222,7 +222,7 @@ impl Repose {
         }
     }
 
-    /// Counts a step within tolerance or not, and draws a new goal when this one has been held long enough; tells if so.
+    /// Counts a step within tolerance or not; tells if the goal has now been held long enough.
     fn hold(&mut self, within: bool) -> bool {
         if within {
             self.held += 1;
@@ -233,11 +233,16 @@ impl Repose {
         if reached {
             self.held = 0;
             self.episode.goals += 1;
-            self.set_goal();
-            // In a scene where the target is more than a picture: nothing may be left of where it was.
-            self.sim.refresh();
         }
         reached
+    }
+
+    /// Draws a new goal, and its first step is still to come.
+    fn replace_goal(&mut self) {
+        self.set_goal();
+        self.held = 0;
+        // In a scene where the target is more than a picture: nothing may be left of where it was.
+        self.sim.refresh();
     }
 
     /// Whether the lesson replaces the goal now, reached or not. Chance decides, so that the state needs no clock.
@@ -386,19 +391,19 @@ impl Env for Repose {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
-            // A goal that was just reached has been replaced already.
-            let gives_up = !reached && self.gives_up();
+            let gives_up = if reached { self.lesson.bootstrap_reached } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(gives_up.then_some(End::Redirected))
         };
+        if reached && end != Some(End::Redirected) {
+            self.replace_goal();
+        }
         self.observe(observation);
         Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }
     }
 
     /// Draws another goal, which must be held anew.
     fn redirect(&mut self, observation: &mut [f32]) {
-        self.set_goal();
-        self.held = 0;
-        self.sim.refresh();
+        self.replace_goal();
         self.observe(observation);
     }
 

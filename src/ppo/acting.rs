@@ -11,11 +11,29 @@ use crate::rng::Rng;
 /// The policy that collects a rollout, shared by all threads.
 pub struct Acting<'a> {
     pub(super) policy: FrozenPolicy<'a>,
+    /// The noise scale far away from the goal, and the distances on which it rises to that from 1.
+    pub(super) away_scale: f32,
+    pub(super) away_range: [f32; 2],
     pub(super) gamma: f32,
     pub(super) reward_scale: f32,
 }
 
 impl Acting<'_> {
+    /// Sets the noise scales of a step: what `distance` finds in an observation is how far its goal is away, rad. Near it the
+    /// policy's own noise is as small as the goal must be met exactly; far from it that would only slow learning down, since both
+    /// what a sample tells of the better action and how far an update of a given KL divergence goes are in proportion to it.
+    pub fn spread(&self, step: &mut RolloutStep, distance: fn(&[f32]) -> f32) {
+        let [near, far] = self.away_range;
+        let rows = step.observations.chunks_exact(step.observations.len() / step.noise_scales.len());
+        for ((scale, exploring), row) in step.noise_scales.iter_mut().zip(step.exploring_scales).zip(rows) {
+            *scale = *exploring;
+            if self.away_scale > 1.0 {
+                let share = ((distance(row) - near) / (far - near)).clamp(0.0, 1.0);
+                *scale = exploring.max(1.0 + (self.away_scale - 1.0) * share);
+            }
+        }
+    }
+
     /// Draws actions for the observations of a step; writes actions, means, log-probabilities and values.
     ///
     /// # Errors
@@ -25,11 +43,14 @@ impl Acting<'_> {
         let std = self.policy.std();
         let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
         let rows = step.actions.chunks_exact_mut(std.len()).zip(step.means.chunks_exact(std.len()));
-        let noises = step.noise_scales.iter().zip(step.steady_noise.chunks_exact(std.len()));
-        for (((actions, means), log_prob), (scale, steady)) in rows.zip(step.log_probs.iter_mut()).zip(noises) {
+        let steady = step.exploring_scales.iter().zip(step.steady_noise.chunks_exact(std.len()));
+        let noises = step.noise_scales.iter().zip(steady);
+        for (((actions, means), log_prob), (scale, (exploring, steady))) in
+            rows.zip(step.log_probs.iter_mut()).zip(noises)
+        {
             let mut squares = 0.0;
             for (((action, mean), std), steady) in actions.iter_mut().zip(means).zip(std).zip(steady) {
-                let drawn: f32 = if *scale == 1.0 { StandardNormal.sample(noise) } else { *steady };
+                let drawn: f32 = if *exploring == 1.0 { StandardNormal.sample(noise) } else { *steady };
                 *action = mean + scale * std * drawn;
                 squares += ((*action - mean) / (scale * std)).powi(2);
             }

@@ -121,8 +121,7 @@ mod tests {
             fill(&mut block.returns, 1.0);
             // A few act with more noise than the others.
             block.noise_scales.iter_mut().step_by(3).for_each(|scale| *scale = 1.5);
-            let scales: Vec<f32> = (0..block.samples()).map(|i| block.noise_scale(i)).collect();
-            let means = block.means.chunks_exact(20).zip(block.actions.chunks_exact(20)).zip(scales);
+            let means = block.means.chunks_exact(20).zip(block.actions.chunks_exact(20)).zip(&block.noise_scales);
             for (((means, actions), scale), log_prob) in means.zip(&mut block.log_probs) {
                 let z = means.iter().zip(actions).map(|(mean, action)| (action - mean) / (0.5 * scale));
                 *log_prob = -0.5 * z.map(|z| z * z).sum::<f32>() - 20.0 * (0.5f32.ln() + 0.918_938_5);

@@ -121,8 +121,13 @@ impl Ppo {
     /// # Errors
     /// Only if candle cannot allocate.
     pub fn acting(&self) -> Result<Acting<'_>> {
+        let policy = self.policy.freeze()?;
+        let std = policy.std();
+        let typical = (std.iter().map(|s| s.ln()).sum::<f32>() / std.len() as f32).exp();
+        let away_scale = (self.config.away_std as f32 / typical).max(1.0);
+        let away_range = self.config.away_range.map(|x| x as f32);
         let (gamma, reward_scale) = (self.config.gamma as f32, self.config.reward_scale as f32);
-        Ok(Acting { policy: self.policy.freeze()?, gamma, reward_scale })
+        Ok(Acting { policy, away_scale, away_range, gamma, reward_scale })
     }
 
     /// The generator of the action noise of a block of environments in an iteration.
@@ -139,7 +144,7 @@ impl Ppo {
     pub fn explore(&self, block: &mut RolloutBlock, iteration: u64, index: usize) {
         let mut rng = rng::stream(self.seed, "exploring", iteration << 32 | index as u64);
         let noises = block.steady_noise.chunks_exact_mut(self.policy.action_size());
-        for (scale, noise) in block.noise_scales.iter_mut().zip(noises) {
+        for (scale, noise) in block.exploring_scales.iter_mut().zip(noises) {
             let explores = rng::uniform(&mut rng, 0.0, 1.0) < self.config.exploring_share;
             *scale = if explores { self.config.exploring_scale as f32 } else { 1.0 };
             if explores {

@@ -21,9 +21,11 @@ pub struct RolloutBlock {
     pub means: Vec<f32>,
     /// `[T, n]`, of the actions
     pub log_probs: Vec<f32>,
-    /// `[n]`, times the standard deviations of the policy are those of the actions
+    /// `[T, n]`, times the standard deviations of the policy are those of the actions
     pub noise_scales: Vec<f32>,
-    /// `[n, A]`, the noise, in its own standard deviations, of those whose scale is not 1
+    /// `[n]`, the least noise scale of those that explore, 1 for the others
+    pub exploring_scales: Vec<f32>,
+    /// `[n, A]`, the noise, in its own standard deviations, of those that explore
     pub steady_noise: Vec<f32>,
     /// `[T + 1, n]`
     pub values: Vec<f32>,
@@ -49,7 +51,9 @@ pub struct RolloutStep<'a> {
     /// `[n, A]`
     pub means: &'a mut [f32],
     /// `[n]`
-    pub noise_scales: &'a [f32],
+    pub noise_scales: &'a mut [f32],
+    /// `[n]`
+    pub exploring_scales: &'a [f32],
     /// `[n, A]`
     pub steady_noise: &'a [f32],
     /// `[n]`
@@ -107,7 +111,8 @@ impl RolloutBlock {
             actions: vec![0.0; steps * action_size],
             means: vec![0.0; steps * action_size],
             log_probs: vec![0.0; steps],
-            noise_scales: vec![1.0; envs],
+            noise_scales: vec![1.0; steps],
+            exploring_scales: vec![1.0; envs],
             steady_noise: vec![0.0; envs * action_size],
             values: vec![0.0; steps + envs],
             rewards: vec![0.0; steps],
@@ -134,11 +139,6 @@ impl RolloutBlock {
         sample * width..(sample + 1) * width
     }
 
-    /// The noise scale of a sample.
-    pub fn noise_scale(&self, sample: usize) -> f32 {
-        self.noise_scales[sample % self.noise_scales.len()]
-    }
-
     /// The observations `[n, O]` that the first step acts on.
     pub fn first_observations_mut(&mut self) -> &mut [f32] {
         let [_, envs, size, _] = self.sizes;
@@ -160,7 +160,8 @@ impl RolloutBlock {
             next_observations: &mut after[..n * o],
             actions: &mut self.actions[t * n * a..][..n * a],
             means: &mut self.means[t * n * a..][..n * a],
-            noise_scales: &self.noise_scales,
+            noise_scales: &mut self.noise_scales[t * n..][..n],
+            exploring_scales: &self.exploring_scales,
             steady_noise: &self.steady_noise,
             log_probs: &mut self.log_probs[t * n..][..n],
             values: &mut self.values[t * n..][..n],

@@ -175,10 +175,10 @@ fn the_environments_that_explore_change_with_each_iteration_and_hold_a_larger_no
         // Squares of the distances from the mean, and numbers of them, of those that explore and of the others.
         let mut spread = [[0.0f64; 2]; 2];
         for block in &rollout.blocks {
-            let envs = block.noise_scales.len();
+            let envs = block.exploring_scales.len();
             let away = |i: usize| [0, 1].map(|j| block.actions[2 * i + j] - block.means[2 * i + j]);
             for i in 0..block.samples() {
-                let explores = block.noise_scale(i) > 1.0;
+                let explores = block.noise_scales[i] > 1.0;
                 let [sum, count] = &mut spread[usize::from(explores)];
                 *sum += f64::from(away(i)[0].powi(2) + away(i)[1].powi(2));
                 *count += 2.0;

@@ -83,12 +83,14 @@ const LONG: &[&str] = &[
     "--set=ppo.symmetry=cube",
     "--set=ppo.critic_learning_rate=1e-3",
     "--set=training.goal_lifetime=20",
+    "--set=training.bootstrap_reached=true",
     "--set=training.hold_reward=1",
     "--set=training.task_reward_start=1",
     "--set=training.task_reward_steps=4000",
     "--set=ppo.max_std=0.4",
     "--set=ppo.max_std_steps=4000",
     "--set=ppo.exploring_share=0.25",
+    "--set=ppo.away_std=0.7",
 ];
 
 #[test]

@@ -1,8 +1,14 @@
 //! What only training changes: lessons, and what a policy takes to be the same.
 
+use std::sync::atomic::AtomicBool;
+
+use shadow_repose::collect::{Scratch, collect};
 use shadow_repose::config::Symmetry;
-use shadow_repose::env::{End, Env, EnvPool, GOAL_ORIENTATION, Lesson, OBSERVATION_SIZE, Repose, StepBuffers};
+use shadow_repose::env::{
+    CUBE_ORIENTATION, End, Env, EnvPool, GOAL_ORIENTATION, Lesson, OBSERVATION_SIZE, Repose, StepBuffers,
+};
 use shadow_repose::perception::perception;
+use shadow_repose::ppo::Ppo;
 use shadow_repose::quat;
 use shadow_repose::rng;
 
@@ -208,4 +214,72 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
         }
     }
     assert!((50..120).contains(&redirected), "80 are expected: {redirected}");
+}
+
+#[test]
+fn a_goal_that_was_reached_can_be_worth_as_much_as_if_it_stayed() {
+    let task = task(&[]);
+    let always = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_start=4"];
+    for bootstrap in [true, false] {
+        let key = format!("training.bootstrap_reached={bootstrap}");
+        let mut env = Repose::new(&task);
+        env.set_lesson(lesson(0, &[&always[..], &["training.hold_steps=1000", &key]].concat()));
+        let mut observation = start(&mut env, 0);
+        for step in 1..=12 {
+            let goal = env.goal();
+            let end = env.step(&[0.0; 20], &mut observation).end;
+            let reached = step % 4 == 0;
+            assert_eq!(end, (reached && bootstrap).then_some(End::Redirected), "step {step}");
+            if end.is_some() {
+                assert!(env.goal() == goal, "what is bootstrapped is the goal that was reached");
+                env.redirect(&mut observation);
+            }
+            assert_eq!(env.goal() != goal, reached, "step {step}");
+            assert_eq!(env.episode().goals, step / 4);
+            let shown = quat::canonical(env.goal()).map(|x| x as f32);
+            assert_eq!(observation[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
+        }
+    }
+}
+
+#[test]
+fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
+    let sets = ["env.num_envs=64", "ppo.init_std=0.5", "ppo.away_std=1.5", "ppo.minibatches=4", "ppo.hidden=[16]"];
+    let (config, task) = (config(&sets), task(&[]));
+    let envs = (0..64).map(|i| {
+        let angle = if i % 2 == 0 { 0.1 } else { 3.1 };
+        let mut env = Repose::new(&task);
+        env.set_lesson(lesson(0, &[&format!("training.goal_angle_start={angle}"), "training.goal_angle_steps=1000"]));
+        env
+    });
+    let mut pool = EnvPool::new(3, envs.collect());
+    let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, 20, 3).unwrap();
+    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+    pool.reset(rollout.first_observations_mut());
+    let never = AtomicBool::new(false);
+    assert!(collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &never).unwrap());
+    // Squares of the distances from the mean, and numbers of them, of those near the goal and of those far from it.
+    let mut spread = [[0.0; 2]; 2];
+    for block in &rollout.blocks {
+        for (i, row) in block.acted_on().chunks_exact(OBSERVATION_SIZE).enumerate() {
+            let orientation = |at: usize| [0, 1, 2, 3].map(|j| f64::from(row[at + j]));
+            let error = quat::angle_between(orientation(CUBE_ORIENTATION), orientation(GOAL_ORIENTATION));
+            let expected = 1.0 + 2.0 * ((error - 0.15) / 0.35).clamp(0.0, 1.0);
+            let found = f64::from(block.noise_scales[i]);
+            assert!((found - expected).abs() < 0.02, "{found} instead of {expected} at {error} rad");
+            if expected == 1.0 || expected == 3.0 {
+                let [sum, count] = &mut spread[usize::from(expected == 3.0)];
+                for j in 20 * i..20 * (i + 1) {
+                    *sum += f64::from(block.actions[j] - block.means[j]).powi(2);
+                    *count += 1.0;
+                }
+            }
+        }
+    }
+    for ([sum, count], expected) in spread.into_iter().zip([0.5, 1.5]) {
+        let std = f64::sqrt(sum / count);
+        assert!(count > 200.0 && (std / expected - 1.0).abs() < 0.1, "{std} instead of {expected}, {count}");
+    }
+    let stats = ppo.update(&mut rollout, 1, &never).unwrap().unwrap();
+    assert!(stats.first_kl.abs() < 1e-5 && stats.first_ratio_error < 1e-3, "{stats:?}");
 }

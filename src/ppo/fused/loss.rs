@@ -86,7 +86,7 @@ impl<'a> Loss<'a> {
         let row = RolloutBlock::row(mean.len(), i);
         let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
         // First the distance from the mean in standard deviations, then the gradient in its place.
-        let sharpness = 1.0 / block.noise_scale(i);
+        let sharpness = 1.0 / block.noise_scales[i];
         for (((z, action), mean), precision) in grad.iter_mut().zip(action).zip(mean).zip(&self.precision) {
             *z = (action - mean) * (precision * sharpness);
         }

@@ -53,13 +53,11 @@ impl Backend for Reference {
         let raw = array(RolloutBlock::acted_on);
         let mut observations = vec![0.0; raw.len()];
         policy.normalizer.scaling().apply(&raw, &mut observations);
-        let scale_of_each =
-            |block: &RolloutBlock| (0..block.samples()).map(|i| block.noise_scale(i)).collect::<Vec<_>>();
         self.batch = Some(Minibatch {
             observations: rows(observations)?,
             actions: rows(array(|block| &block.actions))?,
             old_means: rows(array(|block| &block.means))?,
-            noise_scales: rows(rollout.blocks.iter().flat_map(scale_of_each).collect())?,
+            noise_scales: rows(array(|block| &block.noise_scales))?,
             old_log_probs: column(array(|block| &block.log_probs))?,
             old_values: column(array(|block| &block.values[..block.samples()]))?,
             advantages: column(array(|block| &block.advantages))?,
