@@ -36,6 +36,7 @@ bootstrap_reached = false
 [ppo]
 symmetry = "none"
 bounds_coef = 0.0
+value_clip = 0.0
 max_std_steps = 0
 away_std = 0.0
 exploring_share = 0.0
@@ -146,6 +147,7 @@ pub struct PpoConfig {
     pub gamma: f64,
     pub lambda: f64,
     pub clip: f64,
+    pub value_clip: f64,
     pub value_coef: f64,
     pub entropy_coef: f64,
     pub bounds_coef: f64,
@@ -217,6 +219,11 @@ pub struct RunConfig {
 }
 
 impl PpoConfig {
+    /// How far a value may move from the one that was there when the rollout was collected.
+    pub fn value_clip(&self) -> f64 {
+        if self.value_clip == 0.0 { self.clip } else { self.value_clip }
+    }
+
     /// The upper bound of the standard deviations of the actions after `env_steps` control steps of the whole run, if there is one.
     pub fn std_bound(&self, env_steps: u64) -> Option<f64> {
         let share = share(env_steps, self.max_std_steps);

@@ -93,6 +93,7 @@ impl Config {
         rules.between("ppo.gamma", ppo.gamma, 0.0, 1.0);
         rules.between("ppo.lambda", ppo.lambda, 0.0, 1.0);
         rules.positive("ppo.clip", ppo.clip);
+        rules.not_negative("ppo.value_clip", ppo.value_clip);
         rules.not_negative("ppo.value_coef", ppo.value_coef);
         rules.not_negative("ppo.entropy_coef", ppo.entropy_coef);
         rules.not_negative("ppo.bounds_coef", ppo.bounds_coef);

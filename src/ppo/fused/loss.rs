@@ -11,6 +11,7 @@ use crate::config::PpoConfig;
 pub struct Loss<'a> {
     rollout: &'a Rollout,
     clip: f32,
+    value_clip: f32,
     value_coef: f32,
     bounds_coef: f32,
     /// Of one sample in the means over the minibatch.
@@ -58,6 +59,7 @@ impl<'a> Loss<'a> {
         Self {
             rollout,
             clip: config.clip as f32,
+            value_clip: config.value_clip() as f32,
             value_coef: config.value_coef as f32,
             bounds_coef: config.bounds_coef as f32,
             share: 1.0 / samples as f32,
@@ -121,9 +123,9 @@ impl<'a> Loss<'a> {
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let (old, target) = (block.values[i], block.returns[i]);
-            let step = (value - old).clamp(-self.clip, self.clip);
+            let step = (value - old).clamp(-self.value_clip, self.value_clip);
             let (free, bounded) = (value - target, old + step - target);
-            let inside = (value - old).abs() <= self.clip;
+            let inside = (value - old).abs() <= self.value_clip;
             // Where the step is clipped and that makes the error larger, the value has no influence on it.
             let (error, slope) =
                 if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
@@ -163,7 +165,7 @@ mod tests {
         block.means = vec![0.0, -0.1, 0.4, 0.5, -0.5, 0.5];
         block.advantages = vec![1.0, 0.5, -2.0];
         block.values[..3].copy_from_slice(&[0.2, -0.1, 1.0]);
-        block.returns = vec![0.5, 0.1, 0.9];
+        block.returns = vec![0.5, 0.1, 1.9];
         block.noise_scales = vec![1.0, 1.5, 0.8];
         let old_log_std = [0.7f32.ln(), 1.1f32.ln()];
         for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
@@ -174,7 +176,8 @@ mod tests {
         }
         let log_std = [-0.5, 0.2];
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
-        (config.clip, config.value_coef, config.bounds_coef) = (0.2, 2.0, 0.5);
+        (config.clip, config.value_clip) = (0.2, 0.3);
+        (config.value_coef, config.bounds_coef) = (2.0, 0.5);
         let loss = Loss::new(&rollout, 3, &config, &log_std);
         let mut sums = Sums::default();
         sums.clear(2);
@@ -191,8 +194,8 @@ mod tests {
         assert_close(&[kl(&moved, 3, &old_log_std, &log_std) as f32], &[0.065_324_254]);
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
-        assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
-        assert_close(&[sums.value_error as f32 / 3.0], &[0.26]);
+        assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
+        assert_close(&[sums.value_error as f32 / 3.0], &[0.296_666_7]);
         assert_eq!(sums.excess, 0.0);
 
         // Means beyond ±1 are pulled back by 2 · 0.5 · their distance, a third each, on top of what the surrogate says.

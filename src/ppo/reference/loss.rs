@@ -85,7 +85,7 @@ pub fn losses(
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
     let policy = surrogate.mean_all()?.neg()?;
 
-    let step = (values - &batch.old_values)?.clamp(-config.clip, config.clip)?;
+    let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
     let clipped = (&batch.old_values + step)?;
     let error = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?;
     let value = error.mean_all()?;
@@ -129,12 +129,12 @@ mod tests {
     /// old_value = torch.tensor([0.2, -0.1, 1.0])
     /// action = torch.tensor([[0.5, -1.0], [-0.3, 0.9], [0.2, 1.5]])
     /// advantage = torch.tensor([1.0, 0.5, -2.0])
-    /// returns = torch.tensor([0.5, 0.1, 0.9])
+    /// returns = torch.tensor([0.5, 0.1, 1.9])
     /// dist, old = Normal(mean, scale * log_std.exp()), Normal(old_mean, scale * old_std)
     /// log_prob = dist.log_prob(action).sum(1)
     /// ratio = (log_prob - old.log_prob(action).sum(1)).exp()
     /// policy = -torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
-    /// clipped = old_value + (value - old_value).clamp(-0.2, 0.2)
+    /// clipped = old_value + (value - old_value).clamp(-0.3, 0.3)
     /// critic = torch.max((value - returns) ** 2, (clipped - returns) ** 2).mean()
     /// entropy = Normal(mean, log_std.exp()).entropy().sum(1).mean()
     /// kl = kl_divergence(old, dist).sum(1).mean()
@@ -145,7 +145,7 @@ mod tests {
     #[test]
     fn losses_and_gradients_match_pytorch() {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
-        (config.clip, config.value_coef, config.entropy_coef) = (0.2, 2.0, 0.01);
+        (config.clip, config.value_clip, config.value_coef, config.entropy_coef) = (0.2, 0.3, 2.0, 0.01);
         let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
         let log_std = Var::from_tensor(&tensor(&[-0.5, 0.2], &[2])).unwrap();
         let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
@@ -161,21 +161,21 @@ mod tests {
             old_means,
             old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
             advantages: tensor(&[1.0, 0.5, -2.0], &[3]),
-            returns: tensor(&[0.5, 0.1, 0.9], &[3]),
+            returns: tensor(&[0.5, 0.1, 1.9], &[3]),
         };
         let found = losses(&config, &batch, [&mean, &value], [&log_std, &old_std]).unwrap();
         let log_probs = log_prob(&batch.actions, &mean, &log_std, &batch.noise_scales).unwrap();
         assert_close(&log_probs, &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
         assert_close(&found.ratios, &[1.217_114_7, 0.860_722_24, 1.559_589_3]);
         assert_close(&found.policy, &[0.496_272_44]);
-        assert_close(&found.value, &[0.26]);
+        assert_close(&found.value, &[0.296_666_7]);
         assert_close(&found.entropy, &[2.537_877]);
         assert_close(&found.kl, &[0.065_324_254]);
         let grads = found.total.backward().unwrap();
         let mean_grad = [0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_3];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
         assert_close(grads.get(&log_std).unwrap(), &[0.572_585_3, -0.388_056_3]);
-        assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.666_666_7]);
+        assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
     }
 
     #[test]
