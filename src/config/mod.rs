@@ -18,29 +18,7 @@ use overlay::overlay;
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
 /// What a run did that was begun before a setting existed, where that is not the default of today.
-const BEFORE: &str = r#"
-[training]
-task_reward = 1.0
-task_reward_steps = 0
-progress_reward = 0.0
-hold_reward = 0.0
-goal_reward = 0.0
-drop_reward = 0.0
-drop_reward_steps = 0
-tolerance_scale = 1.0
-tolerance_steps = 0
-hold_steps = 0
-goal_angle_steps = 0
-goal_lifetime = 0
-bootstrap_reached = false
-[ppo]
-symmetry = "none"
-bounds_coef = 0.0
-value_clip = 0.0
-max_std_steps = 0
-away_std = 0.0
-exploring_share = 0.0
-"#;
+const BEFORE: &str = include_str!("before.toml");
 
 /// `env.model` of the scene that is built into the program.
 pub const BUILTIN_MODEL: &str = "builtin";

@@ -120,29 +120,15 @@ impl AddAssign for Shaping {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::config::{Config, Override};
 
-    /// Nothing that training adds.
-    const PLAIN: [&str; 13] = [
-        "training.task_reward=1",
-        "training.task_reward_steps=0",
-        "training.progress_reward=0",
-        "training.hold_reward=0",
-        "training.goal_reward=0",
-        "training.drop_reward=0",
-        "training.drop_reward_steps=0",
-        "training.tolerance_scale=1",
-        "training.tolerance_steps=0",
-        "training.hold_steps=0",
-        "training.goal_angle_steps=0",
-        "training.goal_lifetime=0",
-        "training.bootstrap_reached=false",
-    ];
-
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {
-        let sets: Vec<Override> = PLAIN.iter().chain(sets).map(|set| set.parse().unwrap()).collect();
-        let config = Config::resolve(None, &sets).unwrap();
+        let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
+        // Like a run from before there was anything that only training sees.
+        let config = Config::from_text(Path::new("config.toml"), "", &sets).unwrap();
         Lesson::at(env_steps, &config.training, &config.env)
     }
 

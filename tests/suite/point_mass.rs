@@ -84,7 +84,8 @@ fn pool_of(envs: usize, seed: u64) -> EnvPool<PointMass> {
 }
 
 fn settings() -> PpoConfig {
-    let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9"];
+    let settings =
+        ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9", "ppo.away_std=0"];
     config(&settings).ppo
 }
 

@@ -1,9 +1,10 @@
 //! What only training changes: lessons, and what a policy takes to be the same.
 
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::collect::{Scratch, collect};
-use shadow_repose::config::Symmetry;
+use shadow_repose::config::{Config, Override, Symmetry};
 use shadow_repose::env::{
     CUBE_ORIENTATION, End, Env, EnvPool, GOAL_ORIENTATION, Lesson, OBSERVATION_SIZE, Repose, StepBuffers,
 };
@@ -14,8 +15,10 @@ use shadow_repose::rng;
 
 use crate::support::{config, started, task};
 
+/// A lesson that differs from the task in these settings only.
 fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
-    let config = config(settings);
+    let settings: Vec<Override> = settings.iter().map(|setting| setting.parse().unwrap()).collect();
+    let config = Config::from_text(Path::new("config.toml"), "", &settings).unwrap();
     Lesson::at(env_steps, &config.training, &config.env)
 }
 
@@ -63,7 +66,8 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
 fn a_lesson_decides_what_reaches_a_goal_and_which_goals_are_drawn() {
     let task = task(&[]);
     let mut env = Repose::new(&task);
-    let easy = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_steps=1000"];
+    let easy = ["training.tolerance_start=3.2", "training.tolerance_steps=1000"];
+    let easy = [&easy[..], &["training.hold_start=1", "training.hold_steps=1000"]].concat();
     let near = ["training.goal_angle_start=0.3", "training.goal_angle_steps=1000"];
     env.set_lesson(lesson(0, &[&easy[..], &near].concat()));
     let mut observation = start(&mut env, 0);
