@@ -78,7 +78,7 @@ impl<E: Env> Collecting<'_, E> {
     fn step(&mut self, acting: &Acting, t: usize, last: bool) -> Result<()> {
         let BlockScratch { ends, final_observations, work } = &mut *self.scratch;
         let mut step = self.rollout.step_mut(t);
-        acting.spread(&mut step, rotation_error);
+        acting.set_noise_scales(&mut step, rotation_error);
         acting.act(&mut step, &mut self.noise, work)?;
         let buffers =
             StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };

@@ -22,7 +22,7 @@ impl Acting<'_> {
     /// Sets the noise scales of a step: what `distance` finds in an observation is how far its goal is away, rad. Near it the
     /// policy's own noise is as small as the goal must be met exactly; far from it that would only slow learning down, since both
     /// what a sample tells of the better action and how far an update of a given KL divergence goes are in proportion to it.
-    pub fn spread(&self, step: &mut RolloutStep, distance: fn(&[f32]) -> f32) {
+    pub fn set_noise_scales(&self, step: &mut RolloutStep, distance: fn(&[f32]) -> f32) {
         let [near, far] = self.away_range;
         let rows = step.observations.chunks_exact(step.observations.len() / step.noise_scales.len());
         for ((scale, exploring), row) in step.noise_scales.iter_mut().zip(step.exploring_scales).zip(rows) {
