@@ -141,6 +141,10 @@ impl Env for Recorder {
         self.env.action_size()
     }
 
+    fn distance(observation: &[f32]) -> f32 {
+        Repose::distance(observation)
+    }
+
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
         self.env.reset(rng, observation);
         self.recording.resets.push((self.recording.steps, self.env.simulation().state()));

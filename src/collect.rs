@@ -8,7 +8,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::Result;
 
 use crate::env::{End, Env, EnvBlock, EnvPool, StepBuffers};
-use crate::perception::rotation_error;
 use crate::ppo::{Acting, Ppo, Rollout, RolloutBlock, Workspace};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
@@ -78,7 +77,7 @@ impl<E: Env> Collecting<'_, E> {
     fn step(&mut self, acting: &Acting, t: usize, last: bool) -> Result<()> {
         let BlockScratch { ends, final_observations, work } = &mut *self.scratch;
         let mut step = self.rollout.step_mut(t);
-        acting.set_noise_scales(&mut step, rotation_error);
+        acting.set_noise_scales(&mut step, E::distance);
         acting.act(&mut step, &mut self.noise, work)?;
         let buffers =
             StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };

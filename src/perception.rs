@@ -8,7 +8,7 @@
 use std::f32::consts::FRAC_1_SQRT_2;
 
 use crate::config::Symmetry;
-use crate::env::{CUBE_ORIENTATION, GOAL_ORIENTATION, OBSERVATION_SIZE, RELATIVE_ROTATION};
+use crate::env::{CUBE_ORIENTATION, GOAL_ORIENTATION, OBSERVATION_SIZE};
 
 /// The rotations of a cube onto itself, w,x,y,z, one of each pair q and -q.
 const ROTATIONS: [[f32; 4]; 24] = {
@@ -51,11 +51,6 @@ pub fn perception(symmetry: Symmetry) -> fn(&mut [f32]) {
         Symmetry::None => |_| {},
         Symmetry::Cube => |observations| observations.chunks_exact_mut(OBSERVATION_SIZE).for_each(turn_cube),
     }
-}
-
-/// The rotation error, rad, that an observation shows; it is the same however the cube was turned onto itself.
-pub fn rotation_error(observation: &[f32]) -> f32 {
-    2.0 * observation[RELATIVE_ROTATION].clamp(0.0, 1.0).acos()
 }
 
 /// Turns cube and goal about the cube's own axes so that the cube is as near as can be to where it is not turned at all.

@@ -17,7 +17,7 @@ use overlay::overlay;
 /// The default configuration, commented.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
-/// What a run did that was begun before a setting existed, where that is not the default of today.
+/// What a run did that was begun before a setting existed, also where that is the default of today.
 const BEFORE: &str = include_str!("before.toml");
 
 /// `env.model` of the scene that is built into the program.

@@ -102,7 +102,7 @@ impl Config {
         rules.positive("ppo.init_std", ppo.init_std);
         rules.positive("ppo.max_std", ppo.max_std);
         rules.between("ppo.exploring_share", ppo.exploring_share, 0.0, 1.0);
-        rules.between("ppo.exploring_scale", ppo.exploring_scale, 1.0, 100.0);
+        rules.between("ppo.exploring_scale", ppo.exploring_scale, 0.01, 100.0);
         rules.not_negative("ppo.away_std", ppo.away_std);
         let [near, far] = ppo.away_range;
         let rises = 0.0 <= near && near < far;

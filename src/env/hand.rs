@@ -18,7 +18,7 @@ pub const CUBE_ORIENTATION: usize = 51;
 pub const GOAL_ORIENTATION: usize = 64;
 
 /// Where the rotation that is left to the goal stands in an observation.
-pub const RELATIVE_ROTATION: usize = 68;
+pub(super) const RELATIVE_ROTATION: usize = 68;
 
 /// Joints in the order of the observation.
 const JOINTS: [&str; 24] = [

@@ -10,15 +10,17 @@ mod repose;
 mod reward;
 mod state;
 mod tail;
+mod task;
 
 pub use episode::{EpisodeStats, Recent, Score};
-pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE, RELATIVE_ROTATION};
+pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE};
 pub use lesson::{Lesson, Shaping};
 pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message, stepping};
-pub use repose::{Diverged, Repose, StepDetails, Task};
+pub use repose::{Diverged, Repose, StepDetails};
 pub use reward::RewardTerms;
 pub use state::{EnvState, SavedEnv};
 pub use tail::Tail;
+pub use task::Task;
 
 use anyhow::Result;
 
@@ -55,6 +57,9 @@ pub trait Env: Send {
 
     /// Numbers in an action.
     fn action_size(&self) -> usize;
+
+    /// How far from its goal an observation is, perceived or not, in the unit of `ppo.away_range`.
+    fn distance(observation: &[f32]) -> f32;
 
     /// Starts an episode whose randomness is all drawn from `rng`, and writes the first observation.
     fn reset(&mut self, rng: Rng, observation: &mut [f32]);

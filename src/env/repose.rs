@@ -1,67 +1,24 @@
-//! The task: a Shadow Hand turns the cube in its palm to one orientation after the other.
+//! The environment: a Shadow Hand turns the cube in its palm to one orientation after the other.
 //!
-//! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter and new
-//! goal, ends, observation with the goal in force next.
+//! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter, ends, new
+//! goal, observation with the goal in force next.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 
-use super::hand::CUBE;
+use super::hand::RELATIVE_ROTATION;
 use super::tail::{Recorder, Tail};
+use super::task::Task;
 use super::{
-    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Hand, Lesson, OBSERVATION_SIZE, Recent, Resumable, RewardTerms,
-    SavedEnv, Shaping, Transition,
+    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Lesson, OBSERVATION_SIZE, Recent, Resumable, RewardTerms, SavedEnv,
+    Shaping, Transition,
 };
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Look, Physics, Scene, Simulation, Variation};
-
-/// What all environments of a run share: the scene, the hand in it, the settings.
-pub struct Task {
-    scene: Scene,
-    hand: Hand,
-    config: EnvConfig,
-}
-
-impl Task {
-    /// Loads the scene that `config` names and binds the hand in it.
-    ///
-    /// # Errors
-    /// A scene that cannot be loaded or lacks a name, with its file.
-    pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::of(Scene::load(config.model_file(), variation(config))?, config)
-    }
-
-    /// The same task in a scene to be looked at.
-    ///
-    /// # Errors
-    /// As [`Task::new`], and meshes that cannot be read.
-    pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::of(Scene::load_to_see(config.model_file(), variation(config), look)?, config)
-    }
-
-    fn of(scene: Scene, config: &EnvConfig) -> Result<Arc<Self>> {
-        let hand = Hand::bind(&scene)?;
-        Ok(Arc::new(Self { scene, hand, config: config.clone() }))
-    }
-
-    /// The settings.
-    pub fn config(&self) -> &EnvConfig {
-        &self.config
-    }
-
-    /// The scene.
-    pub fn scene(&self) -> &Scene {
-        &self.scene
-    }
-}
-
-fn variation(config: &EnvConfig) -> Variation {
-    Variation { timestep: config.sim_dt, friction: config.friction_scale, load: (CUBE, config.cube_mass_scale) }
-}
+use crate::sim::{Physics, Simulation};
 
 /// One hand with its cube.
 pub struct Repose {
@@ -245,7 +202,7 @@ impl Repose {
         self.sim.refresh();
     }
 
-    /// Whether the lesson replaces the goal now, reached or not. Chance decides, so that the state needs no clock.
+    /// Whether the lesson replaces a goal that was not reached now. Chance decides, so that the state needs no clock.
     fn gives_up(&mut self) -> bool {
         let chance = self.lesson.redirect_chance;
         chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
@@ -304,6 +261,11 @@ impl Env for Repose {
 
     fn action_size(&self) -> usize {
         ACTION_SIZE
+    }
+
+    /// The rotation error, rad; it stays the same when cube and goal are turned together.
+    fn distance(observation: &[f32]) -> f32 {
+        2.0 * observation[RELATIVE_ROTATION].clamp(0.0, 1.0).acos()
     }
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
@@ -394,7 +356,8 @@ impl Env for Repose {
             let gives_up = if reached { self.lesson.bootstrap_reached } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(gives_up.then_some(End::Redirected))
         };
-        if reached && end != Some(End::Redirected) {
+        // What is bootstrapped as if it stayed is still seen in the last observation under it.
+        if reached && !self.lesson.bootstrap_reached {
             self.replace_goal();
         }
         self.observe(observation);

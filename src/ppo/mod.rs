@@ -58,7 +58,7 @@ pub struct UpdateStats {
     pub value_loss: f64,
     /// Squared distance of the mean actions from [-1, 1], beyond which they are clipped.
     pub excess: f64,
-    /// Entropy of the action distribution, nats.
+    /// Entropy of the policy's own action distribution, nats.
     pub entropy: f64,
     /// KL divergence from the policy that collected, nats.
     pub kl: f64,
@@ -70,7 +70,7 @@ pub struct UpdateStats {
     pub clip_fraction: f64,
     /// Norm of all gradients together, before clipping.
     pub grad_norm: f64,
-    /// Mean standard deviation of the actions, after the update.
+    /// Mean of the policy's own standard deviations, after the update.
     pub std: f64,
     /// 1 - Var(returns - values) / Var(returns) of the values that the rollout was collected with.
     pub explained_variance: f64,
@@ -123,6 +123,8 @@ impl Ppo {
     pub fn acting(&self) -> Result<Acting<'_>> {
         let policy = self.policy.freeze()?;
         let std = policy.std();
+        // The geometric mean. In proportion to it all standard deviations grow: to those of the policy the losses take the factor for
+        // a constant, though it follows them.
         let typical = (std.iter().map(|s| s.ln()).sum::<f32>() / std.len() as f32).exp();
         let away_scale = (self.config.away_std as f32 / typical).max(1.0);
         let away_range = self.config.away_range.map(|x| x as f32);

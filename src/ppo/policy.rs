@@ -187,7 +187,7 @@ impl FrozenPolicy<'_> {
         self.policy.symmetry
     }
 
-    /// The standard deviations of the actions `[A]`.
+    /// The policy's own standard deviations `[A]`; training may scale its noise (see `Acting`).
     pub fn std(&self) -> &[f32] {
         &self.std
     }

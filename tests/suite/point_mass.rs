@@ -44,6 +44,10 @@ impl Env for PointMass {
         2
     }
 
+    fn distance(observation: &[f32]) -> f32 {
+        observation[0].hypot(observation[1])
+    }
+
     fn reset(&mut self, mut rng: Rng, observation: &mut [f32]) {
         self.position = [0.0; 2].map(|_| rng::uniform(&mut rng, -1.0, 1.0));
         self.age = 0;
@@ -84,8 +88,7 @@ fn pool_of(envs: usize, seed: u64) -> EnvPool<PointMass> {
 }
 
 fn settings() -> PpoConfig {
-    let settings =
-        ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9", "ppo.away_std=0"];
+    let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.init_std=0.5", "ppo.gamma=0.9"];
     config(&settings).ppo
 }
 

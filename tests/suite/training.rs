@@ -243,6 +243,11 @@ fn a_goal_that_was_reached_can_be_worth_as_much_as_if_it_stayed() {
             let shown = quat::canonical(env.goal()).map(|x| x as f32);
             assert_eq!(observation[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
         }
+        // Where time is up on the step that reaches it, the last observation is bootstrapped all the same.
+        env.skip_ahead(0.996);
+        let goal = env.goal();
+        let ends = [0, 1, 2, 3].map(|_| env.step(&[0.0; 20], &mut observation).end);
+        assert_eq!((ends[3], env.goal() == goal), (Some(End::Truncated), bootstrap), "{ends:?}");
     }
 }
 
