@@ -97,11 +97,13 @@ pub struct TrainingConfig {
     pub tolerance_scale: f64,
     pub tolerance_start: f64,
     pub tolerance_steps: u64,
+    pub hold_scale: f64,
     pub hold_start: u32,
     pub hold_steps: u64,
     pub goal_angle_start: f64,
     pub goal_angle_steps: u64,
     pub goal_lifetime: u64,
+    pub episode_seconds: f64,
     pub bootstrap_reached: bool,
 }
 
@@ -222,7 +224,12 @@ impl EnvConfig {
 
     /// Control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
-        (self.max_episode_seconds / self.ctrl_dt).round() as u32
+        self.control_steps(self.max_episode_seconds)
+    }
+
+    /// So many seconds in control steps.
+    pub fn control_steps(&self, seconds: f64) -> u32 {
+        (seconds / self.ctrl_dt).round() as u32
     }
 
     /// The user's own scene, or `None` for the built-in one.

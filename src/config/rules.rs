@@ -50,10 +50,16 @@ impl Config {
         rules.not_negative("training.task_reward_start", training.task_reward_start);
         rules.positive("training.tolerance_scale", training.tolerance_scale);
         rules.positive("training.tolerance_start", training.tolerance_start);
+        let shrinks = 0.0 < training.hold_scale && training.hold_scale <= 1.0;
+        rules.check(shrinks, "training.hold_scale", training.hold_scale, "be above 0 and at most 1");
         rules.at_least("training.hold_start", training.hold_start as usize, 1);
         rules.positive("training.goal_angle_start", training.goal_angle_start);
         let half_turn = training.goal_angle_start <= std::f64::consts::PI;
         rules.check(half_turn, "training.goal_angle_start", training.goal_angle_start, "be at most pi");
+        let seconds = training.episode_seconds;
+        let lasts = env.control_steps(seconds) >= 1 && seconds <= env.max_episode_seconds;
+        let rule = "be 0, or last at least a step of env.ctrl_dt and at most env.max_episode_seconds";
+        rules.check(seconds == 0.0 || lasts, "training.episode_seconds", seconds, rule);
 
         rules.at_least("ppo.horizon", ppo.horizon, 1);
         rules.at_least("ppo.epochs", ppo.epochs, 1);

@@ -14,6 +14,8 @@ pub struct Lesson {
     pub hold: u32,
     /// A new goal is at most so far from the cube's orientation, rad.
     pub goal_angle: f64,
+    /// Control steps after which an episode is truncated.
+    pub max_episode_steps: u32,
     /// Chance that the goal is replaced after a step on which it was not reached.
     pub redirect_chance: f64,
     /// Whether the value of going on with a goal that was reached is bootstrapped, as if it stayed.
@@ -50,6 +52,7 @@ impl Lesson {
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
             goal_angle: PI,
+            max_episode_steps: env.max_episode_steps(),
             redirect_chance: 0.0,
             bootstrap_reached: false,
             task_reward: 1.0,
@@ -65,14 +68,19 @@ impl Lesson {
         let task = Self::task(env);
         let share = |steps| share(env_steps, steps);
         let between = |start: f64, end: f64, share: f64| start * (1.0 - share) + end * share;
-        let first_hold = training.hold_start.min(task.hold);
-        let hold = between(f64::from(first_hold), f64::from(task.hold), share(training.hold_steps));
+        let last_hold = (training.hold_scale * f64::from(task.hold)).round().max(1.0);
+        let first_hold = f64::from(training.hold_start).min(last_hold);
+        let hold = between(first_hold, last_hold, share(training.hold_steps));
         Self {
             // By equal factors in equal times: halving the error is as hard a step anywhere.
             tolerance: training.tolerance_start.powf(1.0 - share(training.tolerance_steps))
                 * (training.tolerance_scale * task.tolerance).powf(share(training.tolerance_steps)),
             hold: hold.round() as u32,
             goal_angle: between(training.goal_angle_start, task.goal_angle, share(training.goal_angle_steps)),
+            max_episode_steps: match training.episode_seconds {
+                0.0 => task.max_episode_steps,
+                seconds => env.control_steps(seconds),
+            },
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
             bootstrap_reached: training.bootstrap_reached,
             task_reward: between(training.task_reward_start, training.task_reward, share(training.task_reward_steps)),
@@ -150,6 +158,8 @@ mod tests {
         let aims_better = at(1000, &[&sets[..], &["training.tolerance_scale=0.5"]].concat());
         assert!((aims_better.tolerance - 0.05).abs() < 1e-9, "{}", aims_better.tolerance);
         assert_eq!(found.map(|lesson| lesson.hold), [1, 13, 26, 50, 50]);
+        let shorter = [&sets[..], &["training.hold_scale=0.3"]].concat();
+        assert_eq!([0, 1000, 2000, 9000].map(|steps| at(steps, &shorter).hold), [1, 8, 15, 15]);
         assert_eq!(found.map(|lesson| lesson.goal_angle), [1.0, PI, PI, PI, PI]);
     }
 

@@ -304,7 +304,7 @@ impl Env for Repose {
     }
 
     fn skip_ahead(&mut self, share: f64) {
-        self.age = (share * f64::from(self.task.config.max_episode_steps())) as u32;
+        self.age = (share * f64::from(self.lesson.max_episode_steps)) as u32;
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
@@ -352,7 +352,7 @@ impl Env for Repose {
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
         } else {
-            let time_is_up = self.age >= self.task.config.max_episode_steps();
+            let time_is_up = self.age >= self.lesson.max_episode_steps;
             let gives_up = if reached { self.lesson.bootstrap_reached } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(gives_up.then_some(End::Redirected))
         };

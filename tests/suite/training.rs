@@ -92,6 +92,18 @@ fn a_lesson_decides_what_reaches_a_goal_and_which_goals_are_drawn() {
 }
 
 #[test]
+fn episodes_of_training_can_be_shorter_than_those_that_are_scored() {
+    let mut env = Repose::new(&task(&[]));
+    let mut length = |seconds: &str, share: f64| {
+        env.set_lesson(lesson(0, &[&format!("training.episode_seconds={seconds}")]));
+        let mut observation = start(&mut env, 0);
+        env.skip_ahead(share);
+        (1..).find(|_| env.step(&[0.0; 20], &mut observation).end == Some(End::Truncated)).unwrap()
+    };
+    assert_eq!([length("0.1", 0.0), length("0.1", 0.5), length("0", 0.0)], [10, 5, 1000]);
+}
+
+#[test]
 fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let task = task(&[]);
     let (mut plain, mut observation) = started(&task);
