@@ -79,7 +79,8 @@ impl Lesson {
             goal_angle: between(training.goal_angle_start, task.goal_angle, share(training.goal_angle_steps)),
             max_episode_steps: match training.episode_seconds {
                 0.0 => task.max_episode_steps,
-                seconds => env.control_steps(seconds),
+                // Whoever plays a policy in shorter episodes need not say what only training sees.
+                seconds => env.control_steps(seconds).min(task.max_episode_steps),
             },
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
             bootstrap_reached: training.bootstrap_reached,

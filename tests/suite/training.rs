@@ -101,6 +101,7 @@ fn episodes_of_training_can_be_shorter_than_those_that_are_scored() {
         (1..).find(|_| env.step(&[0.0; 20], &mut observation).end == Some(End::Truncated)).unwrap()
     };
     assert_eq!([length("0.1", 0.0), length("0.1", 0.5), length("0", 0.0)], [10, 5, 1000]);
+    assert_eq!(length("20", 0.0), 1000, "never longer");
 }
 
 #[test]
