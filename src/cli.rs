@@ -81,8 +81,9 @@ pub struct TrainArgs {
     /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
     pub resume: Option<PathBuf>,
-    /// Begin with the policy of a checkpoint or run, weights and normaliser; everything else is as in a new run
-    #[arg(long, value_name = "FILE|RUN", conflicts_with = "resume")]
+    /// Begin with the policy of a checkpoint or run, or the built-in one, weights and normaliser; everything else is as in a new
+    /// run
+    #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume")]
     pub init: Option<PathBuf>,
     /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
     #[arg(long, value_name = "N", value_parser = kept())]
@@ -98,9 +99,9 @@ pub struct TrainArgs {
 /// `play`
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// A checkpoint, or a run folder (its best checkpoint, or its latest) [default: the newest run, or if there is none the
-    /// policy that is built in]
-    #[arg(long, value_name = "FILE|RUN")]
+    /// A checkpoint, a run folder (its best checkpoint, or its latest), or builtin: the policy that comes with the program
+    /// [default: the newest run, or if there is none the policy that comes with the program]
+    #[arg(long, value_name = "FILE|RUN|builtin")]
     pub ckpt: Option<PathBuf>,
     /// Whole episodes to play, every one counted [default: 256; in a window, until it is closed; in a film, 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]

@@ -3,7 +3,8 @@
 //! Its size is known before it is read, its shapes before anything is allocated by them, its checksum before anything in it is
 //! used; and no path that stands in it is followed.
 
-use std::path::Path;
+use std::fmt;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 
@@ -14,6 +15,51 @@ use crate::run;
 
 /// The key of the one setting that is a path.
 pub const MODEL: &str = "env.model";
+
+/// The name of the policy that comes with the program, where a file or a run could be named.
+const BUILTIN: &str = "builtin";
+
+/// That policy.
+const BUILTIN_POLICY: &[u8] = include_bytes!("../assets/policies/repose.safetensors");
+
+/// Where a policy comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// It comes with the program.
+    BuiltIn,
+    /// A checkpoint, or a file with a policy alone.
+    File(PathBuf),
+}
+
+impl Origin {
+    /// The one that `place` means: `builtin`, a file, or a run folder's best checkpoint, or its latest where there is none yet.
+    ///
+    /// # Errors
+    /// Nothing there.
+    pub fn of(place: &Path) -> Result<Self> {
+        if place == Path::new(BUILTIN) { Ok(Self::BuiltIn) } else { run::resolve_checkpoint(place).map(Self::File) }
+    }
+
+    /// Reads it, and the configuration in it with `overrides` on top.
+    ///
+    /// # Errors
+    /// Those of [`load`].
+    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
+        match self {
+            Self::BuiltIn => parse(Path::new(BUILTIN), BUILTIN_POLICY, overrides),
+            Self::File(path) => load(path, overrides),
+        }
+    }
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::BuiltIn => f.write_str("built into the program"),
+            Self::File(path) => path.display().fmt(f),
+        }
+    }
+}
 
 /// Reads a checkpoint or a policy, and the configuration in it with `overrides` on top.
 ///

@@ -1,7 +1,7 @@
 //! Lets a policy play: in a window, as a film, or for its score: whole episodes, a table or one JSON object, and the trace of
 //! the first episodes.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -13,7 +13,7 @@ use crate::config::{Config, Override};
 use crate::env::{RewardTerms, Score, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::film::Film;
-use crate::load;
+use crate::load::{self, Origin};
 use crate::ppo::Policy;
 use crate::run::{self, Requests};
 use crate::scenery::task_to_see;
@@ -45,7 +45,7 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
         (None, Some(Baseline::Random)) => Actor::Random,
         (None, _) => Actor::Zero,
     };
-    let checkpoint = loaded.as_ref().map(|loaded| loaded.path.display().to_string());
+    let checkpoint = loaded.as_ref().map(|loaded| loaded.origin.to_string());
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
     let mut requests = Requests::none();
@@ -154,16 +154,9 @@ fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     Episodes { seed: args.seed, purpose: "score", first: 0, count }
 }
 
-/// The policy that comes with the program.
-const SHIPPED: &[u8] = include_bytes!("../assets/policies/repose.safetensors");
-
-/// What the score calls it.
-const SHIPPED_NAME: &str = "built into the program";
-
 /// A policy, with the configuration that it was trained with and `--set` on top.
 struct Loaded {
-    /// The file that it comes from.
-    path: PathBuf,
+    origin: Origin,
     config: Config,
     policy: Policy,
 }
@@ -171,20 +164,17 @@ struct Loaded {
 impl Loaded {
     fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
         let overrides = of_the_task(overrides)?;
-        let found = match place {
-            Some(place) => Some(run::resolve_checkpoint(place)?),
-            None => run::newest_checkpoint(),
-        };
-        let path = found.clone().unwrap_or_else(|| SHIPPED_NAME.into());
-        let (checkpoint, config) = match found {
-            Some(path) => load::load(&path, overrides)?,
-            None => {
+        let origin = match (place, run::newest_checkpoint()) {
+            (Some(place), _) => Origin::of(place)?,
+            (None, Some(newest)) => Origin::File(newest),
+            (None, None) => {
                 run::say("there is no run here: playing the policy that is built in");
-                load::parse(&path, SHIPPED, overrides)?
+                Origin::BuiltIn
             }
         };
-        let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play {}", path.display()))?;
-        Ok(Self { path, config, policy })
+        let (checkpoint, config) = origin.load(overrides)?;
+        let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play the policy {origin}"))?;
+        Ok(Self { origin, config, policy })
     }
 }
 

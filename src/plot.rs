@@ -13,19 +13,28 @@ const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "
 /// Pixels of a picture whose size is not asked for: its width, and the height of a panel.
 const SIZE: [u32; 2] = [800, 260];
 
-/// Draws the curves as asked.
+/// Draws the curves as asked. Of several runs those that cannot be drawn are left out, with a warning: one that was stopped in its
+/// first iteration, or was made before there was such a column.
 ///
 /// # Errors
-/// Metrics that cannot be read or lack a column, no rows at all, a picture that cannot be written.
+/// No run with metrics that can be read, have the columns and a row; a picture that cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
     let mut panels: Vec<Panel> =
         metrics.iter().map(|name| Panel { name: (*name).to_owned(), curves: Vec::new() }).collect();
-    for place in &args.runs {
-        let columns = [&["env_steps", "time/collect_s", "time/update_s"], &metrics[..]].concat();
-        let table = run::read_metrics(place, &columns)?;
-        ensure!(!table.is_empty(), "{}: there are no rows yet", place.display());
+    let mut drawn = 0;
+    for (i, place) in args.runs.iter().enumerate() {
+        let table = match rows(place, &metrics) {
+            Ok(table) => table,
+            // The last hope.
+            Err(error) if drawn == 0 && i + 1 == args.runs.len() => return Err(error),
+            Err(error) => {
+                run::say(&format!("warning: {error:#}; it is left out"));
+                continue;
+            }
+        };
+        drawn += 1;
         let mut seconds = 0.0;
         let mut along = Vec::with_capacity(table.len());
         for row in &table {
@@ -46,8 +55,16 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     };
     let size = args.size.unwrap_or([SIZE[0], SIZE[1] * panels.len() as u32]);
     Chart { along: along.to_owned(), panels, size }.write(&args.out)?;
-    run::say(&format!("{}: {} runs", args.out.display(), args.runs.len()));
+    run::say(&format!("{}: {drawn} runs", args.out.display()));
     Ok(())
+}
+
+/// Of each iteration of a run: the control steps at its end, the seconds of its two parts, and these metrics.
+fn rows(place: &Path, metrics: &[&str]) -> Result<Vec<Vec<f64>>> {
+    let columns = [&["env_steps", "time/collect_s", "time/update_s"], metrics].concat();
+    let table = run::read_metrics(place, &columns)?;
+    ensure!(!table.is_empty(), "{}: there are no rows yet", place.display());
+    Ok(table)
 }
 
 /// The name of a run: that of its folder.

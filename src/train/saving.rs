@@ -9,7 +9,7 @@ use super::{Session, version};
 use crate::config::{BUILTIN_MODEL, Config, Override, PpoConfig};
 use crate::dump;
 use crate::env::{ACTION_SIZE, EnvState, OBSERVATION_SIZE};
-use crate::load::{self, MODEL};
+use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Array, Checkpoint, Progress};
 use crate::run::{self, Report, RunFolder};
 use crate::{env, sim};
@@ -202,10 +202,10 @@ pub(super) fn first_sound(places: &[PathBuf], overrides: &[Override]) -> Result<
 /// # Errors
 /// A file that cannot be used, or a policy that the configuration does not describe.
 pub(super) fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Checkpoint> {
-    let path = run::resolve_checkpoint(place)?;
+    let origin = Origin::of(place)?;
     // Which scene it was trained in does not matter.
     let any_scene = Override { key: MODEL.into(), value: BUILTIN_MODEL.into() };
-    let (checkpoint, of_it) = load::load(&path, &[any_scene])?;
+    let (checkpoint, of_it) = origin.load(&[any_scene])?;
     let fitting = || {
         checkpoint.expect_policy(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE)?;
         let describe = |ppo: &PpoConfig| (ppo.activation, ppo.symmetry);
@@ -213,6 +213,6 @@ pub(super) fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Chec
         ensure!(found == expected, "its activation and symmetry are {found:?}, those of this training {expected:?}");
         Ok(())
     };
-    fitting().with_context(|| format!("cannot begin with {}", path.display()))?;
+    fitting().with_context(|| format!("cannot begin with the policy {origin}"))?;
     Ok(checkpoint)
 }

@@ -1,6 +1,7 @@
 //! The program itself, as a user runs it.
 
 use std::fs;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use shadow_repose::ppo::Checkpoint;
@@ -83,10 +84,28 @@ fn where_there_is_no_run_the_built_in_policy_is_played_and_turns_the_cube() {
     let args = ["play", "--episodes", "32", "--json"];
     let score = json(&succeeded(program(folder.path(), &args)));
     assert_eq!(score["checkpoint"], "built into the program");
-    // A hand that holds still is 2.2 rad away, and never reaches a goal.
-    assert!(score["rot_dist"].as_f64().unwrap() < 1.7, "{score}");
+    // 2.6 are expected, with a standard error of a quarter; a hand that hovers beside its goals, or holds still, reaches none.
+    assert!(score["goals_per_episode"].as_f64().unwrap() > 1.5, "{score}");
+    assert!(score["drop_rate"].as_f64().unwrap() < 0.4, "{score}");
     assert!(include_bytes!("../../assets/policies/repose.safetensors").len() < 4 << 20);
     assert!(names(folder.path()).is_empty());
+}
+
+#[test]
+fn the_built_in_policy_can_be_named_where_there_are_runs_and_be_begun_with() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = ["env.num_envs=16", "ppo.minibatches=4", "ppo.horizon=8", "run.eval_episodes=1"];
+    let mut args = vec!["train", "--init", "builtin", "--total-steps", "128", "--keep", "9"];
+    small.iter().for_each(|set| args.extend(["--set", set]));
+    succeeded(program(folder.path(), &args));
+    let play = ["play", "--ckpt", "builtin", "--episodes", "1", "--json"];
+    assert_eq!(json(&succeeded(program(folder.path(), &play)))["checkpoint"], "built into the program");
+    let run = names(&folder.path().join("runs/shadow-hand-repose")).remove(0);
+    let checkpoints = folder.path().join("runs/shadow-hand-repose").join(run).join("checkpoints");
+    let begun = names(&checkpoints).into_iter().find(|name| name == "iteration-00000000.safetensors").unwrap();
+    let actor = |path: PathBuf| weights(path).into_iter().find(|(name, _)| name == "actor.0.weight").unwrap();
+    let built_in = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/policies/repose.safetensors");
+    assert_eq!(actor(checkpoints.join(begun)), actor(built_in));
 }
 
 #[test]
@@ -267,6 +286,16 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     assert!(
         svg.contains("loss/value") && svg.contains("hours") && svg.contains("width=\"400\"") && !svg.contains("goals")
     );
+    // Of several runs those without rows are left out; alone they are an error.
+    fs::create_dir(folder.path().join("begun")).unwrap();
+    let header = fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap().lines().next().unwrap().to_owned();
+    fs::write(folder.path().join("begun/metrics.csv"), header + "\n").unwrap();
+    let said = stderr(&succeeded(program(folder.path(), &["plot", "begun", "run", "nowhere"])));
+    for part in ["begun: there are no rows yet; it is left out", "warning: cannot read nowhere", "1 runs"] {
+        assert!(said.contains(part), "{part} is not in {said}");
+    }
+    let refused = program(folder.path(), &["plot", "nowhere", "begun"]);
+    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("error: begun"), "{}", stderr(&refused));
     for (more, part) in [
         (["--metric", "loss/vaule"], "has no column loss/vaule"),
         (["--out", "x.pdf"], "must end in .svg or .png"),
