@@ -29,7 +29,7 @@ pub struct Lesson {
     /// Paid on the step on which a goal is reached.
     goal_reward: f64,
     /// Paid on the step on which the cube is dropped.
-    drop_reward: f64,
+    pub drop_reward: f64,
 }
 
 /// What training pays besides the task's own reward.

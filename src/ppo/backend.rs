@@ -95,6 +95,8 @@ pub fn new(config: &PpoConfig, policy: &Policy, arithmetic: Arithmetic) -> Resul
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicBool;
+
     use super::super::Ppo;
     use super::*;
     use crate::config::{Activation, Config, Precision};
@@ -205,6 +207,41 @@ mod tests {
                 |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt();
             let (apart, moved) = (difference(a, b), difference(a, first));
             assert!(apart < 1e-2 * moved, "{name} moved by {moved}, and is {apart} from candle's");
+        }
+    }
+
+    /// How far the weights of actor and critic have moved at most in an update of one gradient step with these settings.
+    fn one_step(set: impl FnOnce(&mut config::PpoConfig)) -> [f64; 2] {
+        let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
+        (ppo.config.epochs, ppo.config.minibatches, ppo.config.desired_kl) = (1, 1, 0.0);
+        set(&mut ppo.config);
+        ppo.learning_rate = ppo.config.learning_rate;
+        let before = parameters(&ppo.policy);
+        ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();
+        let mut moved = [0.0f64; 2];
+        for ((name, before), (_, after)) in before.iter().zip(&parameters(&ppo.policy)) {
+            let most = &mut moved[usize::from(name.starts_with("critic."))];
+            before.iter().zip(after).for_each(|(a, b)| *most = most.max(f64::from((a - b).abs())));
+        }
+        moved
+    }
+
+    #[test]
+    fn actor_and_critic_learn_at_their_own_rates() {
+        // Adam's first step moves a weight by the rate.
+        for (rate, critic, expected) in [(1e-3, 4e-3, 4e-3), (1e-3, 1e-4, 1e-4), (2e-3, 0.0, 2e-3)] {
+            let moved = one_step(|config| (config.learning_rate, config.critic_learning_rate) = (rate, critic));
+            assert_close(moved[0], rate, 1e-2, "actor");
+            assert_close(moved[1], expected, 1e-2, "critic");
+        }
+    }
+
+    #[test]
+    fn gradients_of_a_larger_norm_than_allowed_are_scaled_down_to_it() {
+        // Gradients far below Adam's epsilon of 1e-8 hardly move anything.
+        for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
+            let moved = one_step(|config| (config.learning_rate, config.max_grad_norm) = (1e-3, norm));
+            assert!(moved.iter().all(|&moved| moved <= most && moved >= least), "{norm}: {moved:?}");
         }
     }
 

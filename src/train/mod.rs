@@ -30,7 +30,7 @@ pub enum Outcome {
 }
 
 /// The names under which an iteration is logged, in order.
-const TAGS: [&str; 39] = [
+const TAGS: [&str; 40] = [
     "episode/return",
     "episode/length",
     "episode/goals",
@@ -51,6 +51,7 @@ const TAGS: [&str; 39] = [
     "training/hold",
     "training/goal_angle",
     "training/task_reward",
+    "training/drop_reward",
     "eval/goals",
     "eval/drop_rate",
     "eval/rot_dist",
@@ -347,7 +348,8 @@ impl Session {
         ];
         values.extend(recent.reward.values().map(|sum| sum / recent.steps as f64));
         values.extend(recent.shaping.values().map(|sum| sum / recent.steps as f64));
-        values.extend([lesson.tolerance, f64::from(lesson.hold), lesson.goal_angle, lesson.task_reward]);
+        values.extend([lesson.tolerance, f64::from(lesson.hold), lesson.goal_angle]);
+        values.extend([lesson.task_reward, lesson.drop_reward]);
         values.extend([evaluation.goals, evaluation.drop_rate, evaluation.rot_dist, evaluation.episode_return]);
         values.extend([update.policy_loss, update.value_loss]);
         values.extend([update.entropy, update.kl, update.first_kl, update.clip_fraction, update.std, update.excess]);
