@@ -20,6 +20,8 @@ struct PointMass {
     age: u32,
     /// Where it panics.
     trap: Option<u32>,
+    /// The steps after which its goal is replaced, by the same one.
+    redirects: u32,
 }
 
 impl PointMass {
@@ -65,13 +67,16 @@ impl Env for PointMass {
         self.age += 1;
         assert_ne!(self.trap, Some(self.age), "the trap");
         self.write(observation);
-        let end =
-            if self.distance() > 3.0 { Some(End::Terminated) } else { (self.age >= STEPS).then_some(End::Truncated) };
+        let end = match self.age {
+            _ if self.distance() > 3.0 => Some(End::Terminated),
+            STEPS.. => Some(End::Truncated),
+            age => (age % self.redirects == 0).then_some(End::Redirected),
+        };
         Transition { reward: -self.distance() as f32, end }
     }
 
-    fn redirect(&mut self, _observation: &mut [f32]) {
-        unreachable!("a point mass has one goal");
+    fn redirect(&mut self, observation: &mut [f32]) {
+        self.write(observation);
     }
 
     fn episode(&self) -> f64 {
@@ -84,7 +89,10 @@ fn pool(seed: u64) -> EnvPool<PointMass> {
 }
 
 fn pool_of(envs: usize, seed: u64) -> EnvPool<PointMass> {
-    EnvPool::new(seed, (0..envs).map(|_| PointMass { position: [0.0; 2], age: 0, trap: None }).collect())
+    EnvPool::new(
+        seed,
+        (0..envs).map(|_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS }).collect(),
+    )
 }
 
 fn settings() -> PpoConfig {
@@ -238,17 +246,18 @@ fn a_panic_in_an_environment_is_an_error_with_its_number_on_any_number_of_thread
 }
 
 #[test]
-fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
+fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_termination_does_not() {
     let (mut pool, ppo) = (pool(1), Ppo::new(&settings(), 2, 2, 1).unwrap());
     let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
     pool.reset(rollout.first_observations_mut());
     // One point starts so far out that it is lost at once.
     rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
     pool.envs_mut().next().unwrap().position = [5.0, 5.0];
+    pool.envs_mut().skip(1).step_by(2).for_each(|env| env.redirects = 7);
     collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &NEVER).unwrap();
     let policy = ppo.policy().freeze().unwrap();
     let mut work = policy.workspace(1);
-    let (mut truncated, mut terminated) = (0, 0);
+    let (mut truncated, mut redirected, mut terminated) = (0, 0, 0);
     for (block, i) in rollout.blocks.iter().flat_map(|block| (0..block.samples()).map(move |i| (block, i))) {
         let moved =
             [0, 1].map(|axis| block.observations[2 * i + axis] + 0.2 * block.actions[2 * i + axis].clamp(-1.0, 1.0));
@@ -258,13 +267,16 @@ fn truncation_bootstraps_from_the_final_observation_and_termination_does_not() {
             let mut value = [0.0];
             policy.forward(&moved, [None, Some(&mut value)], &mut work).unwrap();
             expected += 0.9 * value[0];
-            truncated += 1;
+            let next = 2 * (i + block.exploring_scales.len());
+            let goes_on = (0..2).all(|axis| (block.observations[next + axis] - moved[axis]).abs() < 1e-5);
+            *if goes_on { &mut redirected } else { &mut truncated } += 1;
         } else if block.dones[i] {
             terminated += 1;
         }
         assert!((block.rewards[i] - expected).abs() < 1e-5, "sample {i}: {} not {expected}", block.rewards[i]);
     }
-    assert!(truncated > 30 && terminated == 1, "{truncated} truncated, {terminated} terminated");
+    let found = format!("{truncated} truncated, {redirected} redirected, {terminated} terminated");
+    assert!(truncated > 30 && redirected > 30 && terminated == 1, "{found}");
 }
 
 #[test]

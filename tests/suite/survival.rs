@@ -106,6 +106,10 @@ fn twenty_iterations_and_twenty_more_are_forty_bit_for_bit_on_any_threads() {
         expected.2[1..].iter().any(|row| row[goals].parse().is_ok_and(|goals: f64| goals > 1.0)),
         "no goals are reached"
     );
+    let std = expected.2[0].iter().position(|name| name == "policy/std").unwrap();
+    let last: f64 = expected.2[40][std].parse().unwrap();
+    // What was learnt in the last iteration comes after the bound.
+    assert!((0.2..0.41).contains(&last), "the bound on the noise has come to 0.4: {last}");
     for threads in [["1", "8"], ["8", "1"]] {
         let folder = tempfile::tempdir().unwrap();
         let half = (20 * 128).to_string();

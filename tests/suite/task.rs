@@ -4,12 +4,12 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::collect::{Scratch, collect};
-use shadow_repose::env::{End, Env, EnvPool, Hand, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::env::{End, Env, EnvPool, Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
 use shadow_repose::ppo::{Ppo, Progress};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::rng;
 
-use crate::support::{config, started, task};
+use crate::support::{config, env_config, started, task};
 
 const STILL: [f32; 20] = [0.0; 20];
 
@@ -299,4 +299,42 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
         );
     }
     ppo.checkpoint("", Progress::default()).unwrap().to_bytes().expect("all weights are finite");
+}
+
+#[test]
+fn every_scale_of_the_reward_is_a_setting() {
+    let paid = |set: &str| RewardTerms::of_step(&env_config(&[set]), 0.3, 0.1, &[0.5; 20]).values();
+    let default = [1.0 / 0.4, -1.0, -0.0002 * 5.0, 0.0, 0.0];
+    for (set, term, expected) in [
+        ("run.seed=0", 0, default[0]),
+        ("env.rot_reward_scale=3", 0, 3.0 / 0.4),
+        ("env.rot_eps=0.2", 0, 1.0 / 0.5),
+        ("env.dist_reward_scale=-7", 1, -0.7),
+        ("env.action_penalty_scale=-0.1", 2, -0.5),
+        ("env.success_tolerance=0.35", 3, 2.0),
+        ("env.fall_dist=0.05", 4, 0.0),
+    ] {
+        for (i, (found, default)) in paid(set).into_iter().zip(default).enumerate() {
+            let expected = if i == term { expected } else { default };
+            assert!((found - expected).abs() < 1e-12, "{set}: term {i} is {found}, not {expected}");
+        }
+    }
+    let both = env_config(&["env.success_tolerance=0.35", "env.reach_goal_bonus=9", "env.fall_dist=0.05"]);
+    assert_eq!(RewardTerms::of_step(&both, 0.3, 0.1, &[0.0; 20]).bonus, 9.0);
+}
+
+#[test]
+fn where_cube_and_target_are_and_how_an_episode_begins_are_settings() {
+    let sets = ["env.goal_position=[0.3,0.02,0.31]", "env.target_height=0.4", "env.reset_position_noise=0"];
+    let task = task(&[&sets[..], &["env.reset_dof_pos_noise=0", "env.vel_obs_scale=0.5"]].concat());
+    let (mut env, mut observation) = started(&task);
+    assert_close(&observation[48..51], &[0.3, 0.02, 0.31]);
+    assert_close(&observation[61..64], &[0.3, 0.02, 0.31]);
+    let (target, _) = env.simulation().pose(task.scene().body("target").unwrap());
+    assert_close(&target.map(|x| x as f32), &[0.3, 0.02, 0.71]);
+    assert_close(&observation[..24], &[0.0; 24]);
+    let joint = Hand::bind(task.scene()).unwrap().joints[3];
+    env.simulation_mut().qvel_mut()[joint.dof] = 3.0;
+    env.observe(&mut observation);
+    assert_close(&observation[27..28], &[1.5]);
 }

@@ -305,3 +305,10 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let stats = ppo.update(&mut rollout, 1, &never).unwrap().unwrap();
     assert!(stats.first_kl.abs() < 1e-5 && stats.first_ratio_error < 1e-3, "{stats:?}");
 }
+
+#[test]
+fn values_are_clipped_like_ratios_unless_something_else_is_said() {
+    let clip = |sets: &[&str]| config(sets).ppo.value_clip();
+    assert_eq!(clip(&["ppo.clip=0.3", "ppo.value_clip=0"]), 0.3);
+    assert_eq!(clip(&["ppo.clip=0.3", "ppo.value_clip=7"]), 7.0);
+}
