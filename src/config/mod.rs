@@ -432,6 +432,8 @@ mod tests {
             ("nonsense=1", "nonsense: unknown key"),
             ("learning_rate=1", "did you mean ppo.learning_rate?"),
             ("env.act_moving_average=0", "must be above 0"),
+            ("env.num_hand_dofs=23", "must be 24, the task is laid out for it"),
+            ("env.num_actuators=24", "must be 20, the task is laid out for it"),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(part), "{bad}: {part} is not in\n{text}");

@@ -82,15 +82,15 @@ impl Chart {
         let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
         area.fill(&WHITE).map_err(failed)?;
         let last = self.panels.len() - 1;
+        let x = range(self.panels.iter().flat_map(|panel| panel.values(0)));
         for (i, (panel, part)) in self.panels.iter().zip(area.split_evenly((self.panels.len(), 1))).enumerate() {
-            let points = || panel.curves.iter().flat_map(|curve| &curve.points);
-            let [x, y] = [0, 1].map(|axis| range(points().map(move |point| point[axis])));
+            let y = range(panel.values(1));
             let mut chart = ChartBuilder::on(&part)
                 .caption(&panel.name, ("sans-serif", 17))
                 .margin(8)
                 .x_label_area_size(if i == last { 46 } else { 24 })
                 .y_label_area_size(56)
-                .build_cartesian_2d(x, y)
+                .build_cartesian_2d(x.clone(), y)
                 .map_err(failed)?;
             let mut mesh = chart.configure_mesh();
             mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", 13));
@@ -115,8 +115,34 @@ impl Chart {
     }
 }
 
+impl Panel {
+    /// What the points of all curves have along an axis.
+    fn values(&self, axis: usize) -> impl Iterator<Item = f64> {
+        self.curves.iter().flat_map(|curve| &curve.points).map(move |point| point[axis])
+    }
+}
+
 /// From the least to the greatest of the values, and zero; not empty.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
     if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_panels_have_the_same_axis() {
+        let panel = |name: &str, end| Panel {
+            name: name.into(),
+            curves: vec![Curve { name: "run".into(), points: vec![[1.0, 0.5], [end, 0.7]] }],
+        };
+        let chart = Chart { along: "steps".into(), panels: vec![panel("a", 5.0), panel("b", 20.0)], size: [600, 500] };
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("chart.svg");
+        chart.write(&path).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        assert_eq!(svg.lines().filter(|line| line.trim() == "20.0").count(), 2, "{svg}");
+    }
 }
