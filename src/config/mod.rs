@@ -136,6 +136,7 @@ pub struct PpoConfig {
     pub init_std: f64,
     pub max_std: f64,
     pub max_std_steps: u64,
+    pub min_std: f64,
     pub away_std: f64,
     pub away_range: [f64; 2],
     pub exploring_share: f64,
@@ -204,10 +205,11 @@ impl PpoConfig {
         if self.value_clip == 0.0 { self.clip } else { self.value_clip }
     }
 
-    /// The upper bound of the standard deviations of the actions after `env_steps` control steps of the whole run, if there is one.
-    pub fn std_bound(&self, env_steps: u64) -> Option<f64> {
+    /// The bounds of the standard deviations of the actions after `env_steps` control steps of the whole run.
+    pub fn std_bounds(&self, env_steps: u64) -> [f64; 2] {
         let share = share(env_steps, self.max_std_steps);
-        (self.max_std_steps > 0).then(|| self.init_std.powf(1.0 - share) * self.max_std.powf(share))
+        let falling = self.init_std.powf(1.0 - share) * self.max_std.powf(share);
+        [self.min_std, if self.max_std_steps > 0 { falling } else { f64::INFINITY }]
     }
 }
 
@@ -362,7 +364,7 @@ mod tests {
         assert_eq!((config.ppo.symmetry, config.ppo.gamma), (Symmetry::None, 0.5));
         // What was trained then is the task itself.
         assert_eq!(Lesson::at(0, &config.training, &config.env), Lesson::task(&config.env));
-        assert_eq!((config.ppo.bounds_coef, config.ppo.std_bound(0)), (0.0, None));
+        assert_eq!((config.ppo.bounds_coef, config.ppo.std_bounds(0)), (0.0, [0.0, f64::INFINITY]));
         // A user's own file means today's defaults where it is silent.
         let source = Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.5".into() };
         assert_eq!(Config::resolve(Some(&source), &[]).unwrap().ppo.symmetry, Symmetry::Cube);

@@ -116,6 +116,8 @@ impl Config {
         let falls = ppo.max_std_steps == 0 || ppo.max_std <= ppo.init_std;
         let rule = format!("be at most ppo.init_std = {} unless ppo.max_std_steps = 0", ppo.init_std);
         rules.check(falls, "ppo.max_std", ppo.max_std, &rule);
+        let (least, most) = (ppo.min_std, if ppo.max_std_steps > 0 { ppo.max_std } else { ppo.init_std });
+        rules.between("ppo.min_std", least, 0.0, most);
 
         rules.at_least("run.total_steps", run.total_steps as usize, 1);
         rules.at_least("run.checkpoint_every", run.checkpoint_every as usize, 1);

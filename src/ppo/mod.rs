@@ -100,15 +100,12 @@ impl Ppo {
         Rollout::new(self.config.horizon, block_sizes, self.policy.observation_size(), self.policy.action_size())
     }
 
-    /// Keeps the standard deviations of the actions within the bound for a run after so many control steps.
+    /// Keeps the standard deviations of the actions within the bounds for a run after so many control steps.
     ///
     /// # Errors
     /// Only if candle cannot allocate.
     pub fn limit_std(&mut self, env_steps: u64) -> Result<()> {
-        match self.config.std_bound(env_steps) {
-            Some(bound) => self.policy.limit_std(bound),
-            None => Ok(()),
-        }
+        self.policy.limit_std(self.config.std_bounds(env_steps))
     }
 
     /// What acting for blocks of up to `rows` environments needs, to be used again and again.

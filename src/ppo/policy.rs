@@ -150,9 +150,9 @@ impl Policy {
         Ok(self.log_std().as_detached_tensor().exp()?.to_vec1()?)
     }
 
-    /// Lowers each standard deviation that is above `bound` to it.
-    pub(super) fn limit_std(&self, bound: f64) -> Result<()> {
-        let within = self.log_std().as_detached_tensor().minimum(bound.ln())?;
+    /// Moves each standard deviation that is out of the bounds to the nearer one.
+    pub(super) fn limit_std(&self, [least, most]: [f64; 2]) -> Result<()> {
+        let within = self.log_std().as_detached_tensor().maximum(least.ln())?.minimum(most.ln())?;
         Ok(self.log_std().set(&within)?)
     }
 }

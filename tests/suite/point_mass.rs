@@ -161,6 +161,15 @@ fn standard_deviations_stay_within_a_bound_that_falls_by_equal_factors() {
 }
 
 #[test]
+fn standard_deviations_stay_above_a_lower_bound_and_are_raised_to_it() {
+    for (min_std, expected) in [(0.25, 0.5f32), (0.75, 0.75)] {
+        let mut ppo = Ppo::new(&PpoConfig { min_std, max_std_steps: 0, ..settings() }, 2, 2, 0).unwrap();
+        ppo.limit_std(1000).unwrap();
+        assert!(ppo.policy().std().unwrap().iter().all(|std| (std - expected).abs() < 1e-6), "{min_std}");
+    }
+}
+
+#[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     let settings = PpoConfig { exploring_share: 0.5, exploring_scale: 3.0, ..settings() };
     let (mut pool, mut ppo) = (pool(3), Ppo::new(&settings, 2, 2, 3).unwrap());
