@@ -205,7 +205,7 @@ impl PpoConfig {
         if self.value_clip == 0.0 { self.clip } else { self.value_clip }
     }
 
-    /// The bounds of the standard deviations of the actions after `env_steps` control steps of the whole run.
+    /// The least and the largest standard deviation of the actions after `env_steps` control steps of the whole run.
     pub fn std_bounds(&self, env_steps: u64) -> [f64; 2] {
         let share = share(env_steps, self.max_std_steps);
         let falling = self.init_std.powf(1.0 - share) * self.max_std.powf(share);

@@ -3,7 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::collect::{Scratch, collect};
-use shadow_repose::config::{Backend, PpoConfig, Precision};
+use shadow_repose::config::{Backend, Config, PpoConfig, Precision};
 use shadow_repose::env::{End, Env, EnvPool, Transition};
 use shadow_repose::ppo::Ppo;
 use shadow_repose::rng::{self, Rng};
@@ -167,6 +167,9 @@ fn standard_deviations_stay_above_a_lower_bound_and_are_raised_to_it() {
         ppo.limit_std(1000).unwrap();
         assert!(ppo.policy().std().unwrap().iter().all(|std| (std - expected).abs() < 1e-6), "{min_std}");
     }
+    // The default's upper bound falls to 0.08; a lower one above that would contradict it.
+    let refused = Config::resolve(None, &["ppo.min_std=0.5".parse().unwrap()]).unwrap_err();
+    assert!(format!("{refused:#}").contains("ppo.min_std = 0.5: must lie in [0, 0.08]"), "{refused:#}");
 }
 
 #[test]
