@@ -146,7 +146,7 @@ fn ppo_learns_on_tiles_where_there_are_any() {
 
 #[test]
 fn standard_deviations_stay_within_a_bound_that_falls_by_equal_factors() {
-    let settings = PpoConfig { max_std: 0.125, max_std_steps: 100, ..settings() };
+    let settings = PpoConfig { max_std: 0.125, max_std_steps: 100, min_std: 0.0, ..settings() };
     let mut ppo = Ppo::new(&settings, 2, 2, 0).unwrap();
     let mut std_at = |env_steps| {
         ppo.limit_std(env_steps).unwrap();
@@ -167,9 +167,9 @@ fn standard_deviations_stay_above_a_lower_bound_and_are_raised_to_it() {
         ppo.limit_std(1000).unwrap();
         assert!(ppo.policy().std().unwrap().iter().all(|std| (std - expected).abs() < 1e-6), "{min_std}");
     }
-    // The default's upper bound falls to 0.08; a lower one above that would contradict it.
+    // The default's upper bound falls to 0.2; a lower one above that would contradict it.
     let refused = Config::resolve(None, &["ppo.min_std=0.5".parse().unwrap()]).unwrap_err();
-    assert!(format!("{refused:#}").contains("ppo.min_std = 0.5: must lie in [0, 0.08]"), "{refused:#}");
+    assert!(format!("{refused:#}").contains("ppo.min_std = 0.5: must lie in [0, 0.2]"), "{refused:#}");
 }
 
 #[test]

@@ -266,7 +266,8 @@ fn a_goal_that_was_reached_can_be_worth_as_much_as_if_it_stayed() {
 
 #[test]
 fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
-    let sets = ["env.num_envs=64", "ppo.init_std=0.5", "ppo.away_std=1.5", "ppo.minibatches=4", "ppo.hidden=[16]"];
+    let away = ["ppo.init_std=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
+    let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
     let (config, task) = (config(&sets), task(&[]));
     let envs = (0..64).map(|i| {
         let angle = if i % 2 == 0 { 0.1 } else { 3.1 };
