@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Result, anyhow, bail};
 use plotters::coord::Shift;
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 use super::write_whole;
@@ -47,6 +48,15 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(86, 180, 233),
     RGBColor(0, 0, 0),
 ];
+
+/// Pixels between two dashes.
+const GAP: i32 = 3;
+
+/// Colour and length of the dashes (pixels) of one curve after the other: when all colours are used they come again, broken.
+fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
+    let dashes = std::iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
+    dashes.flat_map(|dash| COLOURS.iter().map(move |colour| (colour.stroke_width(2), dash)))
+}
 
 impl Chart {
     /// Writes the picture, in the format that its name asks for.
@@ -98,12 +108,13 @@ impl Chart {
                 mesh.x_desc(&self.along);
             }
             mesh.draw().map_err(failed)?;
-            for (curve, colour) in panel.curves.iter().zip(COLOURS.iter().cycle()) {
-                let line = LineSeries::new(curve.points.iter().map(|&[x, y]| (x, y)), colour.stroke_width(2));
+            for (curve, (colour, dash)) in panel.curves.iter().zip(styles()) {
+                let points = curve.points.iter().map(|&[x, y]| (x, y));
+                let line = DashedLineSeries::new(points, dash, GAP, colour);
                 let drawn = chart.draw_series(line).map_err(failed)?;
                 drawn
                     .label(&curve.name)
-                    .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+                    .legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 24, y)], dash, GAP, colour));
             }
             if i == 0 {
                 let mut legend = chart.configure_series_labels();
@@ -131,6 +142,24 @@ fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_curve_is_drawn_in_a_way_of_its_own() {
+        let curve = |i| Curve { name: format!("run {i}"), points: vec![[0.0, f64::from(i)], [1.0, f64::from(i)]] };
+        let panel = Panel { name: "a".into(), curves: (1..=8).map(curve).collect() };
+        let chart = Chart { along: "steps".into(), panels: vec![panel], size: [600, 500] };
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("chart.svg");
+        chart.write(&path).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        // The first and the eighth have one colour: two solid lines, one of them in the legend, and the eighth's dashes.
+        let lines = |colour: RGBColor| {
+            let stroke = format!("stroke=\"#{:02X}{:02X}{:02X}\"", colour.0, colour.1, colour.2);
+            svg.lines().filter(|line| line.starts_with("<polyline") && line.contains(&stroke)).count()
+        };
+        assert_eq!(lines(COLOURS[1]), 2, "{svg}");
+        assert!(lines(COLOURS[0]) > 20, "{svg}");
+    }
 
     #[test]
     fn all_panels_have_the_same_axis() {
