@@ -381,7 +381,7 @@ mod tests {
         assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
         assert_eq!(going_on.training.goal_lifetime, 300);
         let Lesson { tolerance, hold, .. } = Lesson::at(0, &going_on.training, &going_on.env);
-        assert!((tolerance - 0.07).abs() < 1e-9 && hold == 15, "{tolerance} {hold}");
+        assert!((tolerance - 0.07).abs() < 1e-9 && hold == 50, "{tolerance} {hold}");
     }
 
     #[test]
