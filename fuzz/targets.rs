@@ -2,12 +2,14 @@
 //! abort, or take much memory. The seeds run through the same functions as ordinary tests.
 
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
+use shadow_repose::agent::Agent;
 use shadow_repose::config::{Config, Override, Source};
-use shadow_repose::env::{ACTION_SIZE, EnvPool, EnvState, OBSERVATION_SIZE, Repose, StepBuffers, Task};
+use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::load;
-use shadow_repose::ppo::{Ppo, sealed};
+use shadow_repose::ppo::{Checkpoint, Policy, sealed};
 
 /// Tells whether it accepts what it is given, and whether it does so once the checksum fits, where there is one.
 pub type Target = fn(&[u8]) -> [bool; 2];
@@ -39,27 +41,15 @@ pub fn checkpoint(data: &[u8]) -> [bool; 2] {
     static TASK: OnceLock<Arc<Task>> = OnceLock::new();
     let task = TASK.get_or_init(|| Task::new(&Config::resolve(None, &[]).unwrap().env).unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
-        let (mut checkpoint, mut config) = load::parse(Path::new("x.safetensors"), bytes, &[])?;
+        let mut checkpoint = Checkpoint::parse(bytes)?;
+        let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
         // What a training needs besides grows with these, and is the user's to allow.
-        (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches) = (1, 1, 1);
-        let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0)?;
-        ppo.restore(&mut checkpoint)?;
-        let state = EnvState {
-            numbers: checkpoint.take_doubles("envs.numbers")?,
-            counters: checkpoint.take_counters("envs.counters")?,
-        };
+        (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches) = (1, 3, 1);
+        let mut agent = Agent::of_task(task, &config)?;
+        agent.restore(&mut checkpoint)?;
         checkpoint.take_counters("scene")?;
         checkpoint.finish()?;
-        let mut pool = EnvPool::new(0, vec![Repose::new(task)]);
-        let (mut observation, mut last) = ([0.0; OBSERVATION_SIZE], [0.0; OBSERVATION_SIZE]);
-        pool.restore(&state, vec![&mut observation])?;
-        for _ in 0..3 {
-            let (rewards, ends) = (&mut [0.0], &mut [None]);
-            let (observations, final_observations) = (&mut observation[..], &mut last[..]);
-            let buffers = StepBuffers { rewards, ends, observations, final_observations };
-            pool.blocks_mut()[0].step(&[0.0; ACTION_SIZE], buffers)?;
-        }
-        Ok(())
+        agent.collect(&AtomicBool::new(false)).map(drop)
     };
     [resume(data).is_ok(), sealed(data).is_ok_and(|data| resume(&data).is_ok())]
 }
@@ -67,11 +57,13 @@ pub fn checkpoint(data: &[u8]) -> [bool; 2] {
 /// The bytes of a policy, to play.
 pub fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
-        let (checkpoint, config) = load::parse(Path::new("x.safetensors"), bytes, &[])?;
-        let policy = load::policy(&checkpoint, &config)?;
-        let frozen = policy.freeze()?;
+        let checkpoint = Checkpoint::parse(bytes)?;
+        let config = load::for_playing(&checkpoint, Path::new("x.safetensors"), &[])?;
+        let policy = Policy::load(&config.net, SPACES, &checkpoint)?;
+        let frozen = policy.freeze();
         let (mut action, mut work) = ([0.0; ACTION_SIZE], frozen.workspace(1));
-        frozen.forward(&[0.5; OBSERVATION_SIZE], [Some(&mut action), None], &mut work)
+        frozen.forward(&[0.5; OBSERVATION_SIZE], Some(&mut action), None, &mut work);
+        Ok(())
     };
     [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]
 }

@@ -4,23 +4,23 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, ensure};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 use serde_json::json;
 
+use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part};
-use crate::collect::{Scratch, collect};
 use crate::config::Config;
 use crate::env::{
-    ACTION_SIZE, End, Env, EnvPool, EpisodeStats, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
+    ACTION_SIZE, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
 };
-use crate::perception::perception;
-use crate::ppo::{Ppo, flops_per_sample, matmul_gflops, time_gradient_steps};
+use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng::{self, Rng};
 use crate::run;
 use crate::schedule::in_rounds;
 use crate::sim::{BareSimulation, SimulationState};
+use crate::spaces::Spaces;
 use crate::train::user_file;
 
 /// Measurements of physics and pool, taken in turn.
@@ -32,16 +32,14 @@ const STEPS: usize = 32_768;
 /// Control steps of all environments between two turns of a round: the speed of a machine drifts within a second.
 const TURN: usize = 4;
 
-/// Control steps before the measured ones, so that most cubes have come to lie in the hand; fewer for many environments.
-fn warm_up(envs: usize) -> usize {
-    (2 * STEPS / envs).clamp(4, 64)
-}
-
 /// Gradient steps and matrix products that are measured.
 const REPEATS: usize = 11;
 
 /// Seconds after which no further whole iteration is begun, and the most iterations.
 const END_TO_END: (f64, usize) = (8.0, 4);
+
+/// Nothing stops what is measured.
+static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// Measures and prints.
 ///
@@ -53,7 +51,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     run::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
     let asked = |part: Part| args.only.is_none_or(|only| only == part);
-    let mut figures = serde_json::Map::new();
+    let mut figures = Vec::new();
     let mut lines = format!(
         "{} threads, {} environments, nets {:?}, minibatches of {}\n",
         rayon::current_num_threads(),
@@ -63,26 +61,24 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     );
     if asked(Part::Physics) {
         let (physics, pool, share) = physics_and_pool(&task, &config)?;
-        figures.extend(entries([("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)]));
+        figures.extend([("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)]);
         lines += &format!("physics alone (mj_step)   {physics:>10.0} steps/s\n");
         lines += &format!("environments              {pool:>10.0} steps/s   {:.1} % of the physics\n", 100.0 * share);
     }
     if asked(Part::Learner) {
         let (samples, gflops, matmul) = learner(&task, &config)?;
-        figures.extend(entries([
-            ("learner_samples_per_s", samples),
-            ("learner_gflops", gflops),
-            ("matmul_gflops", matmul),
-        ]));
+        figures.extend([("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)]);
         lines += &format!("learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n");
         lines += &format!("its matrix products alone                      {matmul:.1} GFLOP/s\n");
     }
     if asked(Part::Training) {
         let end_to_end = end_to_end(&task, &config)?;
-        figures.extend(entries([("end_to_end_steps_per_s", end_to_end)]));
+        figures.push(("end_to_end_steps_per_s", end_to_end));
         lines += &format!("end to end                {end_to_end:>10.0} steps/s\n");
     }
     if args.json {
+        let figures = figures.into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
+        let mut figures = serde_json::Map::from_iter(figures);
         figures.insert("threads".into(), json!(rayon::current_num_threads()));
         figures.insert("hidden".into(), json!(config.ppo.hidden));
         figures.insert("num_envs".into(), json!(config.env.num_envs));
@@ -91,10 +87,6 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         run::print(&lines);
     }
     Ok(())
-}
-
-fn entries<const N: usize>(figures: [(&str, f64); N]) -> [(String, serde_json::Value); N] {
-    figures.map(|(name, value)| (name.into(), json!(value)))
 }
 
 /// What an environment did in a turn.
@@ -132,17 +124,11 @@ impl Recorder {
 
 impl Env for Recorder {
     type Episode = EpisodeStats;
+    type Lesson = Lesson;
+    const SPACES: Spaces = Repose::SPACES;
 
-    fn observation_size(&self) -> usize {
-        self.env.observation_size()
-    }
-
-    fn action_size(&self) -> usize {
-        self.env.action_size()
-    }
-
-    fn distance(observation: &[f32]) -> f32 {
-        Repose::distance(observation)
+    fn set_lesson(&mut self, lesson: Lesson) {
+        self.env.set_lesson(lesson);
     }
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
@@ -197,7 +183,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let envs = config.env.num_envs;
     let turns = STEPS.div_ceil(envs * TURN);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let mut draw = || config.ppo.init_std as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
+    let mut draw = || config.ppo.std_bounds(0)[1] as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
@@ -209,7 +195,8 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
         pool.envs_mut().for_each(Recorder::begin);
         play(pool, &mut rows, steps)
     };
-    turn(&mut pool, warm_up(envs));
+    // Before what is measured most cubes should have come to lie in the hand; fewer steps for many environments.
+    turn(&mut pool, (2 * STEPS / envs).clamp(4, 64));
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
         let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
@@ -237,7 +224,7 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
     let blocks: Vec<_> = pool.blocks_mut().iter_mut().zip(rows).collect();
     let start = Instant::now();
     in_rounds(blocks, steps, |(envs, rows), step| {
-        let size = envs.len() * ACTION_SIZE;
+        let size = envs.count() * ACTION_SIZE;
         let buffers = StepBuffers {
             rewards: &mut rows.rewards,
             ends: &mut rows.ends,
@@ -269,45 +256,29 @@ fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], sizes: &[usize
 
 /// Samples per second and GFLOP/s of gradient steps, and GFLOP/s of their matrix products alone.
 fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
-    let (mut ppo, mut pool) = agent(task, config)?;
-    let mut rollout = ppo.rollout(&pool.block_sizes());
-    let mut scratch = Scratch::new(&pool, &ppo);
-    pool.reset(rollout.first_observations_mut());
-    collect(&mut pool, &ppo, &mut rollout, 0, &mut scratch, &AtomicBool::new(false))?;
+    let mut agent = Agent::of_task(task, config)?;
+    agent.collect(&NEVER)?;
+    let Agent { ppo, rollout, .. } = &mut agent;
     let size = rollout.samples() / config.ppo.minibatches;
     let flops = flops_per_sample(ppo.policy());
-    time_gradient_steps(&mut ppo, &mut rollout, 2)?;
-    let samples = size as f64 / median(time_gradient_steps(&mut ppo, &mut rollout, REPEATS)?);
-    let matmul = median(matmul_gflops(&ppo, size, REPEATS));
+    time_gradient_steps(ppo, rollout, 2)?;
+    let samples = size as f64 / median(time_gradient_steps(ppo, rollout, REPEATS)?);
+    let matmul = median(matmul_gflops(ppo, size, REPEATS));
     Ok((samples, 1e-9 * flops * samples, matmul))
 }
 
-/// Env steps per second of whole iterations, the first one aside if there are more.
+/// Env steps per second of whole iterations of a training with these settings, the first one aside if there are more.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
-    let (mut ppo, mut pool) = agent(task, config)?;
-    let mut rollout = ppo.rollout(&pool.block_sizes());
-    let mut scratch = Scratch::new(&pool, &ppo);
-    pool.reset(rollout.first_observations_mut());
+    let mut agent = Agent::of_task(task, config)?;
     let begun = Instant::now();
-    let mut seconds = Vec::new();
-    for iteration in 0..=END_TO_END.1 as u64 {
-        let start = Instant::now();
-        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &AtomicBool::new(false))?;
-        ppo.update(&mut rollout, iteration, &AtomicBool::new(false))?;
-        rollout.carry_over();
-        seconds.push(start.elapsed().as_secs_f64());
+    let mut rates = Vec::new();
+    for _ in 0..=END_TO_END.1 {
+        rates.push(agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s());
         if begun.elapsed().as_secs_f64() > END_TO_END.0 {
             break;
         }
     }
-    let measured = if seconds.len() > 1 { seconds.split_off(1) } else { seconds };
-    Ok(config.steps_per_iteration() as f64 / median(measured))
-}
-
-fn agent(task: &Arc<Task>, config: &Config) -> Result<(Ppo, EnvPool<Repose>)> {
-    let mut pool = EnvPool::new(config.run.seed, (0..config.env.num_envs).map(|_| Repose::new(task)).collect());
-    pool.perceive_with(perception(config.ppo.symmetry));
-    Ok((Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, config.run.seed)?, pool))
+    Ok(median(if rates.len() > 1 { rates.split_off(1) } else { rates }))
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

@@ -17,11 +17,6 @@ fn threads() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(0..=4096)
 }
 
-/// Accepts a number of checkpoints to keep.
-fn kept() -> RangedU64ValueParser<usize> {
-    RangedU64ValueParser::new().range(1..=1_000_000)
-}
-
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any asked orientation, on a CPU.
 #[derive(Debug, Parser)]
 #[command(version, arg_required_else_help = true)]
@@ -86,7 +81,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume")]
     pub init: Option<PathBuf>,
     /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
-    #[arg(long, value_name = "N", value_parser = kept())]
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub keep: Option<usize>,
     /// Save and exit with 0 after this time, as 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]

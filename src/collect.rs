@@ -28,7 +28,7 @@ impl Scratch {
     pub fn new<E: Env>(pool: &EnvPool<E>, ppo: &Ppo) -> Self {
         let block = |envs| BlockScratch {
             ends: vec![None; envs],
-            final_observations: vec![0.0; envs * pool.observation_size()],
+            final_observations: vec![0.0; envs * E::SPACES.observation_size],
             work: ppo.workspace(envs),
         };
         Self { blocks: pool.block_sizes().into_iter().map(block).collect() }
@@ -48,7 +48,7 @@ struct Collecting<'a, E: Env> {
 /// then blocks have come to different steps, and the pool must be restored before it collects again.
 ///
 /// # Errors
-/// A panic in an environment, with its number; otherwise only if candle cannot allocate.
+/// A panic in an environment, with its number.
 pub fn collect<E: Env>(
     pool: &mut EnvPool<E>,
     ppo: &Ppo,
@@ -57,11 +57,10 @@ pub fn collect<E: Env>(
     scratch: &mut Scratch,
     interrupted: &AtomicBool,
 ) -> Result<bool> {
-    let (acting, horizon) = (ppo.acting()?, rollout.horizon());
+    let (acting, horizon) = (ppo.acting(), rollout.horizon());
     let parts = pool.blocks_mut().iter_mut().zip(&mut rollout.blocks).zip(&mut scratch.blocks).enumerate();
     let blocks = parts.map(|(i, ((envs, rollout), scratch))| {
         let noise = ppo.noise(iteration, i);
-        ppo.explore(rollout, iteration, i);
         Collecting { envs, rollout, scratch, noise, result: Ok(()) }
     });
     let collected = in_rounds(blocks, horizon, |block, t| {
@@ -76,15 +75,19 @@ pub fn collect<E: Env>(
 impl<E: Env> Collecting<'_, E> {
     fn step(&mut self, acting: &Acting, t: usize, last: bool) -> Result<()> {
         let BlockScratch { ends, final_observations, work } = &mut *self.scratch;
-        let mut step = self.rollout.step_mut(t);
-        acting.set_noise_scales(&mut step, E::distance);
-        acting.act(&mut step, &mut self.noise, work)?;
-        let buffers =
-            StepBuffers { rewards: step.rewards, ends, observations: step.next_observations, final_observations };
-        self.envs.step(step.actions, buffers)?;
-        step.dones.iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
+        let rollout = &mut *self.rollout;
+        acting.act(rollout, t, &mut self.noise, work);
+        let (row, actions) = (rollout.step(t, 1), rollout.step(t, E::SPACES.action_size));
+        let next = rollout.step(t + 1, E::SPACES.observation_size);
+        let (rewards, observations) = (&mut rollout.rewards[row.clone()], &mut rollout.observations[next]);
+        let buffers = StepBuffers { rewards, ends, observations, final_observations };
+        self.envs.step(&rollout.actions[actions], buffers)?;
+        rollout.dones[row.clone()].iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
         let cut_off = ends.iter().map(|&end| matches!(end, Some(End::Truncated | End::Redirected)));
-        acting.settle(step.rewards, cut_off, final_observations, work)?;
-        if last { acting.finish(self.rollout, work) } else { Ok(()) }
+        acting.settle(&mut rollout.rewards[row], cut_off, final_observations, work);
+        if last {
+            acting.finish(rollout, t + 1, work);
+        }
+        Ok(())
     }
 }

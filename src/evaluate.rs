@@ -12,10 +12,10 @@ use anyhow::{Result, anyhow};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task, panic_message};
-use crate::perception::perception;
+use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
 use crate::ppo::{FrozenPolicy, Workspace};
 use crate::rng::{self, Rng};
+use crate::schedule::panic_message;
 
 /// Episodes that run together.
 const LANES: usize = 64;
@@ -84,7 +84,7 @@ impl Lane {
 /// of one episode in order, those of different episodes interleaved.
 ///
 /// # Errors
-/// The observer's; a panic in an episode, with its number; candle's if it cannot allocate.
+/// The observer's; a panic in an episode, with its number.
 pub fn evaluate(
     task: &Arc<Task>,
     actor: &Actor,
@@ -111,7 +111,7 @@ pub fn evaluate(
             if interrupted.load(Ordering::Relaxed) {
                 return Ok(None);
             }
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut())?;
+            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
             lanes
                 .par_iter_mut()
                 .zip(actions.par_chunks_exact(ACTION_SIZE))
@@ -146,17 +146,9 @@ impl Actor<'_> {
     }
 
     /// Writes the actions of all lanes; a lane that has ended gets one too, which is not used.
-    fn choose(
-        &self,
-        observations: &[f32],
-        lanes: &mut [Lane],
-        actions: &mut [f32],
-        work: Option<&mut Workspace>,
-    ) -> Result<()> {
+    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
-            let mut seen = observations.to_vec();
-            perception(policy.symmetry())(&mut seen);
-            policy.forward(&seen, [Some(actions), None], work)?;
+            policy.forward(observations, Some(actions), None, work);
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
             match self {
@@ -178,7 +170,6 @@ impl Actor<'_> {
                 }
             }
         }
-        Ok(())
     }
 }
 
@@ -187,13 +178,15 @@ pub struct Player {
     lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
+    /// What the policy needs, from its first step on.
+    work: Option<Workspace>,
 }
 
 impl Player {
     /// A player at the start of the first of these episodes; how many they are is up to the caller.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
-        let mut player =
-            Self { lane: Lane::new(task), observation: vec![0.0; OBSERVATION_SIZE], action: vec![0.0; ACTION_SIZE] };
+        let (observation, action) = (vec![0.0; OBSERVATION_SIZE], vec![0.0; ACTION_SIZE]);
+        let mut player = Self { lane: Lane::new(task), observation, action, work: None };
         player.start(episodes, episodes.first);
         player
     }
@@ -203,14 +196,12 @@ impl Player {
         self.lane.start(episodes, episode, &mut self.observation);
     }
 
-    /// Takes one step as `actor` chooses; tells if it was the last of the episode.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn step(&mut self, actor: &Actor) -> Result<Option<End>> {
-        let mut work = actor.policy().map(|policy| policy.workspace(1));
-        actor.choose(&self.observation, std::slice::from_mut(&mut self.lane), &mut self.action, work.as_mut())?;
-        Ok(self.lane.env.step(&self.action, &mut self.observation).end)
+    /// Takes one step as `actor` chooses, whose policy is always the same; tells if it was the last of the episode.
+    pub fn step(&mut self, actor: &Actor) -> Option<End> {
+        self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
+        let lane = std::slice::from_mut(&mut self.lane);
+        actor.choose(&self.observation, lane, &mut self.action, self.work.as_mut());
+        self.lane.env.step(&self.action, &mut self.observation).end
     }
 
     /// Draws another goal.
@@ -233,7 +224,7 @@ impl Player {
 mod tests {
     use super::*;
     use crate::config::{Config, Symmetry};
-    use crate::env::CUBE_ORIENTATION;
+    use crate::env::SPACES;
     use crate::ppo::Ppo;
 
     #[test]
@@ -242,18 +233,18 @@ mod tests {
             let mut config = Config::resolve(None, &[]).unwrap();
             config.ppo.symmetry = symmetry;
             let task = Task::new(&config.env).unwrap();
-            let ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
-            let actor = Actor::Mean(ppo.policy().freeze().unwrap());
+            let ppo = Ppo::new(&config.ppo, SPACES, 0).unwrap();
+            let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal are one: as they are, and turned by half a turn about their own x.
             let mut observations = vec![0.1; 2 * OBSERVATION_SIZE];
             for (row, q) in observations.chunks_exact_mut(OBSERVATION_SIZE).zip([[1.0, 0.0], [0.0, 1.0]]) {
-                for place in [CUBE_ORIENTATION, crate::env::GOAL_ORIENTATION] {
+                for place in SPACES.cube_and_goal.unwrap() {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
                 }
             }
             let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * ACTION_SIZE]);
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut()).unwrap();
+            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
             let (one, other) = actions.split_at(ACTION_SIZE);
             assert_eq!(one == other, alike, "{symmetry:?}");
         }

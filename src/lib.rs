@@ -12,9 +12,9 @@
 //! |---|---|
 //! | [`cli`] | the shape of the command line |
 //! | [`config`] | all settings, their defaults and rules |
-//! | [`train`] | the training, from top to bottom |
-//! | [`mod@collect`] | environments stepping under the policy: the only place where the two meet |
-//! | [`perception`] | what a policy makes of an observation before its nets see it: the symmetry of the cube |
+//! | [`train`] | the training, from top to bottom: collect, learn, evaluate, report, save |
+//! | [`agent`] | what learns: environments, learner, rollout; one iteration of it |
+//! | [`mod@collect`] | environments stepping under the policy |
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
 //! | [`dump`] | what led to a diverged state, as JSON |
 //! | [`load`] | checkpoints and policies from files that nobody vouches for |
@@ -23,15 +23,16 @@
 //! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
 //! | [`plot`] | learning curves of runs |
 //! | [`mod@bench`] | what this machine can do |
-//! | [`mod@env`] | the task, its reward, the lessons that training makes of it, and many of them in blocks |
+//! | [`mod@env`] | the task: observation (one table), reward, what training changes of it; many of them in blocks |
 //! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
 //! | [`sim`] | the fence around MuJoCo |
-//! | [`ppo`] | the fence around candle: policy, kernels and their reference, checkpoint as bytes |
+//! | [`ppo`] | the learner: flat parameters, policy, two ways to a gradient (`kernels`, ours; `candle`), one Adam, checkpoints |
+//! | [`spaces`] | what a learner must know of observations and actions |
 //! | [`run`] | the outside: run folder, logs, terminal, signals |
 //! | [`quat`], [`rng`] | rotations; generators named by (seed, purpose, index) |
 //!
-//! Direction of knowledge: `main → {train, play, view, bench} → {collect, evaluate, window, film} → {env → sim, ppo, run} → {config, rng, quat,
-//! schedule}`. `env` and `ppo` do not know each other, `run` knows neither; a test holds the fences up.
+//! Direction of knowledge: `main → commands (train, play, view, plot, bench) → {agent, evaluate, window, film} → {collect, load} →
+//! {env → sim, ppo, run} → {config, spaces, rng, quat, schedule}`. `env` and `ppo` do not know each other, `run` knows neither; a test holds the fences up.
 //!
 //! # Data path of an iteration
 //! N environments in blocks of n, T steps, O and A numbers in an observation and an action; a block's arrays are time-major
@@ -43,21 +44,23 @@
 //! ```
 //! Then the learner takes all blocks together:
 //! ```text
-//! rollout --ppo.update--> advantages, epochs × minibatches of loss, gradient, Adam; then the normaliser
+//! rollout --ppo.update--> advantages, epochs × minibatches of (loss → flat gradient → norm → Adam); then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
-//! How a minibatch is computed is described in `ppo::fused`; `ppo::reference` is the same in candle's tensors.
+//! Observations are raw everywhere: a policy perceives (its symmetry) and normalises them as it reads them. How a minibatch is
+//! computed is described in `ppo::kernels`; `ppo::candle` is the same in candle's tensors.
 //!
 //! # What survives
-//! At the end of each iteration [`train`] takes everything that the next one depends on into a [`ppo::Checkpoint`]: the learner
-//! by [`ppo::Ppo::checkpoint`], the environments by [`mod@env`]'s `EnvPool::save`. Whatever ends the iteration after it (a
-//! signal, a panic, a loss that is not finite) leaves that one to be written. [`run`] writes it whole or not at all, under its
-//! number, and finds the newest sound one again. [`load`] is the only way in for files.
+//! At the end of each iteration [`train`] takes everything that the next one depends on into a [`ppo::Checkpoint`], by
+//! [`agent::Agent::checkpoint`]: the learner's part and the environments'. Whatever ends the iteration after it (a signal, a panic,
+//! a loss that is not finite) leaves that one to be written. [`run`] writes it whole or not at all, under its number, and finds the
+//! newest sound one again. [`load`] is the only way in for files.
 //!
 //! # Features
 //! Without `viewer` there is no window, without `video` there are no films and pictures: [`window`] and [`film`] are then
 //! replaced by modules of the same shape that say so. Neither changes anything else.
 
+pub mod agent;
 pub mod bench;
 pub mod cli;
 pub mod collect;
@@ -68,7 +71,6 @@ pub mod evaluate;
 #[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
 pub mod film;
 pub mod load;
-pub mod perception;
 pub mod play;
 pub mod plot;
 pub mod ppo;
@@ -78,6 +80,7 @@ pub mod run;
 pub mod scenery;
 pub mod schedule;
 pub mod sim;
+pub mod spaces;
 pub mod trace;
 pub mod train;
 pub mod view;

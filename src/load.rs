@@ -6,11 +6,11 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 
-use crate::config::{Config, Override};
-use crate::env::{ACTION_SIZE, OBSERVATION_SIZE};
-use crate::ppo::{Checkpoint, Policy};
+use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig};
+use crate::env::SPACES;
+use crate::ppo::Checkpoint;
 use crate::run;
 
 /// The key of the one setting that is a path.
@@ -40,15 +40,17 @@ impl Origin {
         if place == Path::new(BUILTIN) { Ok(Self::BuiltIn) } else { run::resolve_checkpoint(place).map(Self::File) }
     }
 
-    /// Reads it, and the configuration in it with `overrides` on top.
+    /// Reads it, and how its policy is to be played, with `overrides` on top.
     ///
     /// # Errors
-    /// Those of [`load`].
-    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
-        match self {
-            Self::BuiltIn => parse(Path::new(BUILTIN), BUILTIN_POLICY, overrides),
-            Self::File(path) => load(path, overrides),
-        }
+    /// Those of [`read`] and [`for_playing`].
+    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, PolicyConfig)> {
+        let (checkpoint, path) = match self {
+            Self::BuiltIn => (Checkpoint::parse(BUILTIN_POLICY)?, Path::new(BUILTIN)),
+            Self::File(path) => (read(path)?, path.as_path()),
+        };
+        let config = for_playing(&checkpoint, path, overrides).with_context(|| cannot_use(path))?;
+        Ok((checkpoint, config))
     }
 }
 
@@ -61,40 +63,52 @@ impl fmt::Display for Origin {
     }
 }
 
-/// Reads a checkpoint or a policy, and the configuration in it with `overrides` on top.
+/// Reads a checkpoint or a policy.
 ///
 /// # Errors
-/// A file that cannot be read, or that [`parse`] refuses.
-pub fn load(path: &Path, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
-    let bytes = run::read_bytes(path)?;
-    parse(path, &bytes, overrides).with_context(|| format!("cannot use {}", path.display()))
+/// A file that cannot be read, or is damaged or none of this program.
+pub fn read(path: &Path) -> Result<Checkpoint> {
+    Checkpoint::parse(&run::read_bytes(path)?).with_context(|| cannot_use(path))
 }
 
-/// The same of the bytes of a file.
+/// The configuration to go on training with, from a checkpoint in the file `path`, with `overrides` on top.
 ///
 /// # Errors
-/// Bytes that are no checkpoint or policy of this program, or whose configuration is invalid, belongs to another policy, or
-/// names a scene that no override names.
-pub fn parse(path: &Path, bytes: &[u8], overrides: &[Override]) -> Result<(Checkpoint, Config)> {
-    let checkpoint = Checkpoint::parse(bytes)?;
+/// A checkpoint of another version, or whose configuration is invalid, belongs to another policy, or names a scene that no override
+/// names.
+pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<Config> {
+    ensure!(
+        !checkpoint.is_of_0_1,
+        "made by 0.1.0: go on with that version, or begin a new run with its policy (--init)"
+    );
     let config = Config::from_text(path, &checkpoint.config, overrides)?;
-    checkpoint.expect_policy(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE)?;
-    let named = overrides.iter().any(|set| set.key == MODEL);
-    match config.env.model_file() {
-        Some(model) if !named => {
-            let set = run::quoted(&format!("{MODEL}={}", model.display()));
-            bail!(
-                "it was made in a scene of its own, and no path in a file is followed: say --set {set} if you want that one"
-            )
-        }
-        _ => Ok((checkpoint, config)),
-    }
+    expect_usable(checkpoint, &config.ppo.net(), &config.env, overrides)?;
+    Ok(config)
 }
 
-/// The policy of a checkpoint that was loaded with this configuration.
+/// How the policy of a checkpoint in the file `path` is to be played, with `overrides` on top.
 ///
 /// # Errors
-/// A checkpoint that holds another policy.
-pub fn policy(checkpoint: &Checkpoint, config: &Config) -> Result<Policy> {
-    Policy::load(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, checkpoint)
+/// Settings of task or net that are invalid, belong to another policy, or name a scene that no override names.
+pub fn for_playing(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<PolicyConfig> {
+    let config = PolicyConfig::from_text(path, &checkpoint.config, overrides)?;
+    expect_usable(checkpoint, &config.net, &config.env, overrides)?;
+    Ok(config)
+}
+
+fn cannot_use(path: &Path) -> String {
+    format!("cannot use {}", path.display())
+}
+
+/// Makes sure that a checkpoint holds this policy, and that a scene comes from who runs the program, not from the file.
+fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
+    checkpoint.expect_policy(net, &SPACES)?;
+    let named = overrides.iter().any(|set| set.key == MODEL);
+    if let Some(model) = env.model_file().filter(|_| !named) {
+        let set = run::quoted(&format!("{MODEL}={}", model.display()));
+        bail!(
+            "it was made in a scene of its own, and no path in a file is followed: say --set {set} if you want that one"
+        );
+    }
+    Ok(())
 }

@@ -9,11 +9,11 @@ use anyhow::{Context, Result, ensure};
 use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs};
-use crate::config::{Config, Override};
-use crate::env::{RewardTerms, Score, Task};
+use crate::config::{Config, EnvConfig, Override};
+use crate::env::{SPACES, Score, Task};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::film::Film;
-use crate::load::{self, Origin};
+use crate::load::Origin;
 use crate::ppo::Policy;
 use crate::run::{self, Requests};
 use crate::scenery::task_to_see;
@@ -33,39 +33,37 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     };
     let config = match &loaded {
         Some(loaded) => loaded.config.clone(),
-        None => Config::resolve(None, of_the_task(&args.set)?)?,
+        None => Config::resolve(None, of_the_task(&args.set)?)?.env,
     };
     run::start_threads(args.threads)?;
     if wants_window(args) && show(args, &config, loaded.as_ref())? {
         return Ok(Outcome::Finished);
     }
     let actor = match (&loaded, args.policy) {
-        (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()?),
-        (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()?),
+        (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()),
+        (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()),
         (None, Some(Baseline::Random)) => Actor::Random,
         (None, _) => Actor::Zero,
     };
     let checkpoint = loaded.as_ref().map(|loaded| loaded.origin.to_string());
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
-    let mut requests = Requests::none();
-    let mut trace = output.as_ref().map(|_| Trace::new(&config.env, checkpoint.as_deref()));
-    let played = match &args.video {
-        Some(path) => {
-            requests = Requests::listen()?;
-            film(path, &config, &actor, args, &requests, trace.as_mut())?
-        }
-        None => {
-            let never = AtomicBool::new(false);
-            score(&Task::new(&config.env)?, &actor, episodes(args, 256), &never, trace.as_mut())?
-        }
+    let mut trace = output.as_ref().map(|_| Trace::new(&config, checkpoint.as_deref()));
+    // Only a film is worth having if it is interrupted.
+    let requests = if args.video.is_some() { Requests::listen()? } else { Requests::none() };
+    let score = |actor: &Actor, trace: Option<&mut Trace>| {
+        score(&Task::new(&config)?, actor, episodes(args, 256), requests.stop(), trace)
     };
-    let Some(score) = played else { return Ok(Outcome::Stopped(requests.exit_code())) };
+    let played = match &args.video {
+        Some(path) => film(path, &config, &actor, args, &requests, trace.as_mut())?,
+        None => score(&actor, trace.as_mut())?,
+    };
+    let Some(played) = played else { return Ok(Outcome::Stopped(requests.exit_code())) };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
     if args.json {
-        run::print(&format!("{}\n", json_score(&score, checkpoint.as_deref(), args.seed)));
+        run::print(&format!("{}\n", json_score(&played, checkpoint.as_deref(), args.seed)));
         return Ok(Outcome::Finished);
     }
     let name = match &actor {
@@ -77,11 +75,9 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     if let Some(checkpoint) = &checkpoint {
         run::print(&format!("checkpoint {checkpoint}\n"));
     }
-    let mut columns = vec![(name, score)];
+    let mut columns = vec![(name, played)];
     if loaded.is_some() && args.video.is_none() {
-        let never = AtomicBool::new(false);
-        let zero = self::score(&Task::new(&config.env)?, &Actor::Zero, episodes(args, 256), &never, None)?;
-        columns.push(("zero actions", zero.context("nothing interrupts these episodes")?));
+        columns.push(("zero actions", score(&Actor::Zero, None)?.context("nothing interrupts these episodes")?));
     }
     run::print(&table(&columns));
     Ok(Outcome::Finished)
@@ -93,12 +89,12 @@ fn wants_window(args: &PlayArgs) -> bool {
 }
 
 /// Plays in a window; false if none can be opened and none was asked for by name.
-fn show(args: &PlayArgs, config: &Config, loaded: Option<&Loaded>) -> Result<bool> {
-    let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
+fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
+    let task = task_to_see(config, &args.shot, [1280, 720], Quality::High)?;
     let (names, actors, first) = match (loaded, args.policy) {
         (Some(loaded), _) => {
             let policy = &loaded.policy;
-            let actors = vec![Actor::Mean(policy.freeze()?), Actor::Stochastic(policy.freeze()?)];
+            let actors = vec![Actor::Mean(policy.freeze()), Actor::Stochastic(policy.freeze())];
             (vec!["deterministic", "stochastic"], actors, usize::from(args.stochastic))
         }
         (None, policy) => {
@@ -120,13 +116,13 @@ fn show(args: &PlayArgs, config: &Config, loaded: Option<&Loaded>) -> Result<boo
 /// Plays the episodes one after the other and films them. Interrupted, it leaves the film of what was played.
 fn film(
     path: &Path,
-    config: &Config,
+    config: &EnvConfig,
     actor: &Actor,
     args: &PlayArgs,
     requests: &Requests,
     mut trace: Option<&mut Trace>,
 ) -> Result<Option<Score>> {
-    let task = task_to_see(&config.env, &args.shot, [640, 480], Quality::Fast)?;
+    let task = task_to_see(config, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
     let mut played = Vec::new();
@@ -154,10 +150,10 @@ fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     Episodes { seed: args.seed, purpose: "score", first: 0, count }
 }
 
-/// A policy, with the configuration that it was trained with and `--set` on top.
+/// A policy, with the task that it was trained for and `--set` on top.
 struct Loaded {
     origin: Origin,
-    config: Config,
+    config: EnvConfig,
     policy: Policy,
 }
 
@@ -173,8 +169,9 @@ impl Loaded {
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
-        let policy = load::policy(&checkpoint, &config).with_context(|| format!("cannot play the policy {origin}"))?;
-        Ok(Self { origin, config, policy })
+        let policy = Policy::load(&config.net, SPACES, &checkpoint)
+            .with_context(|| format!("cannot play the policy {origin}"))?;
+        Ok(Self { origin, config: config.env, policy })
     }
 }
 
@@ -210,8 +207,7 @@ fn score(
 
 /// One object with everything that is known; what has no value is null.
 fn json_score(score: &Score, checkpoint: Option<&str>, seed: u64) -> Value {
-    let terms = RewardTerms::NAMES.iter().zip(score.reward.values());
-    let reward: Map<String, Value> = terms.map(|(name, value)| ((*name).to_owned(), json!(value))).collect();
+    let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
     json!({
         "episodes": score.episodes,
         "env_steps": score.env_steps,
@@ -232,34 +228,37 @@ fn json_score(score: &Score, checkpoint: Option<&str>, seed: u64) -> Value {
 
 /// A row for each figure, a column for each score.
 fn table(columns: &[(&str, Score)]) -> String {
+    let mut text = format!("{:<24}", "");
+    columns.iter().for_each(|(name, _)| text += &format!("{name:>20}"));
+    let columns: Vec<_> = columns.iter().map(|(_, score)| figures(score)).collect();
+    for (row, (label, _)) in columns[0].iter().enumerate() {
+        text += &format!("\n{label:<24}");
+        columns.iter().for_each(|column| text += &format!("{:>20}", column[row].1));
+    }
+    text + "\n"
+}
+
+/// The figures of a score, as they are called in the table.
+fn figures(score: &Score) -> Vec<(String, String)> {
     let number = |value: f64, decimals: usize| match value.is_nan() {
         true => "-".to_owned(),
         false => format!("{value:.decimals$}"),
     };
-    let interval = |[low, high]: [f64; 2]| format!("{} … {}", number(low, 3), number(high, 3));
-    type Figure<'a> = Box<dyn Fn(&Score) -> String + 'a>;
-    let mut rows: Vec<(String, Figure)> = vec![
-        ("episodes".into(), Box::new(|s| s.episodes.to_string())),
-        ("goals per episode".into(), Box::new(|s| number(s.goals, 3))),
-        ("  95 % interval".into(), Box::new(|s| interval(s.goals_ci95))),
-        ("steps in tolerance, %".into(), Box::new(|s| number(100.0 * s.in_tolerance, 2))),
-        ("rotation error, rad".into(), Box::new(|s| number(s.rot_dist, 3))),
-        ("steps per goal".into(), Box::new(|s| number(s.steps_per_goal, 0))),
-        ("drop rate, %".into(), Box::new(|s| number(100.0 * s.drop_rate, 1))),
-        ("episode length, steps".into(), Box::new(|s| number(s.length, 1))),
-        ("return".into(), Box::new(|s| number(s.episode_return, 2))),
+    let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
+    let mut figures = vec![
+        ("episodes".to_owned(), score.episodes.to_string()),
+        ("goals per episode".to_owned(), number(score.goals, 3)),
+        ("  95 % interval".to_owned(), format!("{low} … {high}")),
+        ("steps in tolerance, %".to_owned(), number(100.0 * score.in_tolerance, 2)),
+        ("rotation error, rad".to_owned(), number(score.rot_dist, 3)),
+        ("steps per goal".to_owned(), number(score.steps_per_goal, 0)),
+        ("drop rate, %".to_owned(), number(100.0 * score.drop_rate, 1)),
+        ("episode length, steps".to_owned(), number(score.length, 1)),
+        ("return".to_owned(), number(score.episode_return, 2)),
     ];
-    for (i, term) in RewardTerms::NAMES.iter().enumerate() {
-        rows.push((format!("  {term}"), Box::new(move |s| number(s.reward.values()[i], 2))));
-    }
-    rows.push(("diverged episodes".into(), Box::new(|s| s.diverged.to_string())));
-    let mut text = format!("{:<24}", "");
-    columns.iter().for_each(|(name, _)| text += &format!("{name:>20}"));
-    for (label, figure) in rows {
-        text += &format!("\n{label:<24}");
-        columns.iter().for_each(|(_, score)| text += &format!("{:>20}", figure(score)));
-    }
-    text + "\n"
+    figures.extend(score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2))));
+    figures.push(("diverged episodes".to_owned(), score.diverged.to_string()));
+    figures
 }
 
 #[cfg(test)]

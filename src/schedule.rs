@@ -4,6 +4,7 @@
 //! block that has waited longest, and nobody waits for a block that another thread is at: with fewer blocks left than
 //! threads, the others leave. What a block holds must not depend on the number of threads: then neither does the result.
 
+use std::any::Any;
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
@@ -50,6 +51,12 @@ pub fn in_rounds<B: Send>(
     let mut done = done.into_inner().expect("no panic under this lock");
     done.sort_unstable_by_key(|waiting| waiting.place);
     done.into_iter().map(|waiting| waiting.block).collect()
+}
+
+/// What a panic said.
+pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }
 
 #[cfg(test)]

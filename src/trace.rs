@@ -3,7 +3,7 @@
 use serde_json::{Map, Value, json};
 
 use crate::config::EnvConfig;
-use crate::env::{End, Env, RewardTerms};
+use crate::env::{ACTUATORS, End, Env, FINGERTIPS, JOINTS, OBSERVATION, Part};
 use crate::evaluate::Moment;
 
 /// Episodes are written, whole and in order, until there are this many records.
@@ -32,6 +32,13 @@ impl Trace {
             "friction_scale": config.friction_scale,
             "cube_mass_scale": config.cube_mass_scale,
             "checkpoint": checkpoint,
+            "observation": OBSERVATION.map(|Part { name, start, length, unit }| {
+                json!({ "name": name, "start": start, "length": length, "unit": unit })
+            }),
+            "joint_names": JOINTS.map(|joint| format!("rh_{joint}")),
+            "actuator_names": ACTUATORS.map(|actuator| format!("rh_A_{actuator}")),
+            "fingertip_names": FINGERTIPS,
+            "quaternion_order": "wxyz",
         });
         Self { header, episodes: Vec::new(), last: usize::MAX }
     }
@@ -67,42 +74,36 @@ impl Trace {
 }
 
 fn record(moment: &Moment) -> Value {
-    let env = moment.env;
-    let simulation = env.simulation();
-    let mut record = json!({
-        "episode": moment.episode,
-        "step": env.episode().length,
-        "qpos": simulation.qpos(),
-        "qvel": simulation.qvel(),
-    });
-    let fields = record.as_object_mut().expect("an object was just made");
-    let mut put = |key: &str, value: Value| drop(fields.insert(key.to_owned(), value));
-    match moment.step {
-        None => {
-            put("reset", json!(true));
-            put("goal", json!(env.goal()));
-        }
-        Some((action, end)) => {
-            let details = env.last_step();
-            let terms = RewardTerms::NAMES.iter().zip(details.reward.values());
-            let mut reward: Map<String, Value> =
-                terms.map(|(name, value)| ((*name).to_owned(), json!(value))).collect();
-            reward.insert("total".into(), json!(details.reward.total()));
-            put("ctrl", json!(simulation.ctrl()));
-            put("action", doubles(action));
-            put("goal", json!(details.goal));
-            put("reward", Value::Object(reward));
-            put("rot_dist", json!(details.rot_dist));
-            put("goal_dist", json!(details.goal_dist));
-            put("held", json!(env.held()));
-            put("goals", json!(env.episode().goals));
-            put("terminated", json!(end == Some(End::Terminated)));
-            put("truncated", json!(end == Some(End::Truncated)));
-            put("diverged", json!(details.diverged));
-        }
-    }
-    put("obs", doubles(moment.observation));
-    record
+    let (env, simulation) = (moment.env, moment.env.simulation());
+    let (qpos, qvel, obs) = (simulation.qpos(), simulation.qvel(), doubles(moment.observation));
+    let (episode, step) = (moment.episode, env.episode().length);
+    let Some((action, end)) = moment.step else {
+        let goal = env.goal();
+        return json!({
+            "episode": episode, "step": step, "qpos": qpos, "qvel": qvel, "reset": true, "goal": goal, "obs": obs,
+        });
+    };
+    let details = env.last_step();
+    let mut reward = Map::from_iter(details.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
+    reward.insert("total".into(), json!(details.reward.total()));
+    json!({
+        "episode": episode,
+        "step": step,
+        "qpos": qpos,
+        "qvel": qvel,
+        "ctrl": simulation.ctrl(),
+        "action": doubles(action),
+        "goal": details.goal,
+        "reward": reward,
+        "rot_dist": details.rot_dist,
+        "goal_dist": details.goal_dist,
+        "held": env.held(),
+        "goals": env.episode().goals,
+        "terminated": end == Some(End::Terminated),
+        "truncated": end == Some(End::Truncated),
+        "diverged": details.diverged,
+        "obs": obs,
+    })
 }
 
 /// Floats as the doubles they are, so that a reader gets them back exactly.

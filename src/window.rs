@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use crate::env::{ACTION_SIZE, Env, Repose, RewardTerms, Task};
+use crate::env::{ACTION_SIZE, Env, Repose, Task};
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::sim::{Bar, Controls, Curve, Readout, Viewer};
 
@@ -62,7 +62,7 @@ impl Window {
                 player.new_goal();
             }
             for _ in 0..pace.steps_due(&asked) {
-                let end = player.step(&actors[asked.choice])?;
+                let end = player.step(&actors[asked.choice]);
                 tally.steps += 1;
                 history.add(player.env(), tally.steps as f64 * task.config().ctrl_dt);
                 if end.is_some() {
@@ -166,7 +166,7 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, history: &History) -> Re
         config.reach_goal_bonus,
         config.fall_penalty,
     ];
-    let terms = RewardTerms::NAMES.into_iter().zip(reward.values()).zip(largest).map(|((name, value), largest)| {
+    let terms = reward.named().into_iter().zip(largest).map(|((name, value), largest)| {
         let share = if largest == 0.0 { 0.0 } else { (value / largest) as f32 };
         Bar { name, share, text: format!("{value:+.3}") }
     });

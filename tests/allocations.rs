@@ -3,10 +3,9 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use shadow_repose::collect::{Scratch, collect};
+use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
-use shadow_repose::env::{ACTION_SIZE, EnvPool, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::ppo::Ppo;
+use shadow_repose::env::{OBSERVATION_SIZE, Task};
 
 struct Watching;
 
@@ -33,22 +32,15 @@ static ALLOCATOR: Watching = Watching;
 
 #[test]
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
-    let config = Config::resolve(None, &[]).unwrap();
-    let task = Task::new(&config.env).unwrap();
-    let envs = 256;
-    let mut pool = EnvPool::new(0, (0..envs).map(|_| Repose::new(&task)).collect());
-    let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
-    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(rollout.first_observations_mut());
-    let mut iterate = |iteration| {
+    let config = Config::resolve(None, &["env.num_envs=256".parse().unwrap()]).unwrap();
+    let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
+    let mut iterate = || {
         LARGEST.store(0, Ordering::Relaxed);
-        collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &NEVER).unwrap();
-        ppo.update(&mut rollout, iteration, &NEVER).unwrap().unwrap();
-        rollout.carry_over();
+        agent.iterate(&NEVER).unwrap().expect("nothing stops it");
         LARGEST.load(Ordering::Relaxed)
     };
-    let first = iterate(1);
-    let later = [iterate(2), iterate(3)];
+    let first = iterate();
+    let later = [iterate(), iterate()];
     // gemm packs the largest weight, 157 × 256 floats, into a buffer of its own. An array of all weights or of a block of rows
     // in a net would be larger, one of all samples much larger.
     let packed = 4 * OBSERVATION_SIZE * config.ppo.hidden[0];

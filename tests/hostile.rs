@@ -7,9 +7,10 @@ use std::sync::Mutex;
 
 use rand::RngExt;
 use rand::seq::SliceRandom;
+use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
-use shadow_repose::env::{ACTION_SIZE, EnvPool, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::ppo::{Array, Checkpoint, Ppo, Progress};
+use shadow_repose::env::Task;
+use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::rng::{self, Rng};
 use shadow_repose::run::{Report, Status};
 
@@ -31,13 +32,7 @@ fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
     let task = Task::new(&config.env).unwrap();
-    let mut pool = EnvPool::new(0, (0..1).map(|_| Repose::new(&task)).collect());
-    let ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, ACTION_SIZE, 0).unwrap();
-    pool.reset(ppo.rollout(&pool.block_sizes()).first_observations_mut());
-    let state = pool.save();
-    let mut checkpoint = ppo.checkpoint(&config.to_text(), Progress::default()).unwrap();
-    checkpoint.insert("envs.numbers", Array::F64(vec![1, state.numbers.len()], state.numbers));
-    checkpoint.insert("envs.counters", Array::U64(vec![1, state.counters.len()], state.counters));
+    let mut checkpoint = Agent::of_task(&task, &config).unwrap().checkpoint(&config.to_text(), None);
     checkpoint.insert("scene", Array::U64(vec![1], vec![task.scene().fingerprint().unwrap()]));
     checkpoint
 }

@@ -2,27 +2,24 @@
 
 use toml::{Table, Value};
 
-use super::{BASE, Override};
+use super::ramp::Ramp;
+use super::{BASE, removed};
 
-impl Override {
-    /// The table with this one value; text that is no TOML value, and any text for a string key, is taken as a string.
-    pub(super) fn as_table(&self, base: &Table) -> Table {
-        let parsed = format!("value = {}", self.value).parse::<Table>();
-        let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
-        let wants_text = lookup(base, &self.key).is_some_and(Value::is_str);
-        let mut value = match parsed {
-            Some(value) if !wants_text || value.is_str() => value,
-            _ => Value::String(self.value.clone()),
-        };
-        // Nothing lies deeper than a key in a section: what follows is part of an unknown name.
-        for part in self.key.splitn(3, '.').collect::<Vec<_>>().into_iter().rev() {
-            value = Value::Table(Table::from_iter([(part.to_owned(), value)]));
-        }
-        match value {
-            Value::Table(table) => table,
-            _ => unreachable!("a key has at least one part"),
-        }
+/// The table with this one value; text that is no TOML value, and any text for a string key, is taken as a string.
+pub fn table_of(key: &str, text: &str, base: &Table) -> Table {
+    let parsed = format!("value = {text}").parse::<Table>();
+    let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
+    let wants_text = lookup(base, key).is_some_and(Value::is_str);
+    let mut value = match parsed {
+        Some(value) if !wants_text || value.is_str() => value,
+        _ => Value::String(text.to_owned()),
+    };
+    // Nothing lies deeper than a part of a ramp in a section: what follows is part of an unknown name.
+    let parts: Vec<&str> = key.splitn(3, '.').collect();
+    for part in parts[1..].iter().rev() {
+        value = Table::from_iter([((*part).to_owned(), value)]).into();
     }
+    Table::from_iter([(parts[0].to_owned(), value)])
 }
 
 fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
@@ -44,8 +41,18 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
             return;
         }
         let name = format!("{prefix}{key}");
+        if let Some(problem) = removed::answer(&name, value) {
+            problems.push(problem);
+            continue;
+        }
         match (base.get(key), value) {
             (None, _) => problems.push(unknown(&name)),
+            // A plain number for a ramp is a constant.
+            (Some(expected), Value::Integer(_) | Value::Float(_)) if is_ramp(expected) => {
+                let parts = ["from", "to"].map(|part| (part.to_owned(), value.clone()));
+                let constant = Table::from_iter(parts.into_iter().chain([("steps".to_owned(), Value::Integer(0))]));
+                overlay(merged, &Table::from_iter([(key.clone(), constant.into())]), base, prefix, problems);
+            }
             (Some(Value::Table(expected)), Value::Table(inner)) => {
                 let Some(Value::Table(target)) = merged.get_mut(key) else {
                     unreachable!("the merged tables are those of the base")
@@ -58,6 +65,11 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
             },
         }
     }
+}
+
+/// Whether the base has a ramp here.
+fn is_ramp(base: &Value) -> bool {
+    base.clone().try_into::<Ramp>().is_ok()
 }
 
 /// `value` as the type that the base has, or what that type is called.
@@ -82,6 +94,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::String(_), _) => Err("a string".into()),
         (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Array(_), _) => Err("an array".into()),
+        (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = … }".into()),
         (Value::Table(_), _) => Err("a section with keys".into()),
         _ => Err("of another type".into()),
     }

@@ -5,6 +5,7 @@
 mod episode;
 mod hand;
 mod lesson;
+mod observation;
 mod pool;
 mod repose;
 mod reward;
@@ -13,9 +14,10 @@ mod tail;
 mod task;
 
 pub use episode::{EpisodeStats, Recent, Score};
-pub use hand::{ACTION_SIZE, CUBE_ORIENTATION, GOAL_ORIENTATION, Hand, OBSERVATION_SIZE};
+pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::{Lesson, Shaping};
-pub use pool::{EnvBlock, EnvPool, StepBuffers, panic_message, stepping};
+pub use observation::{OBSERVATION, OBSERVATION_SIZE, Part, SPACES};
+pub use pool::{EnvBlock, EnvPool, StepBuffers, stepping};
 pub use repose::{Diverged, Repose, StepDetails};
 pub use reward::RewardTerms;
 pub use state::{EnvState, SavedEnv};
@@ -25,6 +27,7 @@ pub use task::Task;
 use anyhow::Result;
 
 use crate::rng::Rng;
+use crate::spaces::Spaces;
 
 /// Why what can be earned ends here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,14 +55,14 @@ pub trait Env: Send {
     /// What is known about a finished episode.
     type Episode: Send;
 
-    /// Numbers in an observation.
-    fn observation_size(&self) -> usize;
+    /// What is trained at some moment of a run, if that changes.
+    type Lesson: Copy + Send;
 
-    /// Numbers in an action.
-    fn action_size(&self) -> usize;
+    /// Its observations and actions, as a learner must know them.
+    const SPACES: Spaces;
 
-    /// How far from its goal an observation is, perceived or not, in the unit of `ppo.away_range`.
-    fn distance(observation: &[f32]) -> f32;
+    /// Trains this lesson from now on.
+    fn set_lesson(&mut self, lesson: Self::Lesson);
 
     /// Starts an episode whose randomness is all drawn from `rng`, and writes the first observation.
     fn reset(&mut self, rng: Rng, observation: &mut [f32]);

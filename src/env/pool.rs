@@ -3,7 +3,6 @@
 //! Environment i reads and writes its own row of each array and owns everything else that it needs, and the randomness of an
 //! episode depends on its number alone; so the results do not depend on which thread steps which block when.
 
-use std::any::Any;
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -12,7 +11,8 @@ use rayon::prelude::*;
 
 use super::{End, Env, EnvState, Resumable, Transition};
 use crate::rng;
-use crate::schedule::block_sizes;
+use crate::schedule::{block_sizes, panic_message};
+use crate::spaces::Spaces;
 
 /// N environments that start their next episode by themselves.
 pub struct EnvPool<E: Env> {
@@ -28,7 +28,6 @@ pub struct EnvBlock<E: Env> {
     /// The number of environments in the whole pool: so far apart are the numbers of an environment's episodes.
     stride: u64,
     finished: Vec<E::Episode>,
-    perceive: fn(&mut [f32]),
 }
 
 struct Slot<E: Env> {
@@ -58,39 +57,19 @@ impl<E: Env> EnvPool<E> {
         let block = |size| {
             let slots = slots.by_ref().take(size).collect();
             first += size;
-            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new(), perceive: |_| {} }
+            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new() }
         };
         Self { blocks: sizes.into_iter().map(block).collect() }
     }
 
-    /// From now on turns the rows `[B, O]` of observations that it writes, in place, into those that the policy looks at.
-    pub fn perceive_with(&mut self, perceive: fn(&mut [f32])) {
-        self.blocks.iter_mut().for_each(|block| block.perceive = perceive);
-    }
-
     /// The number of environments.
-    pub fn len(&self) -> usize {
-        self.blocks.iter().map(EnvBlock::len).sum()
-    }
-
-    /// Never true: a pool has at least one environment.
-    pub fn is_empty(&self) -> bool {
-        self.blocks.is_empty()
-    }
-
-    /// Numbers in an observation.
-    pub fn observation_size(&self) -> usize {
-        self.blocks[0].slots[0].env.observation_size()
-    }
-
-    /// Numbers in an action.
-    pub fn action_size(&self) -> usize {
-        self.blocks[0].slots[0].env.action_size()
+    pub fn count(&self) -> usize {
+        self.blocks.iter().map(EnvBlock::count).sum()
     }
 
     /// The number of environments in each block.
     pub fn block_sizes(&self) -> Vec<usize> {
-        self.blocks.iter().map(EnvBlock::len).collect()
+        self.blocks.iter().map(EnvBlock::count).collect()
     }
 
     /// The blocks in order.
@@ -101,7 +80,7 @@ impl<E: Env> EnvPool<E> {
     /// Starts the first episode of every environment, at random ages so that they do not all end together. Writes the
     /// `observations` `[n, O]` of each block.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
-        let size = self.observation_size();
+        let size = E::SPACES.observation_size;
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         (0..).zip(slots).for_each(|(episode, slot)| slot.next_episode = episode);
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
@@ -109,9 +88,13 @@ impl<E: Env> EnvPool<E> {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
                 slot.start(block.seed, block.stride, row);
                 slot.env.skip_ahead(age);
-                (block.perceive)(row);
             }
         });
+    }
+
+    /// Trains this lesson from now on.
+    pub fn set_lesson(&mut self, lesson: E::Lesson) {
+        self.envs_mut().for_each(|env| env.set_lesson(lesson));
     }
 
     /// The episodes that ended since the last call, in the order of blocks, then of steps, then of environments.
@@ -142,9 +125,8 @@ impl<E: Resumable> EnvPool<E> {
     /// # Errors
     /// A state that no such pool can have saved.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let size = self.observation_size();
-        let mut rows = state.rows(self.len())?;
-        let perceive = self.blocks[0].perceive;
+        let size = E::SPACES.observation_size;
+        let mut rows = state.rows(self.count())?;
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         for (i, (slot, row)) in
             slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
@@ -155,7 +137,6 @@ impl<E: Resumable> EnvPool<E> {
                 ensure!(next_episode < 1 << 60, "an episode with the number {next_episode}");
                 slot.next_episode = next_episode;
                 slot.env.restore(&mut state, row)?;
-                perceive(row);
                 state.finish()
             };
             restore().with_context(|| format!("environment {i}"))?;
@@ -167,13 +148,8 @@ impl<E: Resumable> EnvPool<E> {
 
 impl<E: Env> EnvBlock<E> {
     /// The number n of its environments.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.slots.len()
-    }
-
-    /// Never true: a block has at least one environment.
-    pub fn is_empty(&self) -> bool {
-        self.slots.is_empty()
     }
 
     /// Steps every environment with its row of `actions` `[n, A]`, and starts a new episode where one ended, or goes on under another goal.
@@ -181,12 +157,11 @@ impl<E: Env> EnvBlock<E> {
     /// # Errors
     /// A panic in an environment, with its number; the pool cannot be stepped any further.
     pub fn step(&mut self, actions: &[f32], buffers: StepBuffers) -> Result<()> {
-        let env = &self.slots[0].env;
-        let (size, action_size) = (env.observation_size(), env.action_size());
-        assert_eq!(actions.len(), self.len() * action_size, "actions of a block");
-        assert!(buffers.rewards.len() == self.len() && buffers.ends.len() == self.len(), "rows of a block");
+        let Spaces { observation_size: size, action_size, .. } = E::SPACES;
+        assert_eq!(actions.len(), self.count() * action_size, "actions of a block");
+        assert!(buffers.rewards.len() == self.count() && buffers.ends.len() == self.count(), "rows of a block");
         let both = [buffers.observations.len(), buffers.final_observations.len()];
-        assert_eq!(both, [self.len() * size; 2], "observations of a block");
+        assert_eq!(both, [self.count() * size; 2], "observations of a block");
         let rows = buffers.observations.chunks_exact_mut(size).zip(buffers.final_observations.chunks_exact_mut(size));
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
@@ -197,7 +172,6 @@ impl<E: Env> EnvBlock<E> {
                 (*reward, *end) = (transition.reward, transition.end);
                 if let Some(End::Truncated | End::Redirected) = transition.end {
                     final_row.copy_from_slice(row);
-                    (self.perceive)(final_row);
                 }
                 match transition.end {
                     None => {}
@@ -207,7 +181,6 @@ impl<E: Env> EnvBlock<E> {
                         slot.start(self.seed, self.stride, row);
                     }
                 }
-                (self.perceive)(row);
             };
             // What a panic leaves half done is not used again.
             if let Err(panic) = catch_unwind(AssertUnwindSafe(step)) {
@@ -226,12 +199,6 @@ thread_local! {
 /// The number of the environment that this thread is stepping, if it is: for whoever must tell when there is no way to return.
 pub fn stepping() -> Option<usize> {
     STEPPING.get()
-}
-
-/// What a panic said.
-pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }
 
 impl<E: Env> Slot<E> {

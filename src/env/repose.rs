@@ -3,22 +3,22 @@
 //! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter, ends, new
 //! goal, observation with the goal in force next.
 
-use std::f64::consts::PI;
 use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 
-use super::hand::RELATIVE_ROTATION;
+use super::observation::{Cells, SPACES};
 use super::tail::{Recorder, Tail};
 use super::task::Task;
 use super::{
-    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Lesson, OBSERVATION_SIZE, Recent, Resumable, RewardTerms, SavedEnv,
-    Shaping, Transition,
+    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Lesson, Recent, Resumable, RewardTerms, SavedEnv, Shaping,
+    Transition,
 };
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
 use crate::sim::{Physics, Simulation};
+use crate::spaces::Spaces;
 
 /// One hand with its cube.
 pub struct Repose {
@@ -86,11 +86,6 @@ impl Repose {
         }
     }
 
-    /// Trains this lesson from now on, instead of the task itself.
-    pub fn set_lesson(&mut self, lesson: Lesson) {
-        self.lesson = lesson;
-    }
-
     /// What happened in the last step.
     pub fn last_step(&self) -> &StepDetails {
         &self.last
@@ -142,12 +137,7 @@ impl Repose {
     }
 
     fn set_goal(&mut self) {
-        let drawn = self.draw_rotation();
-        self.goal = match self.lesson.goal_angle < PI {
-            // The same distribution of axes, with angles that are smaller in proportion.
-            true => quat::mul(quat::power(drawn, self.lesson.goal_angle / PI), self.cube().1),
-            false => drawn,
-        };
+        self.goal = self.draw_rotation();
         let [x, y, z] = self.task.config.goal_position;
         self.sim.place(self.task.hand.target, [x, y, z + self.task.config.target_height], self.goal);
     }
@@ -210,62 +200,42 @@ impl Repose {
 
     /// Writes the observation `[157]` of the present state, in the order of the task.
     pub fn observe(&self, observation: &mut [f32]) {
-        assert_eq!(observation.len(), OBSERVATION_SIZE, "length of an observation");
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
-        let mut cells = Cells(observation);
-        cells.put(hand.joints.map(|joint| qpos[joint.qpos]));
-        cells.put(hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
+        let mut cells = Cells::new(observation);
+        cells.put("joint_pos", hand.joints.map(|joint| qpos[joint.qpos]));
+        cells.put("joint_vel", hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
         let (position, orientation) = self.cube();
         let [vx, vy, vz, spin @ ..] = qvel[hand.cube.dof..].first_chunk::<6>().expect("a free joint");
-        cells.put(position);
-        cells.put(quat::canonical(orientation));
-        cells.put([*vx, *vy, *vz]);
+        cells.put("cube_pos", position);
+        cells.put("cube_quat", quat::canonical(orientation));
+        cells.put("cube_linvel", [*vx, *vy, *vz]);
         // MuJoCo keeps the angular velocity of a free joint in the body's frame.
-        cells.put(quat::rotate(orientation, *spin).map(|x| config.vel_obs_scale * x));
-        cells.put(config.goal_position);
-        cells.put(quat::canonical(self.goal));
-        cells.put(quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
+        cells.put("cube_angvel", quat::rotate(orientation, *spin).map(|x| config.vel_obs_scale * x));
+        cells.put("goal_pos", config.goal_position);
+        cells.put("goal_quat", quat::canonical(self.goal));
+        cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
 
         for tip in hand.fingertips {
             let (position, orientation) = self.sim.pose(tip);
             let (linear, angular) = self.sim.velocity(tip);
-            cells.put(position);
-            cells.put(orientation);
-            cells.put(linear);
-            cells.put(angular);
+            cells.put("fingertips", position);
+            cells.put("fingertips", orientation);
+            cells.put("fingertips", linear);
+            cells.put("fingertips", angular);
         }
-        cells.0.copy_from_slice(&self.previous_action);
-    }
-}
-
-/// What is still to be written of an observation.
-struct Cells<'a>(&'a mut [f32]);
-
-impl Cells<'_> {
-    /// The one place where the doubles of the physics become the floats of the learner.
-    fn put<const N: usize>(&mut self, values: [f64; N]) {
-        let (cells, rest) = std::mem::take(&mut self.0).split_at_mut(N);
-        cells.iter_mut().zip(values).for_each(|(cell, value)| *cell = value as f32);
-        self.0 = rest;
+        cells.put("previous_action", self.previous_action.map(f64::from));
     }
 }
 
 impl Env for Repose {
     type Episode = EpisodeStats;
+    type Lesson = Lesson;
+    const SPACES: Spaces = SPACES;
 
-    fn observation_size(&self) -> usize {
-        OBSERVATION_SIZE
-    }
-
-    fn action_size(&self) -> usize {
-        ACTION_SIZE
-    }
-
-    /// The rotation error, rad; it stays the same when cube and goal are turned together.
-    fn distance(observation: &[f32]) -> f32 {
-        2.0 * observation[RELATIVE_ROTATION].clamp(0.0, 1.0).acos()
+    fn set_lesson(&mut self, lesson: Lesson) {
+        self.lesson = lesson;
     }
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
@@ -304,7 +274,7 @@ impl Env for Repose {
     }
 
     fn skip_ahead(&mut self, share: f64) {
-        self.age = (share * f64::from(self.lesson.max_episode_steps)) as u32;
+        self.age = (share * f64::from(self.task.config.max_episode_steps())) as u32;
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
@@ -345,19 +315,19 @@ impl Env for Repose {
             self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
             let within = rot_dist <= self.lesson.tolerance;
             reached = self.hold(within);
-            shaping = self.lesson.shaping(rot_dist_before - rot_dist, within, reached, self.episode.dropped);
+            shaping = self.lesson.shaping(rot_dist_before - rot_dist, within, self.episode.dropped);
             self.recent.shaping += shaping;
         }
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
         } else {
-            let time_is_up = self.age >= self.lesson.max_episode_steps;
-            let gives_up = if reached { self.lesson.bootstrap_reached } else { self.gives_up() };
-            time_is_up.then_some(End::Truncated).or(gives_up.then_some(End::Redirected))
+            let time_is_up = self.age >= self.task.config.max_episode_steps();
+            let goal_ends = if reached { self.lesson.goals_end } else { self.gives_up() };
+            time_is_up.then_some(End::Truncated).or(goal_ends.then_some(End::Redirected))
         };
-        // What is bootstrapped as if it stayed is still seen in the last observation under it.
-        if reached && !self.lesson.bootstrap_reached {
+        // A goal that ends is still seen in the last observation under it, which is bootstrapped.
+        if reached && !self.lesson.goals_end {
             self.replace_goal();
         }
         self.observe(observation);
@@ -398,8 +368,7 @@ impl Resumable for Repose {
         self.rng = rng::at(state.counters()?);
         let [age, held] = state.counters()?;
         let config = &self.task.config;
-        let possible =
-            age < u64::from(config.max_episode_steps()) && held < u64::from(config.max_consecutive_successes);
+        let possible = age < u64::from(config.max_episode_steps()) && held <= age;
         ensure!(possible, "an episode at step {age} that has held its goal for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
         self.episode = EpisodeStats::saved(state)?;

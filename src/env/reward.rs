@@ -20,9 +20,6 @@ pub struct RewardTerms {
 }
 
 impl RewardTerms {
-    /// The names under which the terms are logged, in the order of [`RewardTerms::values`].
-    pub const NAMES: [&'static str; 5] = ["rotation", "distance", "action", "bonus", "fall"];
-
     /// The terms of a step that ends with the rotation error `rot_dist` (rad) and the distance `goal_dist` (m), after the
     /// clipped `action`.
     pub fn of_step(config: &EnvConfig, rot_dist: f64, goal_dist: f64, action: &[f32]) -> Self {
@@ -36,9 +33,15 @@ impl RewardTerms {
         }
     }
 
-    /// The terms in the order of [`RewardTerms::NAMES`].
+    /// The terms by name.
+    pub fn named(&self) -> [(&'static str, f64); 5] {
+        let Self { rotation, distance, action, bonus, fall } = *self;
+        [("rotation", rotation), ("distance", distance), ("action", action), ("bonus", bonus), ("fall", fall)]
+    }
+
+    /// The terms alone, in the same order.
     pub fn values(&self) -> [f64; 5] {
-        [self.rotation, self.distance, self.action, self.bonus, self.fall]
+        self.named().map(|(_, value)| value)
     }
 
     /// What is paid.
@@ -47,7 +50,7 @@ impl RewardTerms {
     }
 }
 
-/// In the order of [`RewardTerms::NAMES`].
+/// In the order of [`RewardTerms::named`].
 impl From<[f64; 5]> for RewardTerms {
     fn from([rotation, distance, action, bonus, fall]: [f64; 5]) -> Self {
         Self { rotation, distance, action, bonus, fall }
@@ -56,11 +59,8 @@ impl From<[f64; 5]> for RewardTerms {
 
 impl AddAssign for RewardTerms {
     fn add_assign(&mut self, other: Self) {
-        self.rotation += other.rotation;
-        self.distance += other.distance;
-        self.action += other.action;
-        self.bonus += other.bonus;
-        self.fall += other.fall;
+        let (a, b) = (self.values(), other.values());
+        *self = std::array::from_fn(|i| a[i] + b[i]).into();
     }
 }
 

@@ -4,17 +4,19 @@
 //! Reading is strict: the arrays must be those that the configuration describes, no more and no fewer, of the same shapes.
 
 use anyhow::{Context, Result, bail, ensure};
-use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
-use super::backend::Moments;
 use super::format::{Array, Content};
-use super::policy::parameter_shapes;
+use super::parameters::{Layout, View};
 use super::{Normalizer, Policy, Ppo};
-use crate::config::PpoConfig;
+use crate::config::NetConfig;
+use crate::spaces::Spaces;
 
 /// The text `format` of a file.
-const FORMAT: &str = "shadow-repose checkpoint 2";
+const FORMAT: &str = "shadow-repose checkpoint 3";
+
+/// The same of a file of version 0.1.0, whose policy can be played and begun with, and nothing else.
+const FORMAT_0_1: &str = "shadow-repose checkpoint 2";
 
 /// Ours takes a thousand bytes.
 const LONGEST_CONFIG: usize = 1 << 16;
@@ -41,6 +43,8 @@ pub struct Checkpoint {
     pub config: String,
     /// How far the run had come.
     pub progress: Progress,
+    /// Version 0.1.0 has made it.
+    pub is_of_0_1: bool,
     content: Content,
 }
 
@@ -53,7 +57,8 @@ impl Checkpoint {
         let mut content = Content::parse(bytes)?;
         let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata lack `{key}`"));
         let format = text("format")?;
-        ensure!(format == FORMAT, "its format is `{format}`, this program reads `{FORMAT}`");
+        let is_of_0_1 = format == FORMAT_0_1;
+        ensure!(format == FORMAT || is_of_0_1, "its format is `{format}`, this program reads `{FORMAT}`");
         let config = text("config")?;
         ensure!(
             config.len() <= LONGEST_CONFIG,
@@ -64,7 +69,7 @@ impl Checkpoint {
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata hold an unknown `{key}`");
         }
-        Ok(Self { config, progress, content })
+        Ok(Self { config, progress, is_of_0_1, content })
     }
 
     /// The bytes of a file.
@@ -83,12 +88,11 @@ impl Checkpoint {
 
     /// What playing needs of it.
     pub fn policy_alone(&self) -> Self {
-        let Self { config, progress, content } = self;
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
-        let arrays = content.arrays.iter().filter(|(name, _)| needed(name));
+        let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
-        Self { config: config.clone(), progress: *progress, content: Content { arrays, ..Content::default() } }
+        Self { config: self.config.clone(), content: Content { arrays, ..Content::default() }, ..*self }
     }
 
     /// Adds an array.
@@ -133,23 +137,27 @@ impl Checkpoint {
         Ok(values)
     }
 
-    fn take_tensor(&mut self, name: &str) -> Result<Tensor> {
-        match self.take(name)? {
-            Array::F32(shape, values) => Ok(Tensor::from_vec(values, shape, &Device::Cpu)?),
-            _ => bail!("tensor `{name}` must be of type F32"),
+    /// Takes out the floats that these views name, each with this prefix, as one array in the order of the views.
+    fn take_floats(&mut self, prefix: &str, views: &[View]) -> Result<Vec<f32>> {
+        let mut all = Vec::new();
+        for View { name, shape, .. } in views {
+            let name = format!("{prefix}{name}");
+            self.expect(&name, shape)?;
+            match self.take(&name)? {
+                Array::F32(_, values) => all.extend(values),
+                _ => bail!("tensor `{name}` must be of type F32"),
+            }
         }
+        Ok(all)
     }
 
-    /// Makes sure that it holds the parameters of the policy that `config` describes, before anything is allocated by what
-    /// `config` says.
+    /// Makes sure that it holds the parameters of such a net, before anything is allocated by what `net` says.
     ///
     /// # Errors
     /// A tensor that is missing, or of another shape.
-    pub fn expect_policy(&self, config: &PpoConfig, observation_size: usize, action_size: usize) -> Result<()> {
-        for (name, shape) in parameter_shapes(config, observation_size, action_size) {
-            self.expect(&name, &shape)?;
-        }
-        Ok(())
+    pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
+        layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))
     }
 
     fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
@@ -158,24 +166,21 @@ impl Checkpoint {
         Ok(())
     }
 
-    fn take_policy(&mut self, policy: &mut Policy) -> Result<()> {
-        for (name, var) in policy.parameters() {
-            var.set(&self.take_tensor(name)?)?;
-        }
-        let size = policy.observation_size();
+    fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
+        self.expect_policy(net, &spaces)?;
+        let views = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size).views();
+        let parameters = self.take_floats("", &views)?;
+        let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
-        policy.normalizer = Normalizer {
-            mean: self.take_vector("normalizer.mean", size)?,
-            variance: self.take_vector("normalizer.variance", size)?,
-            count,
-        };
-        let Normalizer { mean, variance, .. } = &policy.normalizer;
+        let [mean, variance] = ["mean", "variance"].map(|of| self.take_vector(&format!("normalizer.{of}"), size));
+        let normalizer = Normalizer { mean: mean?, variance: variance?, count };
+        let Normalizer { mean, variance, .. } = &normalizer;
         let small = |x: f64| x.abs() < 1e18;
         let sound = small(count) && mean.iter().chain(variance).copied().all(small);
         ensure!(sound, "a tensor `normalizer.…` has a value that no observations have");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
-        Ok(())
+        Policy::new(net, spaces, parameters, normalizer)
     }
 
     /// Makes sure that everything was taken out.
@@ -195,16 +200,9 @@ impl Policy {
     ///
     /// # Errors
     /// A tensor that is missing, of another shape or type, or not one of this policy.
-    pub fn load(
-        config: &PpoConfig,
-        observation_size: usize,
-        action_size: usize,
-        checkpoint: &Checkpoint,
-    ) -> Result<Self> {
-        checkpoint.expect_policy(config, observation_size, action_size)?;
-        let mut policy = Self::new(config, observation_size, action_size, 0)?;
+    pub fn load(net: &NetConfig, spaces: Spaces, checkpoint: &Checkpoint) -> Result<Self> {
         let mut alone = checkpoint.policy_alone();
-        alone.take_policy(&mut policy)?;
+        let policy = alone.take_policy(net, spaces)?;
         alone.finish()?;
         Ok(policy)
     }
@@ -212,28 +210,25 @@ impl Policy {
 
 impl Ppo {
     /// The policy and all that is needed to go on learning, with the configuration (TOML) and the progress of the run.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn checkpoint(&self, config: &str, progress: Progress) -> Result<Checkpoint> {
-        let mut checkpoint = Checkpoint { config: config.to_owned(), progress, content: Content::default() };
-        let floats = |tensor: &Tensor| -> Result<Array> {
-            Ok(Array::F32(tensor.dims().to_vec(), tensor.flatten_all()?.to_vec1()?))
-        };
+    pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
+        let (config, content) = (config.to_owned(), Content::default());
+        let mut checkpoint = Checkpoint { config, progress, is_of_0_1: false, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
-        let moments = self.backend.moments(&self.policy)?;
-        for ((name, var), [mean, square]) in self.policy.parameters().iter().zip(&moments.tensors) {
-            checkpoint.insert(name, floats(var.as_tensor())?);
-            checkpoint.insert(&format!("adam.mean.{name}"), floats(mean)?);
-            checkpoint.insert(&format!("adam.square.{name}"), floats(square)?);
+        let adam = &self.adam;
+        let kinds = [("", &self.policy.parameters), ("adam.mean.", &adam.mean), ("adam.square.", &adam.square)];
+        for View { name, shape, range } in self.policy.layout.views() {
+            for (prefix, numbers) in kinds {
+                let array = Array::F32(shape.clone(), numbers[range.clone()].to_vec());
+                checkpoint.insert(&format!("{prefix}{name}"), array);
+            }
         }
-        checkpoint.insert("adam.steps", Array::U64(vec![1], vec![moments.steps]));
+        checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
         checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate]));
         let normalizer = &self.policy.normalizer;
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
         checkpoint.insert("normalizer.count", vector(&[normalizer.count]));
-        Ok(checkpoint)
+        checkpoint
     }
 
     /// Begins with the policy of a checkpoint, or of a policy alone.
@@ -241,8 +236,7 @@ impl Ppo {
     /// # Errors
     /// Another policy than the one of the configuration.
     pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<()> {
-        let sizes = [self.policy.observation_size(), self.policy.action_size()];
-        self.policy = Policy::load(&self.config, sizes[0], sizes[1], checkpoint)?;
+        self.policy = Policy::load(&self.config.net(), self.policy.spaces, checkpoint)?;
         Ok(())
     }
 
@@ -251,29 +245,20 @@ impl Ppo {
     /// # Errors
     /// A policy alone; a tensor that is missing, or of another shape or type, or with values that it cannot have.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
-        let [observation_size, action_size] = [self.policy.observation_size(), self.policy.action_size()];
-        checkpoint.expect_policy(&self.config, observation_size, action_size)?;
-        checkpoint.take_policy(&mut self.policy)?;
-        let mut tensors = Vec::new();
-        for (name, var) in self.policy.parameters() {
-            let mut moment = |kind: &str| -> Result<(String, Tensor)> {
-                let name = format!("adam.{kind}.{name}");
-                checkpoint.expect(&name, var.dims())?;
-                let moment = checkpoint.take_tensor(&name)?;
-                Ok((name, moment))
-            };
-            let (_, mean) = moment("mean")?;
-            let (name, square) = moment("square")?;
-            ensure!(square.flatten_all()?.min(0)?.to_scalar::<f32>()? >= 0.0, "tensor `{name}` has a negative value");
-            tensors.push([mean, square]);
+        self.policy = checkpoint.take_policy(&self.config.net(), self.policy.spaces)?;
+        let views = self.policy.layout.views();
+        self.adam.mean = checkpoint.take_floats("adam.mean.", &views)?;
+        self.adam.square = checkpoint.take_floats("adam.square.", &views)?;
+        for View { name, range, .. } in views {
+            let sound = self.adam.square[range].iter().all(|&x| x >= 0.0);
+            ensure!(sound, "tensor `adam.square.{name}` has a negative value");
         }
         let steps = checkpoint.take_counters("adam.steps")?;
-        // The kernels count them in 32 bits: 10¹³ environment steps of the default training.
+        // The optimizer counts them in 32 bits: 10¹³ environment steps of the default training.
         ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is no number of steps");
-        let learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
-        ensure!(learning_rate > 0.0, "its learning rate is {learning_rate}");
-        self.backend.restore(Moments { tensors, steps: steps[0] })?;
-        self.learning_rate = learning_rate;
+        self.adam.steps = steps[0];
+        self.learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
+        ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
         Ok(())
     }
 }
@@ -281,21 +266,23 @@ impl Ppo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Backend, Config};
+    use crate::config::{Backend, Config, PpoConfig, Symmetry};
     use crate::ppo::Rollout;
+
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
-        (config.backend, config.hidden) = (backend, hidden.to_vec());
+        (config.backend, config.hidden, config.symmetry) = (backend, hidden.to_vec(), Symmetry::None);
         config
     }
 
     fn learner(hidden: &[usize]) -> Ppo {
-        Ppo::new(&config(Backend::Fused, hidden), 3, 2, 0).unwrap()
+        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0).unwrap()
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
-        ppo.checkpoint("[env]", Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) }).unwrap()
+        ppo.checkpoint("[env]", Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) })
     }
 
     fn refusal(mut checkpoint: Checkpoint, into: &mut Ppo) -> String {
@@ -305,14 +292,13 @@ mod tests {
 
     /// A learner that has taken a step of its optimizer.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
-        let mut ppo = Ppo::new(&config(backend, &[8]), 3, 2, seed).unwrap();
-        ppo.policy.normalizer.update(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]);
+        let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed).unwrap();
+        ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]);
         ppo.learning_rate = 0.123;
-        let rollout = Rollout::new(4, &[8], 3, 2);
+        let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
-        ppo.backend.begin(&ppo.policy, &rollout).unwrap();
-        ppo.backend.gradient(&ppo.policy, &rollout, &samples).unwrap();
-        ppo.backend.step(&ppo.policy, [0.01; 2], 1.0).unwrap();
+        ppo.backend.begin(&ppo.policy);
+        ppo.minibatch_step(&rollout, &samples, true).unwrap();
         ppo
     }
 
@@ -329,9 +315,7 @@ mod tests {
                 checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
                 assert_eq!(to.learning_rate, 0.123);
-                assert!(from.backend.moments(&from.policy).unwrap().tensors.iter().flatten().any(|moment| {
-                    moment.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().any(|&x| x != 0.0)
-                }));
+                assert!(to.adam == from.adam && from.adam.mean.iter().any(|&x| x != 0.0));
                 assert_eq!(saved(&to).content, saved(&from).content);
             }
         }
@@ -344,23 +328,20 @@ mod tests {
         let bytes = alone.to_bytes().unwrap();
         assert!(bytes.len() < saved(&from).to_bytes().unwrap().len() * 2 / 3);
         let read = Checkpoint::parse(&bytes).unwrap();
-        let policy = Policy::load(&config(Backend::Fused, &[8]), 3, 2, &read).unwrap();
+        let policy = Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &read).unwrap();
         assert_eq!(policy.normalizer, from.policy.normalizer);
-        for ((_, a), (_, b)) in policy.parameters().iter().zip(from.policy.parameters()) {
-            let numbers = |var: &Tensor| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-            assert_eq!(numbers(a), numbers(b));
-        }
+        assert_eq!(policy.parameters, from.policy.parameters);
         assert!(refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing"));
     }
 
     #[test]
     fn a_learner_begins_with_the_policy_of_another_and_nothing_else_of_it() {
         let from = learnt(Backend::Fused, 1);
-        let mut to = Ppo::new(&config(Backend::Fused, &[8]), 3, 2, 5).unwrap();
+        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5).unwrap();
         to.begin_with(&saved(&from)).unwrap();
         assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
         let fresh = config(Backend::Fused, &[8]).learning_rate;
-        assert_eq!((to.learning_rate, to.backend.moments(&to.policy).unwrap().steps), (fresh, 0));
+        assert_eq!((to.learning_rate, to.adam.steps), (fresh, 0));
         assert!(learner(&[9]).begin_with(&saved(&from)).is_err());
     }
 
@@ -375,7 +356,7 @@ mod tests {
         more.insert("actor.9.weight", Array::F32(vec![1], vec![0.0]));
         let refused = refusal(more.clone(), &mut learner(&[8]));
         assert!(refused.contains("`actor.9.weight` is not one of this policy"), "{refused}");
-        assert!(Policy::load(&config(Backend::Fused, &[8]), 3, 2, &more).is_err());
+        assert!(Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &more).is_err());
         let mut negative = checkpoint;
         negative.insert("adam.square.log_std", Array::F32(vec![2], vec![0.0, -1.0]));
         assert!(refusal(negative, &mut learner(&[8])).contains("`adam.square.log_std` has a negative value"));
@@ -386,7 +367,7 @@ mod tests {
         let checkpoint = saved(&learner(&[8]));
         // Terabytes, if they were.
         let claimed = config(Backend::Fused, &[1 << 20, 1 << 20, 1 << 20]);
-        assert!(Policy::load(&claimed, 3, 2, &checkpoint).is_err());
+        assert!(Policy::load(&claimed.net(), SPACES, &checkpoint).is_err());
     }
 
     #[test]

@@ -49,9 +49,7 @@ impl Content {
         for (name, bytes, array) in &parts {
             views.push((name.to_string(), TensorView::new(array.dtype(), array.shape().to_vec(), bytes)?));
         }
-        let mut texts: HashMap<String, String> = self.texts.clone().into_iter().collect();
-        texts.insert(CHECKSUM.into(), checksum(&texts, &views));
-        Ok(safetensors::serialize(views, Some(texts))?)
+        seal(self.texts.clone().into_iter().collect(), views)
     }
 
     /// Reads the bytes of a file.
@@ -71,6 +69,22 @@ impl Content {
         }
         Ok(Self { texts: texts.into_iter().collect(), arrays })
     }
+}
+
+/// The file with these texts and arrays, and their checksum; its texts in the order of their names: safetensors writes them as they
+/// lie in a hash map, which differs from run to run, and files of equal content should be equal.
+fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
+    texts.insert(CHECKSUM.into(), checksum(&texts, &views));
+    let mut bytes = safetensors::serialize(views, Some(texts))?;
+    let length = u64::from_le_bytes(*bytes.first_chunk().context("a file begins with the length of its header")?);
+    let header = &mut bytes[8..8 + length as usize];
+    let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
+    parsed.values_mut().filter_map(serde_json::Value::as_object_mut).for_each(serde_json::Map::sort_keys);
+    let sorted = serde_json::to_vec(&parsed)?;
+    ensure!(sorted.len() <= header.len(), "its header has become longer");
+    header.fill(b' ');
+    header[..sorted.len()].copy_from_slice(&sorted);
+    Ok(bytes)
 }
 
 /// The texts of a file, and its arrays in the order of their names.
@@ -99,8 +113,7 @@ fn read(bytes: &[u8]) -> Result<Raw<'_>> {
 pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
     let (mut texts, views) = read(bytes)?;
     texts.remove(CHECKSUM);
-    texts.insert(CHECKSUM.into(), checksum(&texts, &views));
-    Ok(safetensors::serialize(views, Some(texts))?)
+    seal(texts, views)
 }
 
 /// The CRC-32 of all names, texts, types, shapes and numbers: it does not depend on how the header is laid out.
@@ -196,6 +209,16 @@ mod tests {
     #[test]
     fn what_is_written_is_what_is_read() {
         assert_eq!(Content::parse(&content().to_bytes().unwrap()).unwrap(), content());
+    }
+
+    #[test]
+    fn files_of_equal_content_are_equal() {
+        let mut many = content();
+        (0..20).for_each(|i| drop(many.texts.insert(format!("text {i}"), "x".into())));
+        // Each time another hash map, in an order of its own.
+        let bytes = many.to_bytes().unwrap();
+        assert!((0..20).all(|_| many.clone().to_bytes().unwrap() == bytes));
+        assert_eq!(Content::parse(&bytes).unwrap(), many);
     }
 
     #[test]

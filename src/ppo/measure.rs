@@ -5,7 +5,7 @@ use std::time::Instant;
 use anyhow::Result;
 use rayon::prelude::*;
 
-use super::fused::{Matrix, Multiplier, ROWS};
+use super::kernels::{Matrix, Multiplier, ROWS};
 use super::{Policy, Ppo, Rollout};
 
 /// Seconds after which, from the third on, no further gradient step is timed.
@@ -18,7 +18,7 @@ const LIMIT: f64 = 5.0;
 /// A loss or gradient that is not finite.
 pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<f64>> {
     ppo.prepare(rollout);
-    ppo.backend.begin(&ppo.policy, rollout)?;
+    ppo.backend.begin(&ppo.policy);
     // Samples from all over the rollout, as a shuffled minibatch has them.
     let (samples, step) = (rollout.samples(), ppo.config.minibatches);
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
@@ -36,8 +36,8 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the gradient of the
 /// inputs is needed, which it is not for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
-    let weights = policy.parameters().iter().filter(|(_, var)| var.rank() == 2);
-    weights.map(|(name, var)| (var.dims()[0], var.dims()[1], !name.contains(".0.")))
+    let nets = [&policy.layout.actor, &policy.layout.critic];
+    nets.into_iter().flat_map(|layers| layers.iter().enumerate().map(|(i, layer)| (layer.outputs, layer.inputs, i > 0)))
 }
 
 /// Floating-point operations of those products for one sample, both nets.

@@ -1,19 +1,23 @@
-//! The fence around candle: a Gaussian policy, and proximal policy optimisation of it.
+//! Proximal policy optimisation of a Gaussian policy.
 //!
-//! Host slices come in and go out. Nothing outside this folder names candle, nothing inside knows an environment or a file.
+//! Host slices come in and go out; all weights lie in one of them (see `parameters`). Nothing here knows an environment or a file.
 //! In comments: T steps of N environments (the rollout), B = T × N samples, M samples in a minibatch, O and A numbers in an
 //! observation and an action.
 
 mod acting;
+mod adam;
+mod agreement;
 mod backend;
+mod candle;
 mod checkpoint;
 mod format;
-mod fused;
 mod gae;
+mod kernels;
 mod measure;
 mod normalizer;
+mod parameters;
+mod perception;
 mod policy;
-mod reference;
 mod rollout;
 
 use std::f64::consts::{E, TAU};
@@ -21,23 +25,27 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail, ensure};
 use rand::seq::SliceRandom;
-use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 pub use acting::Acting;
 pub use checkpoint::{Checkpoint, Progress};
 pub use format::{Array, sealed};
-pub use fused::Workspace;
 pub use gae::gae;
+pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
+pub use parameters::{Layer, Layout, View};
+pub use perception::Perception;
 pub use policy::{FrozenPolicy, Policy};
-pub use rollout::{Rollout, RolloutBlock, RolloutStep};
+pub use rollout::{Rollout, RolloutBlock};
 
-use crate::config::PpoConfig;
+use crate::config::{self, PpoConfig};
 use crate::rng::{self, Rng};
+use crate::spaces::Spaces;
+use adam::{Adam, norm};
 use backend::{Backend, Losses};
-use fused::Arithmetic;
+use candle::Reference;
+use kernels::{Arithmetic, Kernels};
 
 /// The policy and what improves it.
 pub struct Ppo {
@@ -46,6 +54,9 @@ pub struct Ppo {
     policy: Policy,
     backend: Box<dyn Backend>,
     arithmetic: Arithmetic,
+    /// Of all parameters, of the last minibatch.
+    gradient: Vec<f32>,
+    adam: Adam,
     learning_rate: f64,
 }
 
@@ -79,15 +90,21 @@ pub struct UpdateStats {
 }
 
 impl Ppo {
-    /// A new learner for observations and actions of these sizes; all its randomness follows from `seed`.
+    /// A new learner for environments with these spaces; all its randomness follows from `seed`.
     ///
     /// # Errors
-    /// A precision that this machine does not have.
-    pub fn new(config: &PpoConfig, observation_size: usize, action_size: usize, seed: u64) -> Result<Self> {
-        let policy = Policy::new(config, observation_size, action_size, seed)?;
+    /// A precision that this machine does not have, or a symmetry that the observations do not have.
+    pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64) -> Result<Self> {
+        let [_, std] = config.std_bounds(0);
+        let policy = Policy::random(&config.net(), spaces, std, seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
-        let backend = backend::new(config, &policy, arithmetic)?;
-        Ok(Self { config: config.clone(), seed, policy, backend, arithmetic, learning_rate: config.learning_rate })
+        let backend: Box<dyn Backend> = match config.backend {
+            config::Backend::Fused => Box::new(Kernels::new(config, &policy, arithmetic)),
+            config::Backend::Candle => Box::new(Reference::new(config)),
+        };
+        let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
+        let learning_rate = config.learning_rate;
+        Ok(Self { config: config.clone(), seed, policy, backend, arithmetic, gradient, adam, learning_rate })
     }
 
     /// The policy as it is now.
@@ -97,15 +114,14 @@ impl Ppo {
 
     /// A rollout of the configured horizon for blocks of so many environments.
     pub fn rollout(&self, block_sizes: &[usize]) -> Rollout {
-        Rollout::new(self.config.horizon, block_sizes, self.policy.observation_size(), self.policy.action_size())
+        Rollout::new(self.config.horizon, block_sizes, &self.policy.spaces)
     }
 
     /// Keeps the standard deviations of the actions within the bounds for a run after so many control steps.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn limit_std(&mut self, env_steps: u64) -> Result<()> {
-        self.policy.limit_std(self.config.std_bounds(env_steps))
+    pub fn limit_std(&mut self, env_steps: u64) {
+        let [least, most] = self.config.std_bounds(env_steps).map(|std| std.ln() as f32);
+        let log_std = &mut self.policy.parameters[self.policy.layout.log_std.clone()];
+        log_std.iter_mut().for_each(|x| *x = x.max(least).min(most));
     }
 
     /// What acting for blocks of up to `rows` environments needs, to be used again and again.
@@ -114,42 +130,19 @@ impl Ppo {
     }
 
     /// The policy of this iteration, to collect a rollout with.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn acting(&self) -> Result<Acting<'_>> {
-        let policy = self.policy.freeze()?;
+    pub fn acting(&self) -> Acting<'_> {
+        let policy = self.policy.freeze();
         let std = policy.std();
         // The geometric mean. In proportion to it all standard deviations grow: to those of the policy the losses take the factor for
         // a constant, though it follows them.
         let typical = (std.iter().map(|s| s.ln()).sum::<f32>() / std.len() as f32).exp();
         let away_scale = (self.config.away_std as f32 / typical).max(1.0);
-        let away_range = self.config.away_range.map(|x| x as f32);
-        let (gamma, reward_scale) = (self.config.gamma as f32, self.config.reward_scale as f32);
-        Ok(Acting { policy, away_scale, away_range, gamma, reward_scale })
+        Acting { policy, config: &self.config, away_scale }
     }
 
     /// The generator of the action noise of a block of environments in an iteration.
     pub fn noise(&self, iteration: u64, block: usize) -> Rng {
         rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
-    }
-
-    /// Draws which environments of a block explore in an iteration, and the one noise that each of them keeps through it: what
-    /// changes from step to step is smoothed away by the hand, what stays moves it to another place. To the losses it is noise like
-    /// any other, of a larger standard deviation: an approximation, since what stays can be seen in the states that follow.
-    ///
-    /// On noise correlated in time: J. Hollenstein et al., "Colored noise in PPO: improved exploration and performance through
-    /// correlated action sampling" (2024).
-    pub fn explore(&self, block: &mut RolloutBlock, iteration: u64, index: usize) {
-        let mut rng = rng::stream(self.seed, "exploring", iteration << 32 | index as u64);
-        let noises = block.steady_noise.chunks_exact_mut(self.policy.action_size());
-        for (scale, noise) in block.exploring_scales.iter_mut().zip(noises) {
-            let explores = rng::uniform(&mut rng, 0.0, 1.0) < self.config.exploring_share;
-            *scale = if explores { self.config.exploring_scale as f32 } else { 1.0 };
-            if explores {
-                noise.fill_with(|| StandardNormal.sample(&mut rng));
-            }
-        }
     }
 
     /// Learns from a rollout that this policy has collected, then takes its observations into the normaliser, which stays
@@ -165,35 +158,45 @@ impl Ppo {
 
     fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         let explained_variance = self.prepare(rollout);
-        self.backend.begin(&self.policy, rollout)?;
+        self.backend.begin(&self.policy);
         let size = rollout.samples() / self.config.minibatches;
         let mut shuffle = rng::stream(self.seed, "shuffle", iteration);
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
-        let mut stats = UpdateStats::default();
+        let mut steps = Vec::new();
         for epoch in 0..self.config.epochs {
             order.shuffle(&mut shuffle);
             for (part, samples) in order.chunks_exact(size).enumerate() {
                 if stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
-                let first = (epoch, part) == (0, 0);
-                let losses = self
-                    .minibatch_step(rollout, samples, first)
-                    .with_context(|| format!("epoch {epoch}, minibatch {part}"))?;
-                if first {
-                    (stats.first_kl, stats.first_ratio_error) = (losses.kl, losses.ratio_error);
-                }
-                stats.add(&losses);
+                let step = self.minibatch_step(rollout, samples, steps.is_empty());
+                steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
             }
         }
         self.check_weights()?;
-        stats.average((self.config.epochs * self.config.minibatches) as f64);
-        let std = self.policy.std()?;
-        stats.std = std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64;
-        (stats.explained_variance, stats.learning_rate) = (explained_variance, self.learning_rate);
         let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
-        self.policy.normalizer.update(&seen);
-        Ok(Some(stats))
+        self.policy.see(&seen);
+        Ok(Some(self.stats(&steps, explained_variance)))
+    }
+
+    /// The figures of an update of these steps.
+    fn stats(&self, steps: &[Step], explained_variance: f64) -> UpdateStats {
+        let mean = |of: fn(&Step) -> f64| steps.iter().map(of).sum::<f64>() / steps.len() as f64;
+        let std = self.policy.std();
+        UpdateStats {
+            policy_loss: mean(|step| step.losses.policy),
+            value_loss: mean(|step| step.losses.value),
+            excess: mean(|step| step.losses.excess),
+            entropy: mean(|step| step.entropy),
+            kl: mean(|step| step.losses.kl),
+            first_kl: steps[0].losses.kl,
+            first_ratio_error: steps[0].losses.ratio_error,
+            clip_fraction: mean(|step| step.losses.clip_fraction),
+            grad_norm: mean(|step| step.grad_norm),
+            std: std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64,
+            explained_variance,
+            learning_rate: self.learning_rate,
+        }
     }
 
     /// Sets the returns and the advantages, which get mean 0 and standard deviation 1; returns the explained variance.
@@ -213,35 +216,29 @@ impl Ppo {
     }
 
     /// One gradient step on these samples. The `first` of an update still sees the policy that acted.
-    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Losses> {
-        let losses = self.backend.gradient(&self.policy, rollout, samples)?;
-        let Losses { total, grad_norm, .. } = losses;
-        if !total.is_finite() {
-            bail!("the loss is {total}: the training has failed and stops here");
-        }
-        if !grad_norm.is_finite() {
-            bail!("the norm of the gradient is {grad_norm}: the training has failed and stops here");
+    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Step> {
+        let losses = self.backend.gradient(&self.policy, rollout, samples, &mut self.gradient)?;
+        let grad_norm = norm(&self.gradient, &self.policy.layout.groups());
+        for (what, value) in [("the loss", losses.total), ("the norm of the gradient", grad_norm)] {
+            if !value.is_finite() {
+                bail!("{what} is {value}: the training has failed and stops here");
+            }
         }
         if !first {
             self.adapt_learning_rate(losses.kl);
         }
+        // Of the Gaussian with the policy's own standard deviations.
+        let entropy = self.policy.log_std().iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum();
         // As in PyTorch's clip_grad_norm_, with its constant against a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
-        let critic = match self.config.critic_learning_rate {
-            0.0 => self.learning_rate,
-            own => own,
-        };
-        self.backend.step(&self.policy, [self.learning_rate, critic], scale)?;
-        Ok(losses)
+        self.adam.step(&mut self.policy.parameters, &self.gradient, self.learning_rate, scale);
+        Ok(Step { losses, grad_norm, entropy })
     }
 
     fn check_weights(&self) -> Result<()> {
-        for (name, var) in self.policy.parameters() {
-            // A sum with a number that is not finite is not finite.
-            ensure!(
-                var.sum_all()?.to_scalar::<f32>()?.is_finite(),
-                "the step has made `{name}` infinite or NaN: the training has failed and stops here"
-            );
+        for View { name, range, .. } in self.policy.layout.views() {
+            let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
+            ensure!(finite, "the step has made `{name}` infinite or NaN: the training has failed and stops here");
         }
         Ok(())
     }
@@ -261,30 +258,11 @@ impl Ppo {
     }
 }
 
-impl UpdateStats {
-    fn add(&mut self, losses: &Losses) {
-        self.policy_loss += losses.policy;
-        self.value_loss += losses.value;
-        self.excess += losses.excess;
-        self.entropy += losses.entropy;
-        self.kl += losses.kl;
-        self.clip_fraction += losses.clip_fraction;
-        self.grad_norm += losses.grad_norm;
-    }
-
-    fn average(&mut self, count: f64) {
-        for sum in [
-            &mut self.policy_loss,
-            &mut self.value_loss,
-            &mut self.excess,
-            &mut self.entropy,
-            &mut self.kl,
-            &mut self.clip_fraction,
-            &mut self.grad_norm,
-        ] {
-            *sum /= count;
-        }
-    }
+/// What is known of one gradient step.
+struct Step {
+    losses: Losses,
+    grad_norm: f64,
+    entropy: f64,
 }
 
 fn mean_and_variance<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> (f64, f64) {
@@ -293,20 +271,17 @@ fn mean_and_variance<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> (f64,
     (mean, values.map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / count)
 }
 
-/// The entropy, nats, of a Gaussian with these logarithms of its standard deviations.
-fn entropy(log_std: &[f32]) -> f64 {
-    log_std.iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::Config;
 
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
+
     fn learner(desired_kl: f64) -> Ppo {
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        let mut config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
         (config.desired_kl, config.learning_rate, config.learning_rate_range) = (desired_kl, 1e-3, [5e-4, 2e-3]);
-        Ppo::new(&config, 3, 2, 0).unwrap()
+        Ppo::new(&config, SPACES, 0).unwrap()
     }
 
     #[test]

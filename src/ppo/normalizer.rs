@@ -1,6 +1,5 @@
 //! Running mean and variance of the observations, saved with the policy that has learnt on them.
 
-use pulp::Arch;
 use rayon::prelude::*;
 
 /// Added to the variance, so that a constant input does not divide by zero.
@@ -37,15 +36,15 @@ impl Normalizer {
         }
     }
 
-    /// Takes the rows of these arrays `[B, O]` into the statistics.
+    /// Takes the rows of these raw arrays `[B, O]` into the statistics, each as `perceive` leaves it.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances"
     /// (1979), eq. 2.1.
-    pub fn update(&mut self, raw: &[&[f32]]) {
+    pub fn update(&mut self, raw: &[&[f32]], perceive: impl Fn(&mut [f32]) + Sync) {
         let size = self.mean.len();
         let rows = raw.iter().map(|part| part.len() / size).sum::<usize>() as f64;
-        let mean = column_means(raw, size, |x, _| x);
-        let variance = column_means(raw, size, |x, column| (x - mean[column]).powi(2));
+        let mean = column_means(raw, size, &perceive, |x, _| x);
+        let variance = column_means(raw, size, &perceive, |x, column| (x - mean[column]).powi(2));
         let total = self.count + rows;
         for i in 0..size {
             let delta = mean[i] - self.mean[i];
@@ -57,15 +56,22 @@ impl Normalizer {
     }
 }
 
-/// The mean of `f(value, column)` over the rows, for each column.
-fn column_means(raw: &[&[f32]], size: usize, f: impl Fn(f64, usize) -> f64 + Sync) -> Vec<f64> {
+/// The mean of `f(value, column)` over the perceived rows, for each column.
+fn column_means(
+    raw: &[&[f32]],
+    size: usize,
+    perceive: impl Fn(&mut [f32]) + Sync,
+    f: impl Fn(f64, usize) -> f64 + Sync,
+) -> Vec<f64> {
     let tasks: Vec<&[f32]> = raw.iter().flat_map(|part| part.chunks(ROWS_PER_TASK * size)).collect();
     let partial: Vec<Vec<f64>> = tasks
         .into_par_iter()
         .map(|rows| {
-            let mut sums = vec![0.0; size];
+            let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
             for row in rows.chunks_exact(size) {
-                for (column, (sum, &x)) in sums.iter_mut().zip(row).enumerate() {
+                seen.copy_from_slice(row);
+                perceive(&mut seen);
+                for (column, (sum, &x)) in sums.iter_mut().zip(&seen).enumerate() {
                     *sum += f(f64::from(x), column);
                 }
             }
@@ -91,19 +97,12 @@ impl Scaling {
         self.mean.len()
     }
 
-    /// Writes the normalised rows of `raw` `[B, O]` into `out` `[B, O]`.
-    pub fn apply(&self, raw: &[f32], out: &mut [f32]) {
-        assert_eq!(raw.len(), out.len());
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for (raw, out) in raw.chunks_exact(self.size()).zip(out.chunks_exact_mut(self.size())) {
-                    for (((out, raw), mean), factor) in out.iter_mut().zip(raw).zip(&self.mean).zip(&self.factor) {
-                        *out = ((raw - mean) * factor).clamp(-CLIP, CLIP);
-                    }
-                }
-            },
-        );
+    /// Normalises one observation `[O]` in place.
+    #[inline(always)]
+    pub fn apply(&self, row: &mut [f32]) {
+        for ((x, mean), factor) in row.iter_mut().zip(&self.mean).zip(&self.factor) {
+            *x = ((*x - mean) * factor).clamp(-CLIP, CLIP);
+        }
     }
 }
 
@@ -121,7 +120,7 @@ mod tests {
             .collect();
         let mut normalizer = Normalizer::new(2);
         for batch in [&[&rows[..14]][..], &[&rows[14..3000], &rows[3000..3004]], &[&rows[3004..]]] {
-            normalizer.update(batch);
+            normalizer.update(batch, |_| {});
         }
         for column in 0..2 {
             let values: Vec<f64> = rows.iter().skip(column).step_by(2).map(|&x| f64::from(x)).collect();
@@ -136,9 +135,12 @@ mod tests {
     #[test]
     fn normalised_values_are_in_standard_deviations_and_clipped() {
         let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
-        let mut out = [0.0; 3];
-        normalizer.scaling().apply(&[4.0, 2.0, 400.0], &mut out);
-        assert!((out[0] - 1.0).abs() < 1e-5, "{out:?}");
-        assert_eq!(out[1..], [0.0, CLIP]);
+        let normalised = [4.0, 2.0, 400.0].map(|x| {
+            let mut row = [x];
+            normalizer.scaling().apply(&mut row);
+            row[0]
+        });
+        assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
+        assert_eq!(normalised[1..], [0.0, CLIP]);
     }
 }

@@ -1,179 +1,114 @@
-//! What acts: two MLPs, actor and critic, a standard deviation that does not depend on the state, and the normaliser.
+//! What acts: two MLPs, actor and critic, a standard deviation that does not depend on the state, and how observations are read.
 
 use anyhow::Result;
-use candle_core::{Device, Tensor, Var};
 use rand::RngExt;
 
 use super::Normalizer;
-use super::fused::{Arithmetic, Net, Workspace};
-use super::normalizer::Scaling;
-use super::reference::Mlp;
-use crate::config::{Activation, Backend, PpoConfig, Symmetry};
+use super::kernels::{Arithmetic, Net, Workspace};
+use super::parameters::{Layer, Layout};
+use super::perception::{Perception, Reader};
+use crate::config::{Activation, NetConfig};
 use crate::rng::{self, Rng};
+use crate::spaces::Spaces;
 
 /// The last layer of the actor starts this much smaller, so that the first actions are near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
 
-/// A Gaussian policy with diagonal covariance, and the value of states under it.
+/// A Gaussian policy with diagonal covariance, and the value of states under it. It reads raw observations.
 pub struct Policy {
-    parameters: Vec<(String, Var)>,
-    /// Reads observations as the environments' pool gives them.
+    /// Where which of the parameters lies.
+    pub layout: Layout,
+    /// All weights, biases and logarithms of standard deviations.
+    pub parameters: Vec<f32>,
+    /// Statistics of the observations, as they are perceived.
     pub normalizer: Normalizer,
-    hidden: Vec<usize>,
-    activation: Activation,
-    backend: Backend,
-    symmetry: Symmetry,
-    sizes: [usize; 2],
+    /// The function after each hidden layer.
+    pub activation: Activation,
+    /// What it knows of observations and actions.
+    pub spaces: Spaces,
+    perception: Perception,
 }
 
-/// A policy to act with, as it is at one moment: no graph, and no array allocated with our own kernels. While it lives,
-/// the parameters cannot be written to.
+/// A policy to act with, as it is at one moment. While it lives, the parameters cannot be written to.
 pub struct FrozenPolicy<'a> {
     policy: &'a Policy,
-    nets: Nets<'a>,
-    scaling: Scaling,
+    actor: Net<'a>,
+    critic: Net<'a>,
+    reader: Reader,
     /// `[A]`
     std: Vec<f32>,
 }
 
-/// Actor and critic.
-enum Nets<'a> {
-    Fused([Net<'a>; 2]),
-    Candle([Mlp; 2]),
-}
-
 impl Policy {
-    /// A new policy for observations and actions of these sizes, its weights drawn from `seed`.
+    /// A policy with these parameters for environments with these spaces.
+    ///
+    /// # Errors
+    /// A symmetry that the observations do not have.
+    pub fn new(net: &NetConfig, spaces: Spaces, parameters: Vec<f32>, normalizer: Normalizer) -> Result<Self> {
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
+        assert_eq!(parameters.len(), layout.count(), "numbers in the parameters");
+        let perception = Perception::new(net.symmetry, &spaces)?;
+        Ok(Self { layout, parameters, normalizer, activation: net.activation, spaces, perception })
+    }
+
+    /// A policy that has learnt nothing, its weights drawn from `seed`, with this standard deviation.
     ///
     /// Weights and biases are uniform in ± 1/√inputs, as in PyTorch's `Linear`.
     ///
     /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn new(config: &PpoConfig, observation_size: usize, action_size: usize, seed: u64) -> Result<Self> {
+    /// A symmetry that the observations do not have.
+    pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Result<Self> {
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         let mut rng = rng::stream(seed, "weights", 0);
-        let mut parameters = Vec::new();
-        let mut bound = 0.0;
-        for (name, shape) in parameter_shapes(config, observation_size, action_size) {
-            let var = match shape[..] {
-                [_, inputs] => {
-                    bound = 1.0 / (inputs as f32).sqrt();
-                    let last = name == format!("actor.{}.weight", config.hidden.len());
-                    uniform(&mut rng, if last { bound * LAST_ACTOR_LAYER } else { bound }, &shape)?
-                }
-                // The bias of the weights before it.
-                _ if name != LOG_STD => uniform(&mut rng, bound, &shape)?,
-                _ => Var::from_tensor(&Tensor::full(config.init_std.ln() as f32, shape, &Device::Cpu)?)?,
-            };
-            parameters.push((name, var));
-        }
-        Ok(Self {
-            parameters,
-            normalizer: Normalizer::new(observation_size),
-            hidden: config.hidden.clone(),
-            activation: config.activation,
-            backend: config.backend,
-            symmetry: config.symmetry,
-            sizes: [observation_size, action_size],
-        })
+        let mut parameters = vec![std.ln() as f32; layout.count()];
+        let mut fill = |layer: &Layer, shrink: f32| {
+            let bound = 1.0 / (layer.inputs as f32).sqrt();
+            uniform(&mut rng, bound * shrink, &mut parameters[layer.weight.clone()]);
+            uniform(&mut rng, bound, &mut parameters[layer.bias.clone()]);
+        };
+        let (last, hidden) = layout.actor.split_last().expect("a net has layers");
+        hidden.iter().for_each(|layer| fill(layer, 1.0));
+        fill(last, LAST_ACTOR_LAYER);
+        layout.critic.iter().for_each(|layer| fill(layer, 1.0));
+        Self::new(net, spaces, parameters, Normalizer::new(spaces.observation_size))
     }
 
-    /// The parameters by name, always in the same order.
-    pub fn parameters(&self) -> &[(String, Var)] {
-        &self.parameters
+    /// The logarithm of the standard deviations, `[A]`.
+    pub fn log_std(&self) -> &[f32] {
+        &self.parameters[self.layout.log_std.clone()]
     }
 
-    /// Whether the parameter of this name belongs to the critic.
-    pub(super) fn is_of_critic(name: &str) -> bool {
-        name.starts_with("critic.")
+    /// The standard deviations, `[A]`.
+    pub fn std(&self) -> Vec<f32> {
+        self.log_std().iter().map(|log_std| log_std.exp()).collect()
     }
 
-    /// The number of weights, biases and standard deviations.
-    pub fn parameter_count(&self) -> usize {
-        self.parameters.iter().map(|(_, var)| var.elem_count()).sum()
+    /// Takes the raw rows of these arrays `[B, O]` into the normaliser.
+    pub(super) fn see(&mut self, raw: &[&[f32]]) {
+        let perception = self.perception;
+        self.normalizer.update(raw, |row| perception.turn(row));
     }
 
-    /// Numbers in an observation.
-    pub fn observation_size(&self) -> usize {
-        self.sizes[0]
+    /// How it reads observations at this moment.
+    pub(super) fn reader(&self) -> Reader {
+        Reader { perception: self.perception, scaling: self.normalizer.scaling() }
     }
 
-    /// Numbers in an action.
-    pub fn action_size(&self) -> usize {
-        self.sizes[1]
-    }
-
-    /// The parameters of actor and critic.
-    fn net_parameters(&self) -> [&[(String, Var)]; 2] {
-        let depth = 2 * (self.hidden.len() + 1);
-        [&self.parameters[..depth], &self.parameters[depth..2 * depth]]
-    }
-
-    /// Actor and critic for our own kernels.
-    pub(super) fn fused_nets(&self) -> [Net<'_>; 2] {
-        self.net_parameters().map(|parameters| Net::new(parameters, self.activation))
-    }
-
-    /// Actor and critic for candle.
-    pub(super) fn candle_nets(&self, frozen: bool) -> [Mlp; 2] {
-        self.net_parameters().map(|parameters| Mlp::new(parameters, self.activation, frozen))
+    /// The net of these of its layers.
+    pub(super) fn net(&self, layers: &[Layer]) -> Net<'_> {
+        Net::new(layers, &self.parameters, self.activation)
     }
 
     /// What both nets need for blocks of up to `rows` rows.
     pub(super) fn workspace(&self, rows: usize, learning: bool, arithmetic: Arithmetic) -> Workspace {
-        let [observation, action] = self.sizes;
-        let sizes: Vec<usize> = [observation].iter().chain(&self.hidden).chain([&action]).copied().collect();
-        Workspace::new(&sizes, self.activation, rows, learning, arithmetic)
+        Workspace::new(&self.layout.actor, rows, learning, arithmetic)
     }
 
     /// The policy of this moment.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn freeze(&self) -> Result<FrozenPolicy<'_>> {
-        let nets = match self.backend {
-            Backend::Fused => Nets::Fused(self.fused_nets()),
-            Backend::Candle => Nets::Candle(self.candle_nets(true)),
-        };
-        Ok(FrozenPolicy { policy: self, nets, scaling: self.normalizer.scaling(), std: self.std()? })
+    pub fn freeze(&self) -> FrozenPolicy<'_> {
+        let [actor, critic] = [&self.layout.actor, &self.layout.critic].map(|layers| self.net(layers));
+        FrozenPolicy { policy: self, actor, critic, reader: self.reader(), std: self.std() }
     }
-
-    /// The logarithm of the standard deviations, `[A]`.
-    pub fn log_std(&self) -> &Var {
-        &self.parameters.last().expect("log_std is the last parameter").1
-    }
-
-    /// The standard deviations, `[A]`.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
-    pub fn std(&self) -> Result<Vec<f32>> {
-        Ok(self.log_std().as_detached_tensor().exp()?.to_vec1()?)
-    }
-
-    /// Moves each standard deviation that is out of the bounds to the nearer one.
-    pub(super) fn limit_std(&self, [least, most]: [f64; 2]) -> Result<()> {
-        let within = self.log_std().as_detached_tensor().maximum(least.ln())?.minimum(most.ln())?;
-        Ok(self.log_std().set(&within)?)
-    }
-}
-
-/// The name of the logarithm of the standard deviations.
-const LOG_STD: &str = "log_std";
-
-/// Names and shapes of a policy's parameters, in order: actor, critic, each layer by layer, weights `[outputs, inputs]`
-/// before biases; the logarithm of the standard deviations.
-pub fn parameter_shapes(config: &PpoConfig, observation_size: usize, action_size: usize) -> Vec<(String, Vec<usize>)> {
-    let mut shapes = Vec::new();
-    for (net, outputs) in [("actor", action_size), ("critic", 1)] {
-        let mut inputs = observation_size;
-        for (layer, &size) in config.hidden.iter().chain([&outputs]).enumerate() {
-            shapes.push((format!("{net}.{layer}.weight"), vec![size, inputs]));
-            shapes.push((format!("{net}.{layer}.bias"), vec![size]));
-            inputs = size;
-        }
-    }
-    shapes.push((LOG_STD.into(), vec![action_size]));
-    shapes
 }
 
 impl FrozenPolicy<'_> {
@@ -182,9 +117,9 @@ impl FrozenPolicy<'_> {
         self.policy.workspace(rows, false, Arithmetic::F32)
     }
 
-    /// What it takes to be the same; whoever gives it observations sees to that.
-    pub fn symmetry(&self) -> Symmetry {
-        self.policy.symmetry
+    /// What it knows of observations and actions.
+    pub fn spaces(&self) -> &Spaces {
+        &self.policy.spaces
     }
 
     /// The policy's own standard deviations `[A]`; training may scale its noise (see `Acting`).
@@ -193,38 +128,29 @@ impl FrozenPolicy<'_> {
     }
 
     /// Writes the mean actions `[B, A]` and the values `[B]`, each if asked for, of raw observations `[B, O]`.
-    ///
-    /// # Errors
-    /// Only if candle cannot allocate.
     pub fn forward(
         &self,
         observations: &[f32],
-        [mut means, mut values]: [Option<&mut [f32]>; 2],
+        mut means: Option<&mut [f32]>,
+        mut values: Option<&mut [f32]>,
         work: &mut Workspace,
-    ) -> Result<()> {
-        let [size, actions] = self.policy.sizes;
+    ) {
+        let size = self.policy.spaces.observation_size;
         let mut done = 0;
         for raw in observations.chunks(work.rows() * size) {
             let rows = raw.len() / size;
-            self.scaling.apply(raw, &mut work.inputs[..raw.len()]);
-            for (net, (width, out)) in [(actions, &mut means), (1, &mut values)].into_iter().enumerate() {
-                let Some(out) = out.as_deref_mut() else { continue };
-                let out = &mut out[done * width..][..rows * width];
-                match &self.nets {
-                    Nets::Fused(nets) => out.copy_from_slice(nets[net].forward(rows, work)),
-                    Nets::Candle(nets) => {
-                        let inputs = Tensor::from_slice(&work.inputs[..raw.len()], (rows, size), &Device::Cpu)?;
-                        out.copy_from_slice(&nets[net].forward(&inputs)?.flatten_all()?.to_vec1::<f32>()?);
-                    }
+            self.reader.read(raw, &mut work.inputs[..raw.len()]);
+            for (net, out) in [(&self.actor, means.as_deref_mut()), (&self.critic, values.as_deref_mut())] {
+                let width = net.outputs();
+                if let Some(out) = out {
+                    out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));
                 }
             }
             done += rows;
         }
-        Ok(())
     }
 }
 
-fn uniform(rng: &mut Rng, bound: f32, shape: &[usize]) -> Result<Var> {
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| bound * (2.0 * rng.random::<f32>() - 1.0)).collect();
-    Ok(Var::from_vec(values, shape, &Device::Cpu)?)
+fn uniform(rng: &mut Rng, bound: f32, numbers: &mut [f32]) {
+    numbers.fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
 }

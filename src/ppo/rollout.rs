@@ -5,6 +5,8 @@
 
 use std::ops::Range;
 
+use crate::spaces::Spaces;
+
 /// T steps of N environments; O numbers in an observation, A in an action.
 pub struct Rollout {
     /// In the order of the environments.
@@ -13,7 +15,7 @@ pub struct Rollout {
 
 /// T steps of the n environments of a block; all arrays are time-major.
 pub struct RolloutBlock {
-    /// `[T + 1, n, O]`, raw
+    /// `[T + 1, n, O]`, raw: as the environments write them
     pub observations: Vec<f32>,
     /// `[T, n, A]`
     pub actions: Vec<f32>,
@@ -23,10 +25,6 @@ pub struct RolloutBlock {
     pub log_probs: Vec<f32>,
     /// `[T, n]`, times the standard deviations of the policy are those of the actions
     pub noise_scales: Vec<f32>,
-    /// `[n]`, the least noise scale of those that explore, 1 for the others
-    pub exploring_scales: Vec<f32>,
-    /// `[n, A]`, the noise, in its own standard deviations, of those that explore
-    pub steady_noise: Vec<f32>,
     /// `[T + 1, n]`
     pub values: Vec<f32>,
     /// `[T, n]`, scaled, and bootstrapped where the future was cut off
@@ -40,39 +38,13 @@ pub struct RolloutBlock {
     sizes: [usize; 4],
 }
 
-/// Row t of a block, and the observations that follow it.
-pub struct RolloutStep<'a> {
-    /// `[n, O]`
-    pub observations: &'a [f32],
-    /// `[n, O]`
-    pub next_observations: &'a mut [f32],
-    /// `[n, A]`
-    pub actions: &'a mut [f32],
-    /// `[n, A]`
-    pub means: &'a mut [f32],
-    /// `[n]`
-    pub noise_scales: &'a mut [f32],
-    /// `[n]`
-    pub exploring_scales: &'a [f32],
-    /// `[n, A]`
-    pub steady_noise: &'a [f32],
-    /// `[n]`
-    pub log_probs: &'a mut [f32],
-    /// `[n]`
-    pub values: &'a mut [f32],
-    /// `[n]`
-    pub rewards: &'a mut [f32],
-    /// `[n]`
-    pub dones: &'a mut [bool],
-}
-
 impl Rollout {
     /// An empty rollout of `horizon` steps of blocks of so many environments, all blocks but the last of one size.
-    pub fn new(horizon: usize, block_sizes: &[usize], observation_size: usize, action_size: usize) -> Self {
+    pub fn new(horizon: usize, block_sizes: &[usize], spaces: &Spaces) -> Self {
         let (last, others) = block_sizes.split_last().expect("a rollout has a block");
         let even = others.iter().all(|size| *size == block_sizes[0]) && *last <= block_sizes[0];
         assert!(even, "only the last block may be smaller: {block_sizes:?}");
-        let block = |&envs: &usize| RolloutBlock::new([horizon, envs, observation_size, action_size]);
+        let block = |&envs: &usize| RolloutBlock::new([horizon, envs, spaces.observation_size, spaces.action_size]);
         Self { blocks: block_sizes.iter().map(block).collect() }
     }
 
@@ -112,8 +84,6 @@ impl RolloutBlock {
             means: vec![0.0; steps * action_size],
             log_probs: vec![0.0; steps],
             noise_scales: vec![1.0; steps],
-            exploring_scales: vec![1.0; envs],
-            steady_noise: vec![0.0; envs * action_size],
             values: vec![0.0; steps + envs],
             rewards: vec![0.0; steps],
             dones: vec![false; steps],
@@ -145,29 +115,10 @@ impl RolloutBlock {
         &mut self.observations[..envs * size]
     }
 
-    /// The observations `[n, O]` after the last step, and where their values `[n]` go.
-    pub fn after_last(&mut self) -> (&[f32], &mut [f32]) {
-        let [horizon, envs, size, _] = self.sizes;
-        (&self.observations[horizon * envs * size..], &mut self.values[horizon * envs..])
-    }
-
-    /// Row `t`.
-    pub fn step_mut(&mut self, t: usize) -> RolloutStep<'_> {
-        let [_, n, o, a] = self.sizes;
-        let (before, after) = self.observations.split_at_mut((t + 1) * n * o);
-        RolloutStep {
-            observations: &before[t * n * o..],
-            next_observations: &mut after[..n * o],
-            actions: &mut self.actions[t * n * a..][..n * a],
-            means: &mut self.means[t * n * a..][..n * a],
-            noise_scales: &mut self.noise_scales[t * n..][..n],
-            exploring_scales: &self.exploring_scales,
-            steady_noise: &self.steady_noise,
-            log_probs: &mut self.log_probs[t * n..][..n],
-            values: &mut self.values[t * n..][..n],
-            rewards: &mut self.rewards[t * n..][..n],
-            dones: &mut self.dones[t * n..][..n],
-        }
+    /// Where row `t` lies in an array `[T, n, width]`.
+    pub fn step(&self, t: usize, width: usize) -> Range<usize> {
+        let size = self.sizes[1] * width;
+        t * size..(t + 1) * size
     }
 
     fn carry_over(&mut self) {
@@ -183,16 +134,18 @@ mod tests {
     #[test]
     fn what_follows_the_last_step_is_what_the_next_iteration_starts_from() {
         let mut block = RolloutBlock::new([2, 3, 4, 1]);
-        block.step_mut(1).next_observations.fill(7.0);
+        let after_the_last = block.step(2, 4);
+        block.observations[after_the_last].fill(7.0);
         assert!(block.first_observations_mut().iter().all(|&x| x == 0.0));
         block.carry_over();
         assert_eq!(block.first_observations_mut(), [7.0; 12]);
-        assert_eq!(block.step_mut(0).observations, [7.0; 12]);
+        assert_eq!(block.observations[block.step(0, 4)], [7.0; 12]);
     }
 
     #[test]
     fn every_sample_is_found_in_its_block() {
-        let rollout = Rollout::new(2, &[8, 8, 3], 4, 1);
+        let spaces = Spaces { observation_size: 4, action_size: 1, cube_and_goal: None, distance: |_| 0.0 };
+        let rollout = Rollout::new(2, &[8, 8, 3], &spaces);
         assert_eq!(rollout.samples(), 38);
         let found = |sample| {
             let (block, row) = rollout.locate(sample);

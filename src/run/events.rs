@@ -70,11 +70,11 @@ impl EventFile {
     ///
     /// # Errors
     /// A file that cannot be written.
-    pub fn scalars(&mut self, step: u64, values: &[(&str, f64)]) -> Result<()> {
+    pub fn scalars(&mut self, step: u64, values: &[(impl AsRef<str>, f64)]) -> Result<()> {
         let mut summary = Summary::new();
         for (tag, number) in values.iter().filter(|(_, number)| !number.is_nan()) {
             let mut value = Summary_Value::new();
-            value.set_tag((*tag).to_owned());
+            value.set_tag(tag.as_ref().to_owned());
             value.set_simple_value(*number as f32);
             summary.mut_value().push(value);
         }

@@ -89,17 +89,9 @@ impl RunFolder {
     /// # Errors
     /// A place that cannot be written to.
     pub fn for_now() -> Result<Self> {
-        for attempt in 0..100 {
-            let path = std::env::temp_dir().join(format!("shadow-repose-{}-{attempt}", std::process::id()));
-            match fs::create_dir(&path) {
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
-                result => {
-                    result.with_context(|| format!("cannot create {}", path.display()))?;
-                    return Ok(Self { path });
-                }
-            }
-        }
-        bail!("{} is full of folders of this program", std::env::temp_dir().display())
+        let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
+        let context = || format!("cannot create a folder in {}", std::env::temp_dir().display());
+        Ok(Self { path: folder.with_context(context)?.keep() })
     }
 
     /// Removes a folder in which nothing could be saved.

@@ -33,7 +33,8 @@ pub struct Report {
     env_steps: u64,
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
-    shown: Shown,
+    /// Moving averages.
+    shown: Status,
     total_steps: u64,
     /// When this session began, and the steps made before it.
     begun: (Instant, u64),
@@ -100,18 +101,10 @@ pub struct Status {
     pub drop_rate: f64,
 }
 
-/// Moving averages.
-#[derive(Clone, Copy, Debug)]
-struct Shown {
-    steps_per_s: f64,
-    goals: f64,
-    drop_rate: f64,
-}
-
 impl Report {
     /// Opens the logs in `folder`, for metrics with these names, behind the first `iterations` rows of earlier sessions.
-    pub fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64, total_steps: u64) -> Self {
-        let columns: Vec<&str> = ["iteration", "env_steps"].iter().chain(tags).copied().collect();
+    pub fn open(folder: &Path, tags: &[impl AsRef<str>], iteration: u64, env_steps: u64, total_steps: u64) -> Self {
+        let columns: Vec<&str> = ["iteration", "env_steps"].into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
         let terminal = std::io::stderr().is_terminal();
         let mut report = Self {
             folder: folder.to_owned(),
@@ -122,17 +115,14 @@ impl Report {
             env_steps,
             bar: terminal.then(|| progress_bar(env_steps, total_steps)),
             last_line: None,
-            shown: Shown { steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
+            shown: Status { env_steps, steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
             total_steps,
             begun: (Instant::now(), env_steps),
         };
         // Later steps of a session that did not come to its checkpoint are made again.
         match cut_off_after(folder, env_steps).and_then(|()| report.open_events()) {
             Ok(events) => report.events.writer = Some(events),
-            Err(error) => {
-                report.events.failing = true;
-                report.warn(&format!("no event file is written for now: {error:#}"));
-            }
+            Err(error) => report.events.give_up(&error).into_iter().for_each(|warning| report.warn(&warning)),
         }
         match report.open_metrics() {
             Ok((metrics, dropped)) => {
@@ -141,10 +131,7 @@ impl Report {
                     report.say(&format!("{dropped} rows of {METRICS} after iteration {iteration} are dropped"));
                 }
             }
-            Err(error) => {
-                report.metrics.failing = true;
-                report.warn(&format!("no {METRICS} is written for now: {error:#}"));
-            }
+            Err(error) => report.metrics.give_up(&error).into_iter().for_each(|warning| report.warn(&warning)),
         }
         report
     }
@@ -158,10 +145,10 @@ impl Report {
     }
 
     /// Logs the values of an iteration, in the order of the tags, and shows the status.
-    pub fn iteration(&mut self, iteration: u64, values: &[(&str, f64)], status: &Status) {
+    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], status: &Status) {
         (self.iteration, self.env_steps) = (iteration, status.env_steps);
-        let cell = |&(_, value): &(&str, f64)| if value.is_nan() { String::new() } else { value.to_string() };
-        let cells: Vec<String> = values.iter().map(cell).collect();
+        let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };
+        let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
         let warnings = [
             self.events.write(|events| events.scalars(status.env_steps, values)),
@@ -229,7 +216,7 @@ impl Report {
     }
 }
 
-impl Shown {
+impl Status {
     fn take(&mut self, status: &Status) {
         for (shown, new) in [
             (&mut self.steps_per_s, status.steps_per_s),

@@ -5,6 +5,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use anyhow::{Result, anyhow};
 
+use crate::schedule::panic_message;
+
 /// The result of `f`, in which a panic is an error too and is not printed: the windowing libraries panic where, for instance,
 /// a shared library is missing.
 pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
@@ -14,10 +16,7 @@ pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Resul
     std::panic::set_hook(hook);
     match result {
         Ok(result) => result.map_err(|error| described(&error)),
-        Err(panic) => {
-            let text = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
-            Err(anyhow!("{}", text.unwrap_or("the windowing library failed")))
-        }
+        Err(panic) => Err(anyhow!("{}", panic_message(&*panic))),
     }
 }
 

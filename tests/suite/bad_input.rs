@@ -43,7 +43,7 @@ fn settings_that_cannot_be_are_named_all_at_once() {
     refused(folder.path(), &["train", "--set", "ppo.minibatches=7"], 1, &["must divide num_envs * horizon = 16384"]);
     refused(folder.path(), &["bench", "--set", "ppo.minibatches=7"], 1, &["must divide"]);
     let words = ["train", "--set", "ppo.activation=gelu", "--set", "env.success_hold=x", "--set", "ppo.gamma=2"];
-    let parts = ["ppo.activation = \"gelu\": unknown variant", "`silu`", "env.success_hold = \"x\"", "ppo.gamma = 2"];
+    let parts = ["ppo.activation = \"gelu\": unknown variant", "`tanh`", "env.success_hold = \"x\"", "ppo.gamma = 2"];
     refused(folder.path(), &words, 1, &parts);
     let deep = format!("{}=1", ["a"; 60_000].join("."));
     refused(folder.path(), &["train", "--set", &deep], 1, &["unknown key"]);

@@ -159,8 +159,17 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
     let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let header: Vec<&String> = lines[0].as_object().unwrap().keys().collect();
     let expected = "sim_dt ctrl_dt act_moving_average success_tolerance max_consecutive_successes max_episode_steps model \
-                    friction_scale cube_mass_scale checkpoint";
+                    friction_scale cube_mass_scale checkpoint observation joint_names actuator_names fingertip_names \
+                    quaternion_order";
     assert_eq!(header.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" "), expected);
+    let part =
+        serde_json::json!({ "name": "cube_angvel", "start": 58, "length": 3, "unit": "rad/s * env.vel_obs_scale" });
+    assert_eq!((&lines[0]["observation"][5], &lines[0]["quaternion_order"]), (&part, &Value::from("wxyz")));
+    let names = |key: &str| lines[0][key].as_array().unwrap().iter().map(|name| name.as_str().unwrap()).collect();
+    let (joints, actuators): (Vec<&str>, Vec<&str>) = (names("joint_names"), names("actuator_names"));
+    assert_eq!((joints.len(), joints[0], joints[23]), (24, "rh_THJ5", "rh_WRJ1"));
+    assert_eq!((actuators.len(), actuators[7], actuators[19]), (20, "rh_A_FFJ0", "rh_A_WRJ1"));
+    assert_eq!(lines[0]["fingertip_names"][4], "rh_thdistal");
     let records = &lines[1..];
     // Episodes of 21 records: enough after 96 of them, without the 97th.
     assert!((2000..2025).contains(&records.len()), "{} records", records.len());
@@ -208,6 +217,67 @@ fn the_same_seed_trains_the_same_policy_on_any_number_of_threads() {
         assert!(latest(&runs[0]) == latest(run));
     }
     assert!(latest(&runs[0]) != latest(&other));
+}
+
+#[test]
+fn the_same_training_writes_the_same_bytes() {
+    let runs = [trained(&["--seed", "5"]), trained(&["--seed", "5"])];
+    for file in ["policy.safetensors", "checkpoints/latest.safetensors", "checkpoints/best.safetensors", "config.toml"]
+    {
+        let [one, other] = runs.each_ref().map(|run| fs::read(run.path().join("run").join(file)).unwrap());
+        assert!(one == other, "{file}");
+    }
+}
+
+/// A run folder of version 0.1.0: a checkpoint of one hand, with nets of one neuron.
+fn of_0_1() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let checkpoints = folder.path().join("old/checkpoints");
+    fs::create_dir_all(&checkpoints).unwrap();
+    let seeds = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
+    for name in ["latest", "best", "iteration-00000000"] {
+        let path = checkpoints.join(format!("{name}.safetensors"));
+        fs::copy(seeds.join("checkpoint/bad-of-0.1.0"), path).unwrap();
+    }
+    fs::copy(seeds.join("policy/good-of-0.1.0"), folder.path().join("old/policy.safetensors")).unwrap();
+    folder
+}
+
+#[test]
+fn policies_and_runs_of_0_1_0_are_played_and_begun_with() {
+    let folder = of_0_1();
+    for place in ["old", "old/policy.safetensors", "old/checkpoints/latest.safetensors"] {
+        let play = ["play", "--ckpt", place, "--episodes", "1", "--json", "--set", "env.max_episode_seconds=0.1"];
+        assert_eq!(json(&succeeded(program(folder.path(), &play)))["episode_length"], 10.0, "{place}");
+        let args = ["--init", place, "--set", "ppo.hidden=[1]", "--set", "ppo.symmetry=none", "--total-steps", "128"];
+        succeeded(program(folder.path(), &train(&args)));
+    }
+}
+
+#[test]
+fn a_checkpoint_of_0_1_0_is_not_resumed_and_nothing_is_changed() {
+    let folder = of_0_1();
+    let before = names(&folder.path().join("old/checkpoints"));
+    for place in ["old", "old/checkpoints/latest.safetensors"] {
+        let refused = program(folder.path(), &["train", "--resume", place]);
+        assert_eq!(refused.status.code(), Some(1));
+        assert!(stderr(&refused).contains("made by 0.1.0: go on with that version"), "{}", stderr(&refused));
+        assert!(!stderr(&refused).contains("warning"), "it is not damaged: {}", stderr(&refused));
+    }
+    assert_eq!(names(&folder.path().join("old/checkpoints")), before);
+}
+
+#[test]
+fn a_policy_is_played_whatever_its_file_says_of_its_training() {
+    let folder = trained(&[]);
+    let path = folder.path().join("run/policy.safetensors");
+    let play = ["play", "--ckpt", "run/policy.safetensors", "--episodes", "2", "--json"];
+    let expected = succeeded(program(folder.path(), &play)).stdout;
+    let mut policy = Checkpoint::parse(&fs::read(&path).unwrap()).unwrap();
+    policy.config =
+        policy.config.replace("goal_lifetime", "key_of_tomorrow").replace("gamma = 0.995", "gamma = [1, 2]");
+    fs::write(&path, policy.to_bytes().unwrap()).unwrap();
+    assert!(succeeded(program(folder.path(), &play)).stdout == expected);
 }
 
 #[test]

@@ -29,7 +29,7 @@ struct Block<'a> {
 impl Block<'_> {
     /// Steps with these actions of all environments.
     fn step(&mut self, actions: &[f32]) {
-        let actions = &actions[self.first * ACTION_SIZE..][..self.envs.len() * ACTION_SIZE];
+        let actions = &actions[self.first * ACTION_SIZE..][..self.envs.count() * ACTION_SIZE];
         let buffers = StepBuffers {
             rewards: &mut self.rewards,
             ends: &mut self.ends,
@@ -67,7 +67,7 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: im
         pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
         let mut first = 0;
         let blocks = pool.blocks_mut().iter_mut().zip(observations).map(|(envs, observations)| {
-            let n = envs.len();
+            let n = envs.count();
             first += n;
             Block {
                 envs,
@@ -148,7 +148,7 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             let mut first = 0;
             let mut seen = Vec::new();
             for (block, rows) in pool.blocks_mut().iter_mut().zip(observations) {
-                let n = block.len();
+                let n = block.count();
                 let actions: Vec<f32> = (0..n * ACTION_SIZE).map(|i| action(step, first + i)).collect();
                 let (mut rewards, mut ends) = (vec![0.0; n], vec![None; n]);
                 let mut last = rows.clone();

@@ -3,9 +3,8 @@
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
 
-use shadow_repose::collect::{Scratch, collect};
-use shadow_repose::env::{End, Env, EnvPool, Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
-use shadow_repose::ppo::{Ppo, Progress};
+use shadow_repose::agent::Agent;
+use shadow_repose::env::{End, Env, Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::rng;
 
@@ -273,32 +272,26 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
 #[test]
 fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning_goes_on() {
     let config = config(&["env.num_envs=200", "ppo.hidden=[16]"]);
-    let task = Task::new(&config.env).unwrap();
-    let mut pool = EnvPool::new(0, (0..200).map(|_| Repose::new(&task)).collect());
-    let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, 20, 0).unwrap();
-    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
+    let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
     let never = AtomicBool::new(false);
-    pool.reset(rollout.first_observations_mut());
     for iteration in 1..=6 {
-        let poison = [f64::NAN, f64::INFINITY, -1e200][iteration as usize % 3];
-        for env in [iteration as usize, 100 + iteration as usize] {
-            let simulation = pool.envs_mut().nth(env).unwrap().simulation_mut();
+        let poison = [f64::NAN, f64::INFINITY, -1e200][iteration % 3];
+        for env in [iteration, 100 + iteration] {
+            let simulation = agent.pool.envs_mut().nth(env).unwrap().simulation_mut();
             simulation.qpos_mut()[7] = poison;
             simulation.qvel_mut()[20] = poison;
         }
-        assert!(collect(&mut pool, &ppo, &mut rollout, iteration, &mut scratch, &never).unwrap());
-        let stats = ppo.update(&mut rollout, iteration, &never).unwrap().expect("nothing stops it");
+        let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
         assert!(stats.value_loss.is_finite() && stats.kl.is_finite());
-        rollout.carry_over();
-        let diverged: u64 = pool.envs_mut().map(|env| env.take_recent().diverged).sum();
+        let diverged: u64 = agent.pool.envs_mut().map(|env| env.take_recent().diverged).sum();
         assert_eq!(diverged, 2, "iteration {iteration}");
         assert_eq!(
-            pool.take_finished().iter().filter(|episode| episode.diverged).count(),
+            agent.pool.take_finished().iter().filter(|episode| episode.diverged).count(),
             2,
             "only those episodes end"
         );
     }
-    ppo.checkpoint("", Progress::default()).unwrap().to_bytes().expect("all weights are finite");
+    agent.checkpoint("", None).to_bytes().expect("all weights are finite");
 }
 
 #[test]

@@ -1,25 +1,27 @@
 //! What only training changes: lessons, and what a policy takes to be the same.
 
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use shadow_repose::collect::{Scratch, collect};
-use shadow_repose::config::{Config, Override, Symmetry};
-use shadow_repose::env::{
-    CUBE_ORIENTATION, End, Env, EnvPool, GOAL_ORIENTATION, Lesson, OBSERVATION_SIZE, Repose, StepBuffers,
-};
-use shadow_repose::perception::perception;
-use shadow_repose::ppo::Ppo;
-use shadow_repose::quat;
+use shadow_repose::agent::Agent;
+use shadow_repose::config::Symmetry;
+use shadow_repose::env::{End, Env, EnvPool, Lesson, OBSERVATION_SIZE, Repose, SPACES, StepBuffers};
+use shadow_repose::ppo::Perception;
+use shadow_repose::quat::{self, Quat};
 use shadow_repose::rng;
 
 use crate::support::{config, started, task};
 
-/// A lesson that differs from the task in these settings only.
+const CUBE_ORIENTATION: usize = 51;
+const GOAL_ORIENTATION: usize = 64;
+
+/// What a lesson of the task itself would be, with these settings on top.
 fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
-    let settings: Vec<Override> = settings.iter().map(|setting| setting.parse().unwrap()).collect();
-    let config = Config::from_text(Path::new("config.toml"), "", &settings).unwrap();
-    Lesson::at(env_steps, &config.training, &config.env)
+    let task = ["task_reward=1", "progress_reward=0", "hold_reward=0", "drop_reward=0", "tolerance=0.1", "hold=50"];
+    let task = task.map(|setting| format!("training.{setting}"));
+    let mut all: Vec<&str> = task.iter().map(String::as_str).collect();
+    all.extend(["training.goal_lifetime=0"]);
+    all.extend(settings);
+    Lesson::at(env_steps, &config(&all).training)
 }
 
 fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
@@ -53,7 +55,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "they lie differently");
         for row in [&mut seen, &mut other_seen] {
-            perception(Symmetry::Cube)(row);
+            Perception::new(Symmetry::Cube, &SPACES).unwrap().turn(row);
         }
         // All but the goals, which were drawn for cubes that lie differently.
         for same in [0..64, 72..157] {
@@ -63,45 +65,25 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
 }
 
 #[test]
-fn a_lesson_decides_what_reaches_a_goal_and_which_goals_are_drawn() {
+fn a_lesson_decides_what_reaches_a_goal() {
     let task = task(&[]);
     let mut env = Repose::new(&task);
-    let easy = ["training.tolerance_start=3.2", "training.tolerance_steps=1000"];
-    let easy = [&easy[..], &["training.hold_start=1", "training.hold_steps=1000"]].concat();
-    let near = ["training.goal_angle_start=0.3", "training.goal_angle_steps=1000"];
-    env.set_lesson(lesson(0, &[&easy[..], &near].concat()));
+    let easy = ["training.tolerance={from=3.2,to=0.001,steps=1000}", "training.hold={from=1,to=50,steps=1000}"];
+    env.set_lesson(lesson(0, &easy));
     let mut observation = start(&mut env, 0);
     for goals in 1..=20 {
-        let before = env.goal();
-        let _ = env.step(&[0.0; 20], &mut observation);
+        assert_eq!(env.step(&[0.0; 20], &mut observation).end, Some(End::Redirected));
         assert_eq!(env.episode().goals, goals, "every step reaches one");
-        assert!(env.goal() != before && env.rot_dist() <= 0.3, "{}", env.rot_dist());
+        env.redirect(&mut observation);
     }
     let in_tolerance = env.episode().in_tolerance;
     assert!(in_tolerance < 20, "what is within the tolerance of the task is counted by that: {in_tolerance}");
-    // Later the lesson is the task itself.
-    env.set_lesson(lesson(1000, &[&easy[..], &near].concat()));
-    let mut farthest = 0.0f64;
+    env.set_lesson(lesson(1000, &easy));
     for episode in 0..30 {
         observation = start(&mut env, episode);
-        farthest = farthest.max(env.rot_dist());
         let _ = env.step(&[0.0; 20], &mut observation);
         assert_eq!(env.episode().goals, 0);
     }
-    assert!(farthest > 2.5, "{farthest}");
-}
-
-#[test]
-fn episodes_of_training_can_be_shorter_than_those_that_are_scored() {
-    let mut env = Repose::new(&task(&[]));
-    let mut length = |seconds: &str, share: f64| {
-        env.set_lesson(lesson(0, &[&format!("training.episode_seconds={seconds}")]));
-        let mut observation = start(&mut env, 0);
-        env.skip_ahead(share);
-        (1..).find(|_| env.step(&[0.0; 20], &mut observation).end == Some(End::Truncated)).unwrap()
-    };
-    assert_eq!([length("0.1", 0.0), length("0.1", 0.5), length("0", 0.0)], [10, 5, 1000]);
-    assert_eq!(length("20", 0.0), 1000, "never longer");
 }
 
 #[test]
@@ -110,8 +92,8 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let (mut plain, mut observation) = started(&task);
     let (mut shaped, _) = started(&task);
     // A tolerance so wide that a task paid by it would pay a bonus all the time.
-    let wide = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_start=50"];
-    let paid = ["training.task_reward=0.5", "training.progress_reward=100", "training.hold_steps=0"];
+    let wide = ["training.tolerance=3.2"];
+    let paid = ["training.task_reward=0.5", "training.progress_reward=100"];
     shaped.set_lesson(lesson(0, &[&wide[..], &paid].concat()));
     for _ in 0..20 {
         let before = shaped.rot_dist();
@@ -165,35 +147,39 @@ fn friction_and_the_mass_of_the_cube_are_scaled_as_if_the_scene_said_so() {
     assert!(apart(&slippery, &unchanged) > 1e-3);
 }
 
+/// Turns the cube of an observation onto itself, and its goal with it.
+fn turned(observation: &[f32], rotation: Quat) -> Vec<f32> {
+    let mut other = observation.to_vec();
+    for place in [CUBE_ORIENTATION, GOAL_ORIENTATION] {
+        let q: [f32; 4] = *observation[place..].first_chunk().unwrap();
+        let turned = quat::canonical(quat::mul(q.map(f64::from), rotation)).map(|x| x as f32);
+        other[place..place + 4].copy_from_slice(&turned);
+    }
+    other
+}
+
 #[test]
-fn a_pool_gives_the_policy_what_it_looks_at_and_an_environment_what_is_there() {
-    let task = task(&["env.max_episode_seconds=0.05"]);
-    let rows = |perceive: fn(&mut [f32])| {
-        let mut pool = EnvPool::new(3, (0..4).map(|_| Repose::new(&task)).collect());
-        pool.perceive_with(perceive);
-        let mut all = Vec::new();
-        let (mut observations, mut last) = (vec![0.0; 4 * OBSERVATION_SIZE], vec![0.0; 4 * OBSERVATION_SIZE]);
-        pool.reset(vec![&mut observations]);
-        all.extend_from_slice(&observations);
-        let mut truncated = 0;
-        for _ in 0..6 {
-            let (rewards, ends) = (&mut [0.0; 4], &mut [None; 4]);
-            let buffers = StepBuffers { rewards, ends, observations: &mut observations, final_observations: &mut last };
-            pool.blocks_mut()[0].step(&[0.3; 80], buffers).unwrap();
-            truncated += ends.iter().flatten().count();
-            all.extend(observations.iter().chain(&last));
+fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
+    let sets = ["env.num_envs=8", "ppo.hidden=[16]", "ppo.horizon=4", "ppo.minibatches=4"];
+    for (symmetry, perceives) in [("cube", true), ("none", false)] {
+        let config = config(&[&sets[..], &[&format!("ppo.symmetry={symmetry}")]].concat());
+        let mut agent = Agent::of_task(&task(&[]), &config).unwrap();
+        agent.collect(&AtomicBool::new(false)).unwrap().expect("nothing stops it");
+        let (policy, mut shown) = (agent.ppo.policy().freeze(), vec![0.0; OBSERVATION_SIZE]);
+        let block = &agent.rollout.blocks[0];
+        let last = block.observations[block.step(4, OBSERVATION_SIZE)].chunks_exact(OBSERVATION_SIZE);
+        for (env, row) in agent.pool.envs_mut().zip(last) {
+            env.observe(&mut shown);
+            assert!(shown == row, "as the environment writes it");
         }
-        assert!(truncated >= 4, "{truncated}");
-        let saved = pool.save();
-        pool.restore(&saved, vec![&mut observations]).unwrap();
-        all.extend_from_slice(&observations);
-        all
-    };
-    let raw = rows(|_| {});
-    let mut expected = raw.clone();
-    expected.chunks_exact_mut(OBSERVATION_SIZE).for_each(perception(Symmetry::Cube));
-    assert!(expected != raw, "cubes lie in many ways");
-    assert!(rows(perception(Symmetry::Cube)) == expected);
+        let mut turns_matter = 0;
+        for (row, &value) in block.acted_on().chunks_exact(OBSERVATION_SIZE).zip(&block.values) {
+            let mut found = [0.0];
+            policy.forward(&turned(row, [0.5, 0.5, -0.5, 0.5]), None, Some(&mut found), &mut policy.workspace(1));
+            turns_matter += usize::from((found[0] - value).abs() > 1e-4);
+        }
+        assert_eq!(turns_matter == 0, perceives, "{symmetry}: {turns_matter}");
+    }
 }
 
 #[test]
@@ -234,19 +220,19 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
 }
 
 #[test]
-fn a_goal_that_was_reached_can_be_worth_as_much_as_if_it_stayed() {
-    let task = task(&[]);
-    let always = ["training.tolerance_start=3.2", "training.tolerance_steps=1000", "training.hold_start=4"];
-    for bootstrap in [true, false] {
-        let key = format!("training.bootstrap_reached={bootstrap}");
+fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
+    let task = task(&["env.success_tolerance=3.14", "env.max_consecutive_successes=4"]);
+    for (trained, lesson) in
+        [(true, lesson(0, &["training.tolerance=3.2", "training.hold=4"])), (false, Lesson::task(task.config()))]
+    {
         let mut env = Repose::new(&task);
-        env.set_lesson(lesson(0, &[&always[..], &["training.hold_steps=1000", &key]].concat()));
+        env.set_lesson(lesson);
         let mut observation = start(&mut env, 0);
         for step in 1..=12 {
             let goal = env.goal();
             let end = env.step(&[0.0; 20], &mut observation).end;
             let reached = step % 4 == 0;
-            assert_eq!(end, (reached && bootstrap).then_some(End::Redirected), "step {step}");
+            assert_eq!(end, (reached && trained).then_some(End::Redirected), "step {step}");
             if end.is_some() {
                 assert!(env.goal() == goal, "what is bootstrapped is the goal that was reached");
                 env.redirect(&mut observation);
@@ -260,27 +246,28 @@ fn a_goal_that_was_reached_can_be_worth_as_much_as_if_it_stayed() {
         env.skip_ahead(0.996);
         let goal = env.goal();
         let ends = [0, 1, 2, 3].map(|_| env.step(&[0.0; 20], &mut observation).end);
-        assert_eq!((ends[3], env.goal() == goal), (Some(End::Truncated), bootstrap), "{ends:?}");
+        assert_eq!((ends[3], env.goal() == goal), (Some(End::Truncated), trained), "{ends:?}");
     }
 }
 
 #[test]
 fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
-    let away = ["ppo.init_std=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
+    let away = ["ppo.max_std.from=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
     let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
-    let (config, task) = (config(&sets), task(&[]));
-    let envs = (0..64).map(|i| {
-        let angle = if i % 2 == 0 { 0.1 } else { 3.1 };
-        let mut env = Repose::new(&task);
-        env.set_lesson(lesson(0, &[&format!("training.goal_angle_start={angle}"), "training.goal_angle_steps=1000"]));
-        env
-    });
-    let mut pool = EnvPool::new(3, envs.collect());
-    let mut ppo = Ppo::new(&config.ppo, OBSERVATION_SIZE, 20, 3).unwrap();
-    let (mut rollout, mut scratch) = (ppo.rollout(&pool.block_sizes()), Scratch::new(&pool, &ppo));
-    pool.reset(rollout.first_observations_mut());
+    let task = task(&[]);
+    let cube = task.scene().free_body("cube").unwrap().qpos;
+    let mut agent = Agent::of_task(&task, &config(&sets)).unwrap();
+    let rows = agent.rollout.first_observations_mut().into_iter();
+    let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
+    for (env, row) in agent.pool.envs_mut().zip(rows).step_by(2) {
+        let goal = env.goal();
+        env.simulation_mut().qpos_mut()[cube + 3..cube + 7].copy_from_slice(&goal);
+        env.simulation_mut().refresh();
+        env.observe(row);
+    }
     let never = AtomicBool::new(false);
-    assert!(collect(&mut pool, &ppo, &mut rollout, 1, &mut scratch, &never).unwrap());
+    agent.collect(&never).unwrap().expect("nothing stops it");
+    let Agent { ppo, rollout, .. } = &mut agent;
     // Squares of the distances from the mean, and numbers of them, of those near the goal and of those far from it.
     let mut spread = [[0.0; 2]; 2];
     for block in &rollout.blocks {
@@ -303,13 +290,14 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
         let std = f64::sqrt(sum / count);
         assert!(count > 200.0 && (std / expected - 1.0).abs() < 0.1, "{std} instead of {expected}, {count}");
     }
-    let stats = ppo.update(&mut rollout, 1, &never).unwrap().unwrap();
+    let stats = ppo.update(rollout, 1, &never).unwrap().unwrap();
     assert!(stats.first_kl.abs() < 1e-5 && stats.first_ratio_error < 1e-3, "{stats:?}");
 }
 
 #[test]
-fn values_are_clipped_like_ratios_unless_something_else_is_said() {
+fn values_are_clipped_unless_the_clip_is_0() {
     let clip = |sets: &[&str]| config(sets).ppo.value_clip();
-    assert_eq!(clip(&["ppo.clip=0.3", "ppo.value_clip=0"]), 0.3);
+    assert_eq!(clip(&["ppo.value_clip=0"]), f64::INFINITY);
     assert_eq!(clip(&["ppo.clip=0.3", "ppo.value_clip=7"]), 7.0);
+    assert_eq!(clip(&[]), 0.2);
 }

@@ -1,13 +1,12 @@
 //! A network on a block of rows: forward and backward, layer by layer, in the cache of one core.
 
-use candle_core::{CpuStorage, Storage, StorageRef, Var};
-
-use super::activation::{activate, add_bias, add_bias_activate, slope_from_output, slopes_and_sums};
+use super::super::parameters;
+use super::activation::{add_bias, add_bias_activate, slopes_and_sums};
 use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
 
-/// One network on the present parameters. While it lives, they cannot be written to.
+/// One network on the present parameters.
 pub struct Net<'a> {
     layers: Vec<Layer<'a>>,
     activation: Activation,
@@ -15,35 +14,10 @@ pub struct Net<'a> {
 
 /// `[outputs, inputs]` and `[outputs]`
 struct Layer<'a> {
-    weight: Numbers<'a>,
-    bias: Numbers<'a>,
+    weight: &'a [f32],
+    bias: &'a [f32],
     inputs: usize,
     outputs: usize,
-}
-
-/// The elements of a parameter.
-struct Numbers<'a> {
-    storage: StorageRef<'a>,
-    range: std::ops::Range<usize>,
-}
-
-impl<'a> Numbers<'a> {
-    fn of(var: &'a Var) -> Self {
-        let (storage, layout) = var.storage_and_layout();
-        let (start, end) = layout.contiguous_offsets().expect("parameters are contiguous");
-        Self { storage, range: start..end }
-    }
-}
-
-impl std::ops::Deref for Numbers<'_> {
-    type Target = [f32];
-
-    fn deref(&self) -> &[f32] {
-        match &*self.storage {
-            Storage::Cpu(CpuStorage::F32(numbers)) => &numbers[self.range.clone()],
-            _ => panic!("parameters are floats on the CPU"),
-        }
-    }
 }
 
 /// What a block of up to `rows` rows needs on its way through nets of the same hidden layers.
@@ -52,8 +26,6 @@ pub struct Workspace {
     pub inputs: Vec<f32>,
     /// `[rows, outputs]` of each layer.
     outputs: Vec<Vec<f32>>,
-    /// The same before the activation; empty where its slope does not need that.
-    inner: Vec<Vec<f32>>,
     /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the one below it.
     grads: [Vec<f32>; 2],
     multiplier: Multiplier,
@@ -61,15 +33,12 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// For nets with these sizes of inputs, hidden layers and (the most) outputs. Only a `learning` one can go backward.
-    pub fn new(sizes: &[usize], activation: Activation, rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
-        let (inputs, layers) = sizes.split_first().expect("a net has inputs");
-        let arrays = || layers.iter().map(|size| vec![0.0; rows * size]).collect();
-        let widest = layers.iter().max().expect("a net has layers");
+    /// For a net of these layers, and any other of the same hidden ones with fewer outputs. Only a `learning` one can go backward.
+    pub fn new(layers: &[parameters::Layer], rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
+        let widest = layers.iter().map(|layer| layer.outputs).max().expect("a net has layers");
         Self {
-            inputs: vec![0.0; rows * inputs],
-            outputs: arrays(),
-            inner: if learning && !slope_from_output(activation) { arrays() } else { Vec::new() },
+            inputs: vec![0.0; rows * layers[0].inputs],
+            outputs: layers.iter().map(|layer| vec![0.0; rows * layer.outputs]).collect(),
             grads: [0, 1].map(|_| vec![0.0; if learning { rows * widest } else { 0 }]),
             multiplier: Multiplier::new(arithmetic),
             rows,
@@ -89,14 +58,15 @@ impl Workspace {
 }
 
 impl<'a> Net<'a> {
-    /// The net of these parameters: weight and bias of each layer.
-    pub fn new(parameters: &'a [(String, Var)], activation: Activation) -> Self {
-        let layer = |pair: &'a [(String, Var)]| {
-            let (weight, bias) = (&pair[0].1, &pair[1].1);
-            let &[outputs, inputs] = weight.dims() else { panic!("a weight is a matrix") };
-            Layer { weight: Numbers::of(weight), bias: Numbers::of(bias), inputs, outputs }
+    /// The net of these layers of `parameters`.
+    pub fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
+        let layer = |layer: &parameters::Layer| Layer {
+            weight: &parameters[layer.weight.clone()],
+            bias: &parameters[layer.bias.clone()],
+            inputs: layer.inputs,
+            outputs: layer.outputs,
         };
-        Self { layers: parameters.chunks_exact(2).map(layer).collect(), activation }
+        Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
     /// Numbers in an output.
@@ -117,14 +87,9 @@ impl<'a> Net<'a> {
             let y = &mut outputs[0][..rows * layer.outputs];
             work.multiplier.product(y, layer.x(x, rows), layer.weight().transposed(), false);
             if l + 1 == self.layers.len() {
-                add_bias(y, &layer.bias);
-            } else if let Some(inner) = work.inner.get_mut(l) {
-                let inner = &mut inner[..y.len()];
-                add_bias(y, &layer.bias);
-                inner.copy_from_slice(y);
-                activate(y, inner, self.activation);
+                add_bias(y, layer.bias);
             } else {
-                add_bias_activate(y, &layer.bias, self.activation);
+                add_bias_activate(y, layer.bias, self.activation);
             }
         }
         &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
@@ -145,10 +110,8 @@ impl<'a> Net<'a> {
             if !add {
                 bias_grad.fill(0.0);
             }
-            let known = if slope_from_output(self.activation) { work.outputs.get(l) } else { work.inner.get(l) };
-            let known = &known.expect("a learning workspace")[..grad.len()];
             let activation = (l + 1 < self.layers.len()).then_some(self.activation);
-            slopes_and_sums(grad, known, activation, bias_grad);
+            slopes_and_sums(grad, &work.outputs[l][..grad.len()], activation, bias_grad);
             let grad = Matrix::new(grad, rows, layer.outputs);
             let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
             work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), add);
@@ -162,7 +125,7 @@ impl<'a> Net<'a> {
 
 impl Layer<'_> {
     fn weight(&self) -> Matrix<'_> {
-        Matrix::new(&self.weight, self.outputs, self.inputs)
+        Matrix::new(self.weight, self.outputs, self.inputs)
     }
 
     fn x<'x>(&self, x: &'x [f32], rows: usize) -> Matrix<'x> {

@@ -46,22 +46,6 @@ fn tanh(x: f32) -> f32 {
     m / (m + 2.0)
 }
 
-#[inline(always)]
-fn silu(x: f32) -> f32 {
-    x / (exp_m1(-x) + 2.0)
-}
-
-#[inline(always)]
-fn silu_slope(x: f32) -> f32 {
-    let sigmoid = 1.0 / (exp_m1(-x) + 2.0);
-    sigmoid * (1.0 + x * (1.0 - sigmoid))
-}
-
-/// Whether the slope is a function of the activation itself; else the input is needed for it.
-pub fn slope_from_output(activation: Activation) -> bool {
-    activation != Activation::Silu
-}
-
 /// Adds `bias` `[C]` to each row of `x` `[B, C]`.
 pub fn add_bias(x: &mut [f32], bias: &[f32]) {
     each_row(x, bias, |x, b| x + b);
@@ -72,32 +56,19 @@ pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
     match activation {
         Activation::Elu => each_row(x, bias, |x, b| elu(x + b)),
         Activation::Relu => each_row(x, bias, |x, b| relu(x + b)),
-        Activation::Silu => each_row(x, bias, |x, b| silu(x + b)),
         Activation::Tanh => each_row(x, bias, |x, b| tanh(x + b)),
-    }
-}
-
-/// Writes the activations of the numbers `z`.
-pub fn activate(out: &mut [f32], z: &[f32], activation: Activation) {
-    match activation {
-        Activation::Elu => each(out, z, |_, z| elu(z)),
-        Activation::Relu => each(out, z, |_, z| relu(z)),
-        Activation::Silu => each(out, z, |_, z| silu(z)),
-        Activation::Tanh => each(out, z, |_, z| tanh(z)),
     }
 }
 
 /// Multiplies `grad` `[B, C]` by the slopes of the activation, in place, and adds the sums of its columns to `sums` `[C]`.
 ///
-/// `known` `[B, C]` has the outputs of the activation, or its inputs where [`slope_from_output`] is false; without an
-/// activation it is not looked at.
-pub fn slopes_and_sums(grad: &mut [f32], known: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
+/// `outputs` `[B, C]` are those of the activation, of which all slopes are functions; without an activation they are not looked at.
+pub fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
     match activation {
         None => add_columns(sums, grad),
-        Some(Activation::Elu) => each_and_sum(grad, known, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
-        Some(Activation::Relu) => each_and_sum(grad, known, sums, |g, y| if y > 0.0 { g } else { 0.0 }),
-        Some(Activation::Silu) => each_and_sum(grad, known, sums, |g, x| g * silu_slope(x)),
-        Some(Activation::Tanh) => each_and_sum(grad, known, sums, |g, y| g * (1.0 - y * y)),
+        Some(Activation::Elu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
+        Some(Activation::Relu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { 0.0 }),
+        Some(Activation::Tanh) => each_and_sum(grad, outputs, sums, |g, y| g * (1.0 - y * y)),
     }
 }
 
@@ -130,17 +101,7 @@ fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32)
     );
 }
 
-/// `x[i] = f(x[i], y[i])`, compiled for the processor it runs on.
-#[inline(always)]
-fn each(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
-    assert_eq!(x.len(), y.len());
-    Arch::new().dispatch(
-        #[inline(always)]
-        || x.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y)),
-    );
-}
-
-/// The same for each row of `x` `[B, C]` with `y` `[C]`.
+/// `x[i, j] = f(x[i, j], y[j])` for each row of `x` `[B, C]`, compiled for the processor it runs on.
 #[inline(always)]
 fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
     Arch::new().dispatch(
@@ -157,7 +118,7 @@ fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
 mod tests {
     use super::*;
 
-    const ALL: [Activation; 4] = [Activation::Elu, Activation::Relu, Activation::Silu, Activation::Tanh];
+    const ALL: [Activation; 3] = [Activation::Elu, Activation::Relu, Activation::Tanh];
 
     fn exact(activation: Activation, x: f64) -> f64 {
         match activation {
@@ -169,7 +130,6 @@ mod tests {
                 }
             }
             Activation::Relu => x.max(0.0),
-            Activation::Silu => x / (1.0 + (-x).exp()),
             Activation::Tanh => x.tanh(),
         }
     }
@@ -186,7 +146,6 @@ mod tests {
             for (x, y) in inputs().into_iter().zip(found) {
                 let expected = exact(activation, f64::from(x));
                 let error = (f64::from(y) - expected).abs();
-                // SiLU far below zero is a tiny product: there the error is measured against |x| e^x at the cut-off.
                 assert!(
                     error <= 3e-7 * expected.abs().max(1e-30) || error < 2e-7,
                     "{activation:?}({x}) = {y}, not {expected}"
@@ -219,10 +178,9 @@ mod tests {
             for x in [-3.0f32, -0.7, -0.01, 0.02, 0.9, 4.0] {
                 let mut output = [x];
                 add_bias_activate(&mut output, &[0.0], activation);
-                let known = if slope_from_output(activation) { output } else { [x] };
                 let mut grad = [2.0];
                 let mut sums = [1.0];
-                slopes_and_sums(&mut grad, &known, Some(activation), &mut sums);
+                slopes_and_sums(&mut grad, &output, Some(activation), &mut sums);
                 assert_eq!(sums[0], 1.0 + grad[0]);
                 let step = 1e-6;
                 let x = f64::from(x);

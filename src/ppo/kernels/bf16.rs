@@ -2,8 +2,16 @@
 
 use pulp::Arch;
 
-use super::amx::{DEPTH, LINES, TILE};
 use super::product::Matrix;
+
+/// Lines (rows of the left matrix, columns of the right one) in a tile.
+pub const LINES: usize = 16;
+
+/// Numbers of each line in a tile.
+pub const DEPTH: usize = 32;
+
+/// Numbers in a tile.
+pub const TILE: usize = LINES * DEPTH;
 
 /// The nearest bf16, of two as near the even one; what is not a number stays so.
 #[inline(always)]

@@ -8,17 +8,8 @@ use std::sync::OnceLock;
 
 use anyhow::Result;
 
-use super::bf16::{Packed, Side};
+use super::bf16::{LINES, Packed, Side, TILE};
 use super::product::Matrix;
-
-/// Lines (rows of the left matrix, columns of the right one) in a tile.
-pub const LINES: usize = 16;
-
-/// Numbers of each line in a tile.
-pub const DEPTH: usize = 32;
-
-/// Numbers in a tile.
-pub const TILE: usize = LINES * DEPTH;
 
 /// Rows and columns of the product that are computed together: two tiles by two.
 const BLOCK: usize = 2 * LINES;
@@ -100,7 +91,8 @@ mod machine {
     use std::arch::x86_64::{__cpuid, __cpuid_count};
     use std::marker::PhantomData;
 
-    use super::{BLOCK, DEPTH, LINES, TILE};
+    use super::super::bf16::{DEPTH, LINES, TILE};
+    use super::BLOCK;
 
     /// Bytes from one row of a tile to the next, in memory as in the processor.
     const ROW_BYTES: usize = 64;
@@ -247,7 +239,7 @@ mod machine {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ppo::fused::bf16::rounded;
+    use crate::ppo::kernels::bf16::rounded;
     use crate::rng;
 
     /// Where there are no tiles, there is nothing to test but that this is said.

@@ -1,21 +1,27 @@
 //! The losses of one minibatch, as pure functions of tensors. M samples, A numbers in an action.
 
-use std::f64::consts::{E, TAU};
-
 use candle_core::{D, Result, Tensor};
 
 use crate::config::PpoConfig;
 
+/// The distributions of the actions of M samples.
+pub struct Gaussian {
+    /// `[M, A]`
+    pub means: Tensor,
+    /// `[A]`, the logarithm of the policy's standard deviations
+    pub log_std: Tensor,
+    /// `[M, 1]`, times the policy's standard deviations are those of a sample
+    pub scales: Tensor,
+}
+
 /// What a minibatch is learnt from.
 pub struct Minibatch {
-    /// `[M, O]`, normalised
+    /// `[M, O]`, as the nets see them
     pub observations: Tensor,
     /// `[M, A]`
     pub actions: Tensor,
-    /// `[M, A]`, of the distribution that the actions were drawn from
-    pub old_means: Tensor,
-    /// `[M, 1]`, times the standard deviations of the policy were those of that distribution
-    pub noise_scales: Tensor,
+    /// What the actions were drawn from.
+    pub old: Gaussian,
     /// `[M]`, of the actions under that distribution
     pub old_log_probs: Tensor,
     /// `[M]`, of the critic at that time
@@ -36,51 +42,45 @@ pub struct Losses {
     pub value: Tensor,
     /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
     pub excess: Tensor,
-    /// Mean entropy of the action distribution, nats.
-    pub entropy: Tensor,
     /// Mean KL divergence of the present distribution from the one that acted, nats.
     pub kl: Tensor,
-    /// Probability ratios of the actions, `[M]`.
+    /// `[M]`, of the probabilities of each action
     pub ratios: Tensor,
 }
 
-/// Logarithm of the probability density of `actions` `[M, A]` under Gaussians with `means` `[M, A]` and standard
-/// deviations `scales` `[M, 1]` · exp(`log_std`) `[A]` → `[M]`; without the scales themselves, of which a ratio is free.
-///
-/// # Errors
-/// Shapes that do not fit.
-pub fn log_prob(actions: &Tensor, means: &Tensor, log_std: &Tensor, scales: &Tensor) -> Result<Tensor> {
-    let z = (actions - means)?.broadcast_div(&log_std.exp()?)?.broadcast_div(scales)?;
-    let constant = 0.5 * TAU.ln() * actions.dim(D::Minus1)? as f64;
-    let log_scale = (log_std.sum_all()? + constant)?;
-    (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
+impl Gaussian {
+    /// The logarithm of the density of `actions` `[M, A]` for each sample, `[M]`; it lacks the logarithm of the scales, here and
+    /// where the actions were drawn, since only ratios count.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn log_prob(&self, actions: &Tensor) -> Result<Tensor> {
+        let z = (actions - &self.means)?.broadcast_div(&self.log_std.exp()?)?.broadcast_div(&self.scales)?;
+        let constant = 0.5 * std::f64::consts::TAU.ln() * self.log_std.elem_count() as f64;
+        let log_scale = (self.log_std.sum_all()? + constant)?;
+        (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
+    }
+
+    /// Mean over the samples of the KL divergence KL(`old` ‖ self), where both have the same scales.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn kl(&self, old: &Self) -> Result<Tensor> {
+        let moved = (&old.means - self.means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
+        let log_std = self.log_std.detach();
+        let spread = (((&old.log_std * 2.0)?.exp()? + moved)? / (&log_std * 2.0)?.exp()?)?;
+        ((&log_std - &old.log_std)? + (spread * 0.5)?)?.sum_all()? - 0.5 * log_std.elem_count() as f64
+    }
 }
 
-/// Mean over the samples of the KL divergence KL(old ‖ new) of diagonal Gaussians; standard deviations `[A]`, which both are
-/// multiplied by `scales` `[M, 1]`.
-///
-/// # Errors
-/// Shapes that do not fit.
-pub fn kl([old_means, old_std]: [&Tensor; 2], [means, log_std]: [&Tensor; 2], scales: &Tensor) -> Result<Tensor> {
-    let variance = (log_std * 2.0)?.exp()?;
-    let moved = (old_means - means)?.broadcast_div(scales)?.sqr()?.mean(0)?;
-    let spread = ((old_std.sqr()? + moved)? / variance)?;
-    ((log_std - old_std.log()?)? + (spread * 0.5)?)?.sum_all()? - 0.5 * log_std.elem_count() as f64
-}
-
-/// The losses of a minibatch for which the nets gave `means` `[M, A]` and `values` `[M]`.
+/// The losses of a minibatch for which the nets gave the distribution `new` and `values` `[M]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 ///
 /// # Errors
 /// Shapes that do not fit.
-pub fn losses(
-    config: &PpoConfig,
-    batch: &Minibatch,
-    [means, values]: [&Tensor; 2],
-    [log_std, old_std]: [&Tensor; 2],
-) -> Result<Losses> {
-    let ratios = (log_prob(&batch.actions, means, log_std, &batch.noise_scales)? - &batch.old_log_probs)?.exp()?;
+pub fn losses(config: &PpoConfig, batch: &Minibatch, new: &Gaussian, values: &Tensor) -> Result<Losses> {
+    let ratios = (new.log_prob(&batch.actions)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
     let policy = surrogate.mean_all()?.neg()?;
@@ -90,12 +90,10 @@ pub fn losses(
     let error = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?;
     let value = error.mean_all()?;
 
-    let entropy = (log_std.sum_all()? + 0.5 * (TAU * E).ln() * log_std.elem_count() as f64)?;
-    let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
-    let total = ((&policy + (&value * config.value_coef)?)? - (&entropy * config.entropy_coef)?)?;
-    let total = (total + (&excess * config.bounds_coef)?)?;
-    let kl = kl([&batch.old_means, old_std], [&means.detach(), &log_std.detach()], &batch.noise_scales)?;
-    Ok(Losses { total, policy, value, excess, entropy, kl, ratios: ratios.detach() })
+    let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
+    let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
+    let kl = new.kl(&batch.old)?;
+    Ok(Losses { total, policy, value, excess, kl, ratios: ratios.detach() })
 }
 
 #[cfg(test)]
@@ -106,6 +104,15 @@ mod tests {
 
     fn tensor(values: &[f32], shape: &[usize]) -> Tensor {
         Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
+    }
+
+    /// With the standard deviations 0.7 and 1.1, times the scales.
+    fn gaussian(means: &[f32], scales: &[f32]) -> Gaussian {
+        Gaussian {
+            means: tensor(means, &[scales.len(), 2]),
+            log_std: tensor(&[0.7f32.ln(), 1.1f32.ln()], &[2]),
+            scales: tensor(scales, &[scales.len(), 1]),
+        }
     }
 
     #[track_caller]
@@ -136,45 +143,41 @@ mod tests {
     /// policy = -torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
     /// clipped = old_value + (value - old_value).clamp(-0.3, 0.3)
     /// critic = torch.max((value - returns) ** 2, (clipped - returns) ** 2).mean()
-    /// entropy = Normal(mean, log_std.exp()).entropy().sum(1).mean()
     /// kl = kl_divergence(old, dist).sum(1).mean()
-    /// (policy + 2.0 * critic - 0.01 * entropy).backward()
-    /// for x in (log_prob + 2 * scale.log()[:, 0], ratio, policy, critic, entropy, kl, mean.grad, log_std.grad, value.grad):
+    /// (policy + 2.0 * critic).backward()
+    /// for x in (log_prob + 2 * scale.log()[:, 0], ratio, policy, critic, kl, mean.grad, log_std.grad, value.grad):
     ///     print(x.tolist())
     /// ```
     #[test]
     fn losses_and_gradients_match_pytorch() {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
-        (config.clip, config.value_clip, config.value_coef, config.entropy_coef) = (0.2, 0.3, 2.0, 0.01);
+        (config.clip, config.value_clip, config.value_coef) = (0.2, 0.3, 2.0);
         let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
         let log_std = Var::from_tensor(&tensor(&[-0.5, 0.2], &[2])).unwrap();
         let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
-        let old_std = tensor(&[0.7, 1.1], &[2]);
         let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
-        let old_means = tensor(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[3, 2]);
-        let noise_scales = tensor(&[1.0, 1.5, 0.8], &[3, 1]);
+        let old = gaussian(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[1.0, 1.5, 0.8]);
         let batch = Minibatch {
             observations: tensor(&[0.0; 3], &[3, 1]),
-            old_log_probs: log_prob(&actions, &old_means, &old_std.log().unwrap(), &noise_scales).unwrap(),
-            noise_scales,
+            old_log_probs: old.log_prob(&actions).unwrap(),
             actions,
-            old_means,
+            old,
             old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
             advantages: tensor(&[1.0, 0.5, -2.0], &[3]),
             returns: tensor(&[0.5, 0.1, 1.9], &[3]),
         };
-        let found = losses(&config, &batch, [&mean, &value], [&log_std, &old_std]).unwrap();
-        let log_probs = log_prob(&batch.actions, &mean, &log_std, &batch.noise_scales).unwrap();
-        assert_close(&log_probs, &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
+        let (means, scales) = (mean.as_tensor().clone(), batch.old.scales.clone());
+        let new = Gaussian { means, log_std: log_std.as_tensor().clone(), scales };
+        let found = losses(&config, &batch, &new, &value).unwrap();
+        assert_close(&new.log_prob(&batch.actions).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
         assert_close(&found.ratios, &[1.217_114_7, 0.860_722_24, 1.559_589_3]);
         assert_close(&found.policy, &[0.496_272_44]);
         assert_close(&found.value, &[0.296_666_7]);
-        assert_close(&found.entropy, &[2.537_877]);
         assert_close(&found.kl, &[0.065_324_254]);
         let grads = found.total.backward().unwrap();
         let mean_grad = [0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_3];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
-        assert_close(grads.get(&log_std).unwrap(), &[0.572_585_3, -0.388_056_3]);
+        assert_close(grads.get(&log_std).unwrap(), &[0.582_585_3, -0.378_056_3]);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
     }
 
@@ -183,19 +186,19 @@ mod tests {
         let batch = Minibatch {
             observations: tensor(&[0.0], &[1, 1]),
             actions: tensor(&[0.2, 1.5], &[1, 2]),
-            old_means: tensor(&[-0.5, 0.5], &[1, 2]),
-            noise_scales: tensor(&[1.0], &[1, 1]),
+            old: gaussian(&[-0.5, 0.5], &[1.0]),
             old_log_probs: tensor(&[-2.0], &[1]),
             old_values: tensor(&[1.0], &[1]),
             advantages: tensor(&[-2.0], &[1]),
             returns: tensor(&[0.9], &[1]),
         };
-        let (log_std, std, value) = (tensor(&[-0.5, 0.2], &[2]), tensor(&[0.7, 1.1], &[2]), tensor(&[1.4], &[1]));
         let mean = Var::from_tensor(&tensor(&[1.5, -0.2], &[1, 2])).unwrap();
         let with = |bounds_coef: f64| {
             let mut config = Config::resolve(None, &[]).unwrap().ppo;
             config.bounds_coef = bounds_coef;
-            let found = losses(&config, &batch, [&mean, &value], [&log_std, &std]).unwrap();
+            let (log_std, scales) = (tensor(&[-0.5, 0.2], &[2]), tensor(&[1.0], &[1, 1]));
+            let new = Gaussian { means: mean.as_tensor().clone(), log_std, scales };
+            let found = losses(&config, &batch, &new, &tensor(&[1.4], &[1])).unwrap();
             assert_close(&found.excess, &[0.25]);
             found.total.backward().unwrap().get(&mean).unwrap().clone()
         };
@@ -204,8 +207,7 @@ mod tests {
 
     #[test]
     fn a_distribution_has_no_divergence_from_itself() {
-        let (means, std) = (tensor(&[0.3, -2.0], &[1, 2]), tensor(&[0.5, 2.0], &[2]));
-        let kl = kl([&means, &std], [&means, &std.log().unwrap()], &tensor(&[3.0], &[1, 1])).unwrap();
+        let kl = gaussian(&[0.3, -2.0], &[3.0]).kl(&gaussian(&[0.3, -2.0], &[3.0])).unwrap();
         assert!(kl.to_scalar::<f32>().unwrap().abs() < 1e-6);
     }
 }

@@ -1,0 +1,321 @@
+//! Where a value comes from: the default, under a user's file, under single settings.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, anyhow, bail};
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use super::BASE;
+use super::overlay::{overlay, table_of};
+use super::rules::violations;
+use super::settings::{Config, EnvConfig, NetConfig};
+
+/// The keys of `[ppo]` that describe a policy.
+const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
+
+/// What a policy is whose file was made before there was a setting, also where that is another default today.
+const BEFORE: &str = "[ppo]\nsymmetry = \"none\"";
+
+/// One `--set key=value`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Override {
+    /// The dotted key, as `ppo.learning_rate`.
+    pub key: String,
+    /// The text behind the equals sign.
+    pub value: String,
+}
+
+impl std::str::FromStr for Override {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.split_once('=') {
+            Some((key, value)) if !key.trim().is_empty() => {
+                Ok(Self { key: key.trim().into(), value: value.trim().into() })
+            }
+            _ => Err(format!("`{text}` is not of the form key=value, as in ppo.learning_rate=1e-4")),
+        }
+    }
+}
+
+/// A configuration text and the name to use for it in messages.
+pub struct Source {
+    /// The file it came from.
+    pub path: PathBuf,
+    /// Its content.
+    pub text: String,
+}
+
+/// How a policy is to be played: all that is read of the settings in its file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PolicyConfig {
+    /// The task that it was trained for.
+    pub env: EnvConfig,
+    /// The policy itself.
+    pub net: NetConfig,
+}
+
+impl Config {
+    /// The base, overlaid by the user's file and then by `overrides`.
+    ///
+    /// # Errors
+    /// One error that lists every unknown key, every value of a wrong type and every value out of range.
+    pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        let file = user.map(|source| source.path.as_path());
+        layered(file, &user.map(Source::table).transpose()?.into_iter().collect::<Vec<_>>(), overrides)
+    }
+
+    /// A configuration that a run has written whole.
+    ///
+    /// # Errors
+    /// As [`Config::resolve`].
+    pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
+        Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
+    }
+
+    /// The whole configuration as TOML.
+    pub fn to_text(&self) -> String {
+        let sections = Table::try_from(self).expect("a configuration is a tree of tables");
+        let mut text = String::new();
+        for (section, keys) in &sections {
+            text += &format!("[{section}]\n");
+            keys.as_table().into_iter().flatten().for_each(|(key, value)| text += &format!("{key} = {value}\n"));
+            text.push('\n');
+        }
+        text
+    }
+}
+
+impl PolicyConfig {
+    /// What playing takes of the configuration of a run: how the policy was trained is not even looked at, so that the settings of
+    /// training can come and go.
+    ///
+    /// # Errors
+    /// As [`Config::resolve`].
+    pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
+        let mut table = Source { path: path.into(), text: text.into() }.table()?;
+        table.retain(|section, _| section == "env" || section == "ppo");
+        if let Some(Value::Table(env)) = table.get_mut("env") {
+            env.retain(|key, _| key != "num_envs");
+        }
+        if let Some(Value::Table(ppo)) = table.get_mut("ppo") {
+            ppo.retain(|key, _| OF_NETS.contains(&key));
+        }
+        let before = BEFORE.parse().expect("our own settings are TOML");
+        let Config { env, ppo, .. } = layered(Some(path), &[before, table], overrides)?;
+        Ok(Self { env, net: ppo.net() })
+    }
+}
+
+impl Source {
+    fn table(&self) -> Result<Table> {
+        self.text.parse().map_err(|error| anyhow!("{}: not a TOML file: {error}", self.path.display()))
+    }
+}
+
+/// The base, overlaid by these tables and then by `overrides`; problems are said to be of `file`.
+fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Result<Config> {
+    let base: Table = BASE.parse().expect("our own settings are TOML");
+    let (mut merged, mut problems) = (base.clone(), Vec::new());
+    let singles = overrides.iter().map(|set| table_of(&set.key, &set.value, &base));
+    for table in tables.iter().cloned().chain(singles) {
+        overlay(&mut merged, &table, &base, "", &mut problems);
+    }
+    // Words and sizes that no key of that type can have: each key is tried alone among the defaults, so that one that fails can be
+    // named. With the default in its place the other rules can be checked.
+    for (section, keys) in &base {
+        for (key, default) in keys.as_table().into_iter().flatten() {
+            let mut alone = base.clone();
+            alone[section][key] = merged[section][key].clone();
+            if let Err(error) = Config::deserialize(Value::Table(alone)) {
+                problems.push(format!("{section}.{key} = {}: {}", merged[section][key], error.message().trim()));
+                merged[section][key] = default.clone();
+            }
+        }
+    }
+    let config = Config::deserialize(Value::Table(merged))?;
+    problems.extend(violations(&config));
+    if problems.is_empty() {
+        return Ok(config);
+    }
+    let origin = file.map_or(String::new(), |file| format!(" ({})", file.display()));
+    bail!("invalid configuration{origin}:\n  {}", problems.join("\n  "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Activation, Ramp, Symmetry};
+    use super::*;
+
+    fn set(text: &str) -> Override {
+        text.parse().unwrap()
+    }
+
+    fn errors(overrides: &[&str]) -> String {
+        let overrides: Vec<Override> = overrides.iter().map(|s| set(s)).collect();
+        Config::resolve(None, &overrides).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn the_base_is_valid_and_survives_being_written_and_read() {
+        let config = Config::resolve(None, &[]).unwrap();
+        assert_eq!(config.env.max_episode_steps(), 1000);
+        assert_eq!(config.env.substeps(), 1);
+        let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]).unwrap();
+        assert_eq!(config, again);
+    }
+
+    #[test]
+    fn the_other_files_that_come_with_the_program_say_what_differs() {
+        let large = include_str!("../../configs/repose-large.toml");
+        let going_on = include_str!("../../configs/repose-continue.toml");
+        let [large, going_on] =
+            [large, going_on].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
+        assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
+        // A file too may hold a part of a ramp.
+        assert_eq!(large.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
+        assert_eq!(large.ppo.max_std, Ramp { from: 0.6, to: 0.2, steps: 50_000_000 });
+        assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
+        assert_eq!((going_on.ppo.std_bounds(0), going_on.ppo.value_clip()), ([0.2; 2], f64::INFINITY));
+        assert_eq!(going_on.training.goal_lifetime, 300);
+    }
+
+    #[test]
+    fn a_ramp_can_be_set_whole_in_part_or_as_a_constant() {
+        let tolerance = |sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            Config::resolve(None, &sets).unwrap().training.tolerance
+        };
+        let default = Ramp { from: 0.4, to: 0.07, steps: 25_000_000 };
+        assert_eq!(tolerance(&[]), default);
+        assert_eq!(tolerance(&["training.tolerance=0.07"]), Ramp::constant(0.07));
+        assert_eq!(tolerance(&["training.tolerance.to=0.05"]), Ramp { to: 0.05, ..default });
+        assert_eq!(tolerance(&["training.tolerance.steps=1e6"]), Ramp { steps: 1_000_000, ..default });
+        let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=20000000}"]);
+        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 20_000_000 });
+        assert_eq!(tolerance(&["training.tolerance={to=0.06}"]), Ramp { to: 0.06, ..default });
+        // A part of what was set to a constant before.
+        let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
+        assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0 });
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_ramp_is_said_by_name() {
+        for (bad, part) in [
+            ("training.tolerance=0", "training.tolerance = 0: must be above 0"),
+            ("training.tolerance.from=-1", "training.tolerance.from = -1: must be above 0"),
+            ("training.tolerance=wide", "training.tolerance = \"wide\": must be a number, or { from = …"),
+            ("training.tolerance=nan", "training.tolerance.from = nan: must be a finite number"),
+            ("training.tolerance.form=1", "training.tolerance.form: unknown key"),
+            ("training.tolerance.steps=-1", "training.tolerance.steps = -1: must be a whole number"),
+            ("training.hold.to=0.4", "training.hold.to = 0.4: must be at least 1"),
+            ("ppo.min_std=0.5", "ppo.min_std = 0.5: must be at most ppo.max_std, which is 0.49"),
+            ("ppo.min_std.to=0.3", "must be at most ppo.max_std, which is 0.29"),
+        ] {
+            let text = errors(&[bad]);
+            assert!(text.contains(part), "{bad}: {part} is not in\n{text}");
+        }
+    }
+
+    #[test]
+    fn settings_that_are_gone_are_answered_with_what_to_do() {
+        for (gone, advice) in [
+            ("training.tolerance_steps=0", "write it as a ramp"),
+            ("training.hold_scale=0.3", "whatever the task asks"),
+            ("training.bootstrap_reached=true", "training always does"),
+            ("ppo.init_std=0.6", "starts with ppo.max_std"),
+            ("ppo.exploring_share=0", "it brought nothing"),
+            ("ppo.activation=silu", "no policy that came with the program had it"),
+        ] {
+            let text = errors(&[gone]);
+            let key = gone.split_once('=').unwrap().0;
+            assert!(text.contains(key) && text.contains(": gone since 0.2.0: ") && text.contains(advice), "{text}");
+        }
+    }
+
+    #[test]
+    fn of_the_settings_in_a_policys_file_only_those_of_playing_are_read() {
+        let trained = "[env]\nnum_envs = 0\nrot_eps = 0.2\n[ppo]\nhidden = [9]\ngamma = \"much\"\nnot_yet = 1\n\
+                       [training]\ngoal_reward = 3\n[of_tomorrow]\nx = 1\n[run]\nseed = -1";
+        let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, sets);
+        let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
+        assert_eq!((found.env.rot_eps, found.env.sim_dt, found.net.hidden), (0.2, 0.005, vec![9]));
+        // It was made before there was a symmetry.
+        assert_eq!(found.net.symmetry, Symmetry::None);
+        let whole = Config::resolve(None, &[]).unwrap();
+        assert_eq!(policy(&whole.to_text(), &[]).unwrap(), PolicyConfig { env: whole.env, net: whole.ppo.net() });
+        for (bad, part) in [
+            ("[env]\nrot_eps = 0", "env.rot_eps = 0: must be above 0"),
+            ("[env]\nnot_yet = 1", "env.not_yet: unknown key"),
+            ("[ppo]\nhidden = []", "must hold one to 64 sizes"),
+            ("[ppo]\nactivation = \"silu\"", "ppo.activation = \"silu\": gone since 0.2.0"),
+        ] {
+            let text = policy(bad, &[]).unwrap_err().to_string();
+            assert!(text.contains(part), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_users_file_holds_only_what_differs_and_set_wins_over_it() {
+        let source =
+            Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8".into() };
+        let sets = [set("ppo.gamma=0.97"), set("ppo.activation=tanh"), set("run.total_steps=1e6")];
+        let config = Config::resolve(Some(&source), &sets).unwrap();
+        assert_eq!((config.ppo.gamma, config.env.num_envs), (0.97, 8));
+        assert_eq!((config.ppo.hidden, config.ppo.activation), (vec![32], Activation::Tanh));
+        assert_eq!((config.run.total_steps, config.ppo.lambda), (1_000_000, 0.95));
+    }
+
+    #[test]
+    fn all_violations_are_named_together_with_the_rule() {
+        let text = errors(&["ppo.minibatches=7", "env.rot_eps=0", "ppo.gama=1", "env.sim_dt=fast", "ppo.clip=-1"]);
+        for part in [
+            "ppo.minibatches = 7: must divide num_envs * horizon",
+            "env.rot_eps = 0: must be above 0",
+            "ppo.gama: unknown key; did you mean ppo.gamma?",
+            "env.sim_dt = \"fast\": must be a number",
+            "ppo.clip = -1: must be above 0",
+        ] {
+            assert!(text.contains(part), "{part}\nis not in\n{text}");
+        }
+    }
+
+    #[test]
+    fn the_control_step_must_be_a_whole_multiple_of_the_physics_step() {
+        let text = errors(&["env.sim_dt=0.003"]);
+        assert!(text.contains("env.ctrl_dt = 0.01: must be a whole multiple of env.sim_dt = 0.003"), "{text}");
+        let config = Config::resolve(None, &[set("env.sim_dt=0.002")]).unwrap();
+        assert_eq!(config.env.substeps(), 5);
+    }
+
+    #[test]
+    fn wrong_kinds_of_values_are_refused_by_name() {
+        for (bad, part) in [
+            ("env.rot_eps=nan", "must be a finite number"),
+            ("env.num_envs=-3", "must be a whole number, not negative"),
+            ("env.num_envs=0", "must be at least 1"),
+            ("env.num_envs=1.5", "must be a whole number, not negative"),
+            ("ppo.hidden=3", "must be an array"),
+            ("ppo.hidden=[]", "must hold one to 64 sizes"),
+            ("ppo=3", "must be a section with keys"),
+            ("ppo.activation=gelu", "gelu"),
+            ("ppo.away_range=[0.5,0.5]", "must rise from 0 or more"),
+            ("env.goal_position=[1,2]", "goal_position"),
+            ("nonsense=1", "nonsense: unknown key"),
+            ("learning_rate=1", "did you mean ppo.learning_rate?"),
+            ("env.act_moving_average=0", "must be above 0"),
+            ("env.num_hand_dofs=23", "must be 24, the task is laid out for it"),
+            ("env.num_actuators=24", "must be 20, the task is laid out for it"),
+        ] {
+            let text = errors(&[bad]);
+            assert!(text.contains(part), "{bad}: {part} is not in\n{text}");
+        }
+    }
+
+    #[test]
+    fn an_override_without_equals_sign_is_refused() {
+        assert!("ppo.gamma".parse::<Override>().is_err());
+        assert!("=1".parse::<Override>().is_err());
+    }
+}

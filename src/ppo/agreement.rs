@@ -1,0 +1,185 @@
+//! That the two backends compute the same: a file of tests alone.
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicBool;
+
+    use super::super::backend::Losses;
+    use super::super::kernels::{Arithmetic, Kernels};
+    use super::super::{Policy, Ppo, Rollout};
+    use crate::config::{self, Activation, Config, Precision};
+    use crate::rng;
+    use crate::spaces::Spaces;
+
+    const BACKENDS: [config::Backend; 2] = [config::Backend::Fused, config::Backend::Candle];
+
+    const SPACES: Spaces =
+        Spaces { observation_size: 157, action_size: 20, cube_and_goal: Some([51, 64]), distance: |_| 0.0 };
+
+    /// A learner of that kind, and a rollout that it could have collected with a slightly different policy.
+    fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
+        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
+        config.bounds_coef = 0.1;
+        let mut ppo = Ppo::new(&config, SPACES, 3).unwrap();
+        ppo.policy.see(&[&[[0.3; 157], [0.9; 157]].concat()]);
+        let mut rollout = Rollout::new(16, &[32, 32, 21], &SPACES);
+        let mut rng = rng::stream(0, "test", 0);
+        let mut fill = |numbers: &mut [f32], scale: f64| {
+            numbers.iter_mut().for_each(|x| *x = rng::uniform(&mut rng, -scale, scale) as f32);
+        };
+        for block in &mut rollout.blocks {
+            fill(&mut block.observations, 1.0);
+            fill(&mut block.means, 0.2);
+            fill(&mut block.actions, 0.7);
+            fill(&mut block.values, 0.4);
+            fill(&mut block.advantages, 2.0);
+            fill(&mut block.returns, 1.0);
+            // A few act with more noise than the others.
+            block.noise_scales.iter_mut().step_by(3).for_each(|scale| *scale = 1.5);
+            let means = block.means.chunks_exact(20).zip(block.actions.chunks_exact(20)).zip(&block.noise_scales);
+            for (((means, actions), scale), log_prob) in means.zip(&mut block.log_probs) {
+                let z = means.iter().zip(actions).map(|(mean, action)| (action - mean) / (0.5 * scale));
+                *log_prob = -0.5 * z.map(|z| z * z).sum::<f32>() - 20.0 * (0.5f32.ln() + 0.918_938_5);
+            }
+        }
+        ppo.backend.begin(&ppo.policy);
+        (ppo, rollout)
+    }
+
+    /// One gradient step at the rate of 1e-3, without clipping.
+    fn step(ppo: &mut Ppo) {
+        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 1e-3, 1.0);
+    }
+
+    /// The gradient of these samples, which stays in the learner.
+    fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
+        ppo.backend.gradient(&ppo.policy, rollout, samples, &mut ppo.gradient).unwrap()
+    }
+
+    /// These numbers parameter by parameter.
+    fn by_name<'a>(policy: &Policy, numbers: &'a [f32]) -> Vec<(String, &'a [f32])> {
+        policy.layout.views().into_iter().map(|view| (view.name, &numbers[view.range])).collect()
+    }
+
+    #[track_caller]
+    fn assert_close(found: f64, expected: f64, tolerance: f64, what: &str) {
+        assert!((found - expected).abs() <= tolerance * expected.abs().max(1e-6), "{what}: {found} not {expected}");
+    }
+
+    #[test]
+    fn losses_and_gradients_of_the_kernels_are_those_of_candle() {
+        for activation in [Activation::Elu, Activation::Relu, Activation::Tanh] {
+            // Three sizes of minibatches: one group, whole groups, and blocks that do not divide the last group.
+            for samples in [20, 1024, 1301] {
+                let what = format!("{activation:?}, {samples} samples");
+                let [(fused, kernels), (candle, reference)] = BACKENDS.map(|backend| {
+                    let (mut ppo, rollout) = learner(backend, activation);
+                    let samples: Vec<u32> = (0..samples).map(|i| (i * 7) % rollout.samples() as u32).collect();
+                    (gradient(&mut ppo, &rollout, &samples), ppo)
+                });
+                for (name, found, expected) in [
+                    ("total", fused.total, candle.total),
+                    ("policy", fused.policy, candle.policy),
+                    ("value", fused.value, candle.value),
+                    ("excess", fused.excess, candle.excess),
+                    ("kl", fused.kl, candle.kl),
+                    ("ratio", fused.ratio_error, candle.ratio_error),
+                ] {
+                    assert_close(found, expected, 2e-4, &format!("{what}: {name}"));
+                }
+                assert_eq!(fused.clip_fraction, candle.clip_fraction, "{what}");
+                assert!((0.05..0.98).contains(&fused.clip_fraction), "{what}: some are clipped, not all");
+                let [a, b] = [&kernels, &reference].map(|ppo| by_name(&ppo.policy, &ppo.gradient));
+                for ((name, a), (_, b)) in a.into_iter().zip(b) {
+                    let largest = b.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+                    let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                    assert!(
+                        largest > 0.0 && error < 1e-4 * largest,
+                        "{what}: gradient of {name}: {error} of {largest}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn many_steps_of_the_kernels_stay_with_candles() {
+        let [fused, candle] = BACKENDS.map(|backend| {
+            let (mut ppo, rollout) = learner(backend, Activation::Elu);
+            for part in 0..20 {
+                let samples: Vec<u32> = (0..256).map(|i| (i * 5 + part * 31) % rollout.samples() as u32).collect();
+                gradient(&mut ppo, &rollout, &samples);
+                step(&mut ppo);
+            }
+            ppo
+        });
+        let first = learner(config::Backend::Fused, Activation::Elu).0;
+        let [fused, candle, first] = [&fused, &candle, &first].map(|ppo| by_name(&ppo.policy, &ppo.policy.parameters));
+        for (((name, a), (_, b)), (_, first)) in fused.into_iter().zip(candle).zip(first) {
+            let difference =
+                |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt();
+            let (apart, moved) = (difference(a, b), difference(a, first));
+            assert!(apart < 1e-2 * moved, "{name} moved by {moved}, and is {apart} from candle's");
+        }
+    }
+
+    #[test]
+    fn gradients_of_a_larger_norm_than_allowed_are_scaled_down_to_it() {
+        // Adam's first step moves a weight by the rate; gradients far below its epsilon of 1e-8 hardly move anything.
+        for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
+            let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
+            (ppo.config.epochs, ppo.config.minibatches, ppo.config.desired_kl) = (1, 1, 0.0);
+            (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
+            let before = ppo.policy.parameters.clone();
+            ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();
+            let moved = before.iter().zip(&ppo.policy.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(moved <= most && moved >= least, "{norm}: {moved}");
+        }
+    }
+
+    #[test]
+    fn gradients_are_the_same_bits_for_any_number_of_threads_and_whatever_came_before() {
+        for precision in [Precision::F32, Precision::Bf16Rounded] {
+            let run = |threads: &[usize]| {
+                let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Tanh);
+                let arithmetic = Arithmetic::new(precision).unwrap();
+                ppo.backend = Box::new(Kernels::new(&ppo.config, &ppo.policy, arithmetic));
+                ppo.backend.begin(&ppo.policy);
+                let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
+                let mut losses = Vec::new();
+                for (i, &number) in threads.iter().enumerate() {
+                    // First a few samples, in the end all.
+                    let samples = if i + 1 < threads.len() { &samples[..40] } else { &samples[..] };
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(number).build().unwrap();
+                    losses.push(pool.install(|| gradient(&mut ppo, &rollout, samples)));
+                }
+                step(&mut ppo);
+                (losses.pop(), ppo.gradient, ppo.policy.parameters)
+            };
+            let one = run(&[1]);
+            for threads in [&[2][..], &[8], &[1, 2], &[2, 8], &[8, 1]] {
+                assert!(one == run(threads), "{precision:?}, {threads:?} threads");
+            }
+        }
+    }
+
+    #[test]
+    fn the_smallest_nets_and_minibatches_agree_with_candle() {
+        let spaces = Spaces { observation_size: 1, action_size: 1, cube_and_goal: None, ..SPACES };
+        let [fused, candle] = BACKENDS.map(|backend| {
+            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            (config.backend, config.hidden, config.symmetry) = (backend, vec![1], config::Symmetry::None);
+            let mut ppo = Ppo::new(&config, spaces, 3).unwrap();
+            let mut rollout = Rollout::new(1, &[1], &spaces);
+            rollout.blocks[0].observations.fill(0.7);
+            rollout.blocks[0].actions.fill(0.4);
+            rollout.blocks[0].advantages.fill(1.5);
+            rollout.blocks[0].returns.fill(0.3);
+            ppo.backend.begin(&ppo.policy);
+            (gradient(&mut ppo, &rollout, &[0]), ppo.gradient)
+        });
+        assert_close(fused.0.total, candle.0.total, 1e-5, "loss");
+        assert!(fused.1.iter().zip(&candle.1).all(|(a, b)| (a - b).abs() < 1e-5), "{:?} not {:?}", fused.1, candle.1);
+    }
+}

@@ -1,0 +1,94 @@
+//! The same computation in candle's own tensors, layers and automatic gradients: slower, the reference that the kernels are
+//! compared with, and the place to try a change of the algorithm first. No other folder names candle.
+
+mod loss;
+mod nets;
+
+use anyhow::Result;
+use candle_core::{Device, Module, Tensor};
+
+use super::Policy;
+use super::backend::{self, Backend};
+use super::rollout::{Rollout, RolloutBlock};
+use crate::config::PpoConfig;
+use crate::spaces::Spaces;
+use loss::{Gaussian, Minibatch};
+use nets::Nets;
+
+/// Gradients by candle.
+pub struct Reference {
+    config: PpoConfig,
+    /// `[A]`, of the policy that collected the rollout.
+    old_log_std: Vec<f32>,
+}
+
+impl Reference {
+    /// With these settings.
+    pub fn new(config: &PpoConfig) -> Self {
+        Self { config: config.clone(), old_log_std: Vec::new() }
+    }
+
+    /// These samples of a rollout.
+    fn minibatch(&self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Minibatch> {
+        let Spaces { observation_size, action_size, .. } = policy.spaces;
+        let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
+            let located = samples.iter().map(|&sample| rollout.locate(sample));
+            located.flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)]).copied().collect()
+        };
+        let rows = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
+        let column = |of| Tensor::from_vec(array(1, of), samples.len(), &Device::Cpu);
+        let raw = array(observation_size, |block| &block.observations);
+        let mut observations = vec![0.0; raw.len()];
+        policy.reader().read(&raw, &mut observations);
+        Ok(Minibatch {
+            observations: rows(observation_size, observations)?,
+            actions: rows(action_size, array(action_size, |block| &block.actions))?,
+            old: Gaussian {
+                means: rows(action_size, array(action_size, |block| &block.means))?,
+                log_std: Tensor::new(&self.old_log_std[..], &Device::Cpu)?,
+                scales: rows(1, array(1, |block| &block.noise_scales))?,
+            },
+            old_log_probs: column(|block| &block.log_probs)?,
+            old_values: column(|block| &block.values)?,
+            advantages: column(|block| &block.advantages)?,
+            returns: column(|block| &block.returns)?,
+        })
+    }
+}
+
+impl Backend for Reference {
+    fn begin(&mut self, policy: &Policy) {
+        self.old_log_std = policy.log_std().to_vec();
+    }
+
+    fn gradient(
+        &mut self,
+        policy: &Policy,
+        rollout: &Rollout,
+        samples: &[u32],
+        out: &mut [f32],
+    ) -> Result<backend::Losses> {
+        let (batch, nets) = (self.minibatch(policy, rollout, samples)?, Nets::new(policy)?);
+        let means = nets.actor.forward(&batch.observations)?;
+        let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
+        let log_std = nets.log_std.as_tensor().clone();
+        let new = Gaussian { means, log_std, scales: batch.old.scales.clone() };
+        let losses = loss::losses(&self.config, &batch, &new, &values)?;
+        nets.write_gradient(&losses.total.backward()?, out)?;
+        let ratios = losses.ratios.to_vec1::<f32>()?;
+        let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
+        Ok(backend::Losses {
+            total: scalar(&losses.total)?,
+            policy: scalar(&losses.policy)?,
+            value: scalar(&losses.value)?,
+            excess: scalar(&losses.excess)?,
+            kl: scalar(&losses.kl)?,
+            clip_fraction: errors().filter(|&error| error > self.config.clip).count() as f64 / ratios.len() as f64,
+            ratio_error: errors().fold(0.0, f64::max),
+        })
+    }
+}
+
+fn scalar(tensor: &Tensor) -> Result<f64> {
+    Ok(f64::from(tensor.to_scalar::<f32>()?))
+}

@@ -1,0 +1,116 @@
+//! Where each weight of a policy lies in the one array that holds them all.
+//!
+//! Everything that works on all weights alike (the optimizer, the norm of a gradient, a sum over machines) takes the array as it
+//! is; everything that means one of them goes by its range.
+
+use std::ops::Range;
+
+/// The name of the logarithm of the standard deviations.
+const LOG_STD: &str = "log_std";
+
+/// The parameters of a policy, in order: actor, critic, each layer by layer, weights before biases; then the logarithm of the
+/// standard deviations.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layout {
+    /// The layers of the actor.
+    pub actor: Vec<Layer>,
+    /// The layers of the critic.
+    pub critic: Vec<Layer>,
+    /// The logarithm of the standard deviations, `[A]`.
+    pub log_std: Range<usize>,
+}
+
+/// One layer of a net.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layer {
+    /// Numbers that go in.
+    pub inputs: usize,
+    /// Numbers that come out.
+    pub outputs: usize,
+    /// `[outputs, inputs]`
+    pub weight: Range<usize>,
+    /// `[outputs]`
+    pub bias: Range<usize>,
+}
+
+/// One parameter as it is named in a file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// `actor.0.weight`, for example.
+    pub name: String,
+    /// Sizes of its dimensions.
+    pub shape: Vec<usize>,
+    /// Its numbers, by rows.
+    pub range: Range<usize>,
+}
+
+impl Layout {
+    /// Of nets with these hidden layers, for observations and actions of these sizes.
+    pub fn new(hidden: &[usize], observation_size: usize, action_size: usize) -> Self {
+        let mut at = 0;
+        let mut take = |count: usize| {
+            at += count;
+            at - count..at
+        };
+        let mut net = |outputs: usize| -> Vec<Layer> {
+            let mut inputs = observation_size;
+            let layer = |&outputs: &usize| {
+                let layer = Layer { inputs, outputs, weight: take(outputs * inputs), bias: take(outputs) };
+                inputs = outputs;
+                layer
+            };
+            hidden.iter().chain([&outputs]).map(layer).collect()
+        };
+        let (actor, critic) = (net(action_size), net(1));
+        Self { actor, critic, log_std: take(action_size) }
+    }
+
+    /// The number of weights, biases and standard deviations.
+    pub fn count(&self) -> usize {
+        self.log_std.end
+    }
+
+    /// The numbers of actor, critic and standard deviations.
+    pub fn groups(&self) -> [Range<usize>; 3] {
+        let of = |net: &[Layer]| net[0].weight.start..net[net.len() - 1].bias.end;
+        [of(&self.actor), of(&self.critic), self.log_std.clone()]
+    }
+
+    /// Each parameter with its name, in order.
+    pub fn views(&self) -> Vec<View> {
+        let mut views = Vec::new();
+        for (net, layers) in [("actor", &self.actor), ("critic", &self.critic)] {
+            for (i, Layer { inputs, outputs, weight, bias }) in layers.iter().enumerate() {
+                let weight_shape = vec![*outputs, *inputs];
+                views.push(View { name: format!("{net}.{i}.weight"), shape: weight_shape, range: weight.clone() });
+                views.push(View { name: format!("{net}.{i}.bias"), shape: vec![*outputs], range: bias.clone() });
+            }
+        }
+        views.push(View { name: LOG_STD.into(), shape: vec![self.log_std.len()], range: self.log_std.clone() });
+        views
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_views_cover_all_numbers_once_and_have_the_names_of_the_files() {
+        let layout = Layout::new(&[5, 4], 3, 2);
+        let views = layout.views();
+        let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let layers = "0.weight 0.bias 1.weight 1.bias 2.weight 2.bias";
+        let of = |net: &str| layers.split(' ').map(|layer| format!("{net}.{layer} ")).collect::<String>();
+        assert_eq!(names.join(" "), of("actor") + &of("critic") + "log_std");
+        let mut end = 0;
+        for View { name, shape, range } in &views {
+            assert_eq!((range.start, range.len()), (end, shape.iter().product()), "{name}");
+            end = range.end;
+        }
+        assert_eq!(end, layout.count());
+        assert_eq!(views[4].shape, [2, 4], "the actor's last layer");
+        let [actor, critic, log_std] = layout.groups();
+        assert_eq!([actor.start, actor.end, critic.end, log_std.end], [0, critic.start, log_std.start, end]);
+    }
+}

@@ -1,0 +1,202 @@
+//! What happens to the run folder while a training writes into it: it is damaged, deleted, replaced, or its disk is full.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+use std::time::{Duration, Instant};
+
+use crate::support::{command, names, program, stderr, succeeded, train};
+use crate::survival::{begun, ended_by, endless, iterations, result, resume, send};
+
+#[test]
+fn the_newest_checkpoints_are_kept_as_many_as_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "1280", "--run-dir", "run", "--keep", "3", "--set", "run.checkpoint_every=1"]);
+    succeeded(program(folder.path(), &args));
+    let expected = ["best", "iteration-00000008", "iteration-00000009", "iteration-00000010", "latest"];
+    assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
+    // As many in a resumed run, where nothing else is said.
+    succeeded(resume(folder.path(), &["--total-steps", "1408"]));
+    let expected = ["best", "iteration-00000009", "iteration-00000010", "iteration-00000011", "latest"];
+    assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
+}
+
+#[test]
+fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "512", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    succeeded(program(folder.path(), &args));
+    let expected = result(folder.path(), "run");
+    let latest = folder.path().join("run/checkpoints/latest.safetensors");
+    // In place, as a disk does it: the same file under both its names.
+    let mut bytes = fs::read(&latest).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&latest, bytes).unwrap();
+    let output = succeeded(resume(folder.path(), &[]));
+    let said = stderr(&output);
+    assert!(said.contains("warning: cannot use") && said.contains("checksum") && said.contains("one before"), "{said}");
+    assert!(said.contains("1 rows of metrics.csv after iteration 3 are dropped"), "{said}");
+    assert!(result(folder.path(), "run") == expected);
+    for name in names(&folder.path().join("run/checkpoints")) {
+        fs::write(folder.path().join("run/checkpoints").join(name), "gone").unwrap();
+    }
+    let output = resume(folder.path(), &[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("error: cannot resume run"), "{}", stderr(&output));
+}
+
+#[test]
+fn whoever_goes_back_to_an_older_checkpoint_goes_on_from_there_even_if_killed_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["--total-steps", "1280", "--run-dir", "run", "--keep", "9", "--set", "run.checkpoint_every=2"];
+    succeeded(program(folder.path(), &train(&args)));
+    let expected = result(folder.path(), "run");
+    let older = "run/checkpoints/iteration-00000004.safetensors";
+    // No time for a single iteration.
+    succeeded(program(folder.path(), &["train", "--resume", older, "--keep", "9", "--stop-after", "1ms"]));
+    assert_eq!(iterations(folder.path()), 4);
+    let found = names(&folder.path().join("run/checkpoints"));
+    assert!(found.contains(&"iteration-00000010.later".to_owned()), "nothing is thrown away: {found:?}");
+    let output = succeeded(resume(folder.path(), &["--total-steps", "1280"]));
+    assert!(!stderr(&output).contains("dropped"), "{}", stderr(&output));
+    assert!(result(folder.path(), "run") == expected);
+}
+
+#[test]
+fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("tmp")).unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    let mut first = command(folder.path(), &args);
+    first.env("TMPDIR", folder.path().join("tmp"));
+    let (first, first_lines) = begun(first);
+    send("STOP", &first);
+    fs::rename(folder.path().join("run"), folder.path().join("gone")).unwrap();
+    let (second, second_lines) = begun(command(folder.path(), &args));
+    send("CONT", &first);
+    let (code, said) = ended_by("TERM", first, first_lines);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("is being trained in by another program") && said.contains("instead"), "{said}");
+    assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
+    let made = iterations(folder.path());
+    succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+}
+
+#[test]
+fn a_file_that_may_not_grow_any_more_costs_rows_but_not_the_training() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings = train(&["--total-steps", "64000", "--run-dir", "run", "--set", "run.checkpoint_every=5"]).join(" ");
+    // In blocks of 512 bytes: room for a checkpoint of 124 KB, not for 500 rows. Writes beyond it fail as on a full disk.
+    let script = format!("trap '' XFSZ; ulimit -f 280; exec {} {settings}", env!("CARGO_BIN_EXE_shadow-repose"));
+    let output = Command::new("sh").args(["-c", &script]).current_dir(folder.path()).output().unwrap();
+    let said = stderr(&succeeded(output));
+    assert!(said.contains("metrics.csv is not written for now") && said.contains("metrics.csv lacks"), "{said}");
+    let rows = iterations(folder.path());
+    assert!((100..500).contains(&rows), "{rows} rows");
+    succeeded(program(folder.path(), &["play", "--ckpt", "run", "--episodes", "2", "--json"]));
+    succeeded(resume(folder.path(), &["--total-steps", "64128"]));
+}
+
+#[test]
+fn two_trainings_in_one_folder_are_refused_and_a_crash_leaves_no_lock() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut child, lines) = endless(folder.path(), &[]);
+    let second = resume(folder.path(), &[]);
+    assert_eq!(second.status.code(), Some(1));
+    let who = format!("another program: process {}", child.id());
+    assert!(stderr(&second).contains(&who), "{}", stderr(&second));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    drop(lines);
+    succeeded(resume(folder.path(), &["--total-steps", "128"]));
+}
+
+#[test]
+fn a_folder_that_is_deleted_meanwhile_is_made_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
+    let (child, lines) = begun(command(folder.path(), &args));
+    let run = folder.path().join("run");
+    // The training may be writing into it at this very moment.
+    let patience = Instant::now();
+    while fs::remove_dir_all(&run).is_err() && run.exists() {
+        assert!(patience.elapsed() < Duration::from_secs(30));
+    }
+    while !run.join("checkpoints/latest.safetensors").exists() {
+        assert!(patience.elapsed() < Duration::from_secs(30), "no checkpoint is written");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let (code, said) = ended_by("TERM", child, lines);
+    assert_eq!(code, Some(143), "{said}");
+    let made = iterations(folder.path());
+    succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
+    assert!(names(&run).contains(&"config.toml".to_owned()));
+}
+
+#[test]
+fn a_state_that_cannot_be_saved_in_its_place_in_the_end_is_saved_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("tmp")).unwrap();
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1000000"]);
+    let mut training = command(folder.path(), &args);
+    training.env("TMPDIR", folder.path().join("tmp"));
+    let (child, lines) = begun(training);
+    // A file where a folder should be stops everybody, root too.
+    let checkpoints = folder.path().join("run/checkpoints");
+    fs::remove_dir_all(&checkpoints).unwrap();
+    fs::write(&checkpoints, "in the way").unwrap();
+    let (code, said) = ended_by("TERM", child, lines);
+    assert_eq!(code, Some(1), "{said}");
+    let elsewhere = folder.path().join("tmp").join(&names(&folder.path().join("tmp"))[0]).display().to_string();
+    assert!(said.contains(&format!("--resume {elsewhere}")) && said.contains("error: cannot create"), "{said}");
+    let resumed = program(folder.path(), &["train", "--resume", &elsewhere, "--stop-after", "300ms"]);
+    assert!(stderr(&succeeded(resumed)).contains("stopped after"));
+}
+
+/// Runs a shell script with a file system of `size` at `small` in `folder`, of its own and gone with it; none where the
+/// system does not let us.
+fn with_small_disk(folder: &Path, size: &str, script: &str) -> Option<Output> {
+    fs::create_dir(folder.join("small")).unwrap();
+    let unshared = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--user", "--map-root-user", "--mount", "sh", "-c", script]).current_dir(folder);
+        command.env("PROGRAM", env!("CARGO_BIN_EXE_shadow-repose")).env("TMPDIR", folder).output()
+    };
+    let mount = format!("mount -t tmpfs -o size={size} none small && ");
+    let possible = unshared(&format!("{mount} true")).is_ok_and(|output| output.status.success());
+    if !possible {
+        eprintln!("not tested: file systems cannot be mounted here");
+        return None;
+    }
+    Some(unshared(&format!("{mount} {script}")).unwrap())
+}
+
+#[test]
+fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings =
+        train(&["--total-steps", "100000", "--run-dir", "small/run", "--set", "run.checkpoint_every=5"]).join(" ");
+    // The disk is full from early on, and is given room again before a second one comes to its end.
+    let script = format!(
+        "($PROGRAM {settings} 2> said & train=$!
+          until grep -q steps/s said || ! kill -0 $train; do sleep 0.01; done
+          cat /dev/zero > small/filler 2> /dev/null
+          wait $train; echo code $?
+          rm small/filler
+          $PROGRAM play --ckpt small/run --episodes 2 --json
+          $PROGRAM train --resume small/run; echo code $?)"
+    );
+    let Some(output) = with_small_disk(folder.path(), "2m", &script) else { return };
+    let said = fs::read_to_string(folder.path().join("said")).unwrap();
+    let printed = String::from_utf8_lossy(&output.stdout);
+    let lines: Vec<&str> = printed.lines().collect();
+    // Full in the end too: that is an error, and the state is elsewhere.
+    assert_eq!(lines[0], "code 1", "{said}");
+    assert!(said.contains("tried again at the next checkpoint") && said.contains("No space left"), "{said}");
+    assert!(said.contains("99968 of 100000") || said.contains("100096 of 100000"), "all steps were made: {said}");
+    assert!(said.contains("instead; go on with"), "{said}");
+    assert!(said.contains("metrics.csv lacks"), "what was lost is counted: {said}");
+    assert!(lines[1].contains("\"episodes\":2"), "the last whole checkpoint plays: {printed}");
+    assert_eq!(lines[2], "code 0", "{}", stderr(&output));
+}
