@@ -49,7 +49,8 @@ impl Origin {
             Self::BuiltIn => (Checkpoint::parse(BUILTIN_POLICY)?, Path::new(BUILTIN)),
             Self::File(path) => (read(path)?, path.as_path()),
         };
-        let config = for_playing(&checkpoint, path, overrides).with_context(|| cannot_use(path))?;
+        let config = for_playing(&checkpoint, path, overrides);
+        let config = if *self == Self::BuiltIn { config } else { config.with_context(|| cannot_use(path)) }?;
         Ok((checkpoint, config))
     }
 }

@@ -39,6 +39,7 @@ impl Trace {
             "actuator_names": ACTUATORS.map(|actuator| format!("rh_A_{actuator}")),
             "fingertip_names": FINGERTIPS,
             "quaternion_order": "wxyz",
+            "vel_obs_scale": config.vel_obs_scale,
         });
         Self { header, episodes: Vec::new(), last: usize::MAX }
     }

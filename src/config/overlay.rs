@@ -32,7 +32,7 @@ fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
 }
 
 /// Whoever has so many is helped by the first of them.
-const MOST_PROBLEMS: usize = 20;
+const MOST_PROBLEMS: usize = 30;
 
 /// Lays `table` over `merged`, whose keys and types are those of `base`; what does not fit is left out and reported.
 pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {

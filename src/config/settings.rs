@@ -130,7 +130,7 @@ pub enum Symmetry {
     Cube,
 }
 
-/// What computes the nets, their gradients and the steps of the optimizer.
+/// What computes the gradients.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {

@@ -16,37 +16,29 @@ pub struct Part {
     pub unit: &'static str,
 }
 
-/// All parts in order. Positions and velocities are the world's; quaternions are w,x,y,z, and all but the fingertips' have w ≥ 0.
-/// Of each fingertip: position, quaternion, linear and angular velocity.
-pub const OBSERVATION: [Part; 11] = {
-    let mut parts = [
-        part("joint_pos", JOINTS.len(), "rad"),
-        part("joint_vel", JOINTS.len(), "rad/s * env.vel_obs_scale"),
-        part("cube_pos", 3, "m"),
-        part("cube_quat", 4, "1"),
-        part("cube_linvel", 3, "m/s"),
-        part("cube_angvel", 3, "rad/s * env.vel_obs_scale"),
-        part("goal_pos", 3, "m"),
-        part("goal_quat", 4, "1"),
-        part("relative_quat", 4, "1"),
-        part("fingertips", 13 * FINGERTIPS.len(), "m, 1, m/s, rad/s"),
-        part("previous_action", ACTION_SIZE, "1"),
-    ];
-    let mut i = 1;
-    while i < parts.len() {
-        parts[i].start = parts[i - 1].start + parts[i - 1].length;
-        i += 1;
-    }
-    parts
-};
+// Each begins where the one before it ends.
+const JOINT_POS: Part = Part { name: "joint_pos", start: 0, length: JOINTS.len(), unit: "rad" };
+const JOINT_VEL: Part = JOINT_POS.then("joint_vel", JOINTS.len(), "rad/s * vel_obs_scale");
+const CUBE_POS: Part = JOINT_VEL.then("cube_pos", 3, "m");
+const CUBE_QUAT: Part = CUBE_POS.then("cube_quat", 4, "1");
+const CUBE_LINVEL: Part = CUBE_QUAT.then("cube_linvel", 3, "m/s");
+const CUBE_ANGVEL: Part = CUBE_LINVEL.then("cube_angvel", 3, "rad/s * vel_obs_scale");
+const GOAL_POS: Part = CUBE_ANGVEL.then("goal_pos", 3, "m");
+const GOAL_QUAT: Part = GOAL_POS.then("goal_quat", 4, "1");
+const RELATIVE_QUAT: Part = GOAL_QUAT.then("relative_quat", 4, "1");
+const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
+const TIPS: Part = RELATIVE_QUAT.then("fingertips", 13 * FINGERTIPS.len(), OF_FINGERTIPS);
+const PREVIOUS_ACTION: Part = TIPS.then("previous_action", ACTION_SIZE, "1");
 
-const CUBE_QUAT: Part = OBSERVATION[3];
-const GOAL_QUAT: Part = OBSERVATION[7];
-const RELATIVE_QUAT: Part = OBSERVATION[8];
-const LAST: Part = OBSERVATION[OBSERVATION.len() - 1];
+/// All parts in order. Positions and velocities are the world's; quaternions are w,x,y,z, and all but the fingertips' have w ≥ 0.
+#[rustfmt::skip]
+pub const OBSERVATION: [Part; 11] = [
+    JOINT_POS, JOINT_VEL, CUBE_POS, CUBE_QUAT, CUBE_LINVEL, CUBE_ANGVEL,
+    GOAL_POS, GOAL_QUAT, RELATIVE_QUAT, TIPS, PREVIOUS_ACTION,
+];
 
 /// Numbers in an observation.
-pub const OBSERVATION_SIZE: usize = LAST.start + LAST.length;
+pub const OBSERVATION_SIZE: usize = PREVIOUS_ACTION.start + PREVIOUS_ACTION.length;
 
 /// What a learner of this task must know.
 pub const SPACES: Spaces = Spaces {
@@ -56,8 +48,11 @@ pub const SPACES: Spaces = Spaces {
     distance: rotation_error,
 };
 
-const fn part(name: &'static str, length: usize, unit: &'static str) -> Part {
-    Part { name, start: 0, length, unit }
+impl Part {
+    /// The part that follows.
+    const fn then(self, name: &'static str, length: usize, unit: &'static str) -> Self {
+        Self { name, start: self.start + self.length, length, unit }
+    }
 }
 
 /// The rotation error that an observation shows, rad.
@@ -89,6 +84,11 @@ impl<'a> Cells<'a> {
             .for_each(|(cell, value)| *cell = value as f32);
         self.written += N;
         self.part += usize::from(self.written == start + length);
+    }
+
+    /// Makes sure that nothing is left of what was there before.
+    pub(super) fn finish(self) {
+        assert_eq!(self.written, OBSERVATION_SIZE, "numbers of an observation");
     }
 }
 
@@ -126,5 +126,15 @@ mod tests {
         assert!(!refused(|cells| cells.put("joint_pos", [0.0; 24])));
         assert!(refused(|cells| cells.put("joint_pos", [0.0; 25])), "too many");
         assert!(refused(|cells| cells.put("joint_vel", [0.0; 24])), "out of order");
+        let all = |cells: &mut Cells| {
+            for part in OBSERVATION {
+                (0..part.length).for_each(|_| cells.put(part.name, [0.0]));
+            }
+        };
+        let mut observation = [0.0; OBSERVATION_SIZE];
+        let mut cells = Cells::new(&mut observation);
+        all(&mut cells);
+        cells.finish();
+        assert!(refused(|cells| std::mem::replace(cells, Cells { cells: &mut [], written: 0, part: 0 }).finish()));
     }
 }

@@ -69,7 +69,7 @@ impl Repose {
     /// An environment of `task`; it must be reset before it is stepped.
     pub fn new(task: &Arc<Task>) -> Self {
         Self {
-            sim: task.scene.simulate(),
+            sim: Simulation::new(&task.scene),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
@@ -226,6 +226,7 @@ impl Repose {
             cells.put("fingertips", angular);
         }
         cells.put("previous_action", self.previous_action.map(f64::from));
+        cells.finish();
     }
 }
 

@@ -43,7 +43,7 @@ mod tests {
                 *log_prob = -0.5 * z.map(|z| z * z).sum::<f32>() - 20.0 * (0.5f32.ln() + 0.918_938_5);
             }
         }
-        ppo.backend.begin(&ppo.policy);
+        ppo.backend.begin(&ppo.policy, &rollout);
         (ppo, rollout)
     }
 
@@ -144,8 +144,8 @@ mod tests {
             let run = |threads: &[usize]| {
                 let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Tanh);
                 let arithmetic = Arithmetic::new(precision).unwrap();
-                ppo.backend = Box::new(Kernels::new(&ppo.config, &ppo.policy, arithmetic));
-                ppo.backend.begin(&ppo.policy);
+                ppo.backend = Box::new(Kernels::new(&ppo.config, arithmetic));
+                ppo.backend.begin(&ppo.policy, &rollout);
                 let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
                 let mut losses = Vec::new();
                 for (i, &number) in threads.iter().enumerate() {
@@ -176,7 +176,7 @@ mod tests {
             rollout.blocks[0].actions.fill(0.4);
             rollout.blocks[0].advantages.fill(1.5);
             rollout.blocks[0].returns.fill(0.3);
-            ppo.backend.begin(&ppo.policy);
+            ppo.backend.begin(&ppo.policy, &rollout);
             (gradient(&mut ppo, &rollout, &[0]), ppo.gradient)
         });
         assert_close(fused.0.total, candle.0.total, 1e-5, "loss");

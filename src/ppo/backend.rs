@@ -26,7 +26,7 @@ pub struct Losses {
 /// A way to compute gradients.
 pub trait Backend: Send {
     /// Prepares for the minibatches of a rollout, before any step on it: this is the policy that has collected it.
-    fn begin(&mut self, policy: &Policy);
+    fn begin(&mut self, policy: &Policy, rollout: &Rollout);
 
     /// Writes the gradient of the losses of these samples, all of which lie in the rollout, with respect to the parameters of the
     /// policy, in their order.

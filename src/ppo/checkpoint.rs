@@ -297,7 +297,7 @@ mod tests {
         ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
-        ppo.backend.begin(&ppo.policy);
+        ppo.backend.begin(&ppo.policy, &rollout);
         ppo.minibatch_step(&rollout, &samples, true).unwrap();
         ppo
     }

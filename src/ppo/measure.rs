@@ -18,7 +18,7 @@ const LIMIT: f64 = 5.0;
 /// A loss or gradient that is not finite.
 pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<f64>> {
     ppo.prepare(rollout);
-    ppo.backend.begin(&ppo.policy);
+    ppo.backend.begin(&ppo.policy, rollout);
     // Samples from all over the rollout, as a shuffled minibatch has them.
     let (samples, step) = (rollout.samples(), ppo.config.minibatches);
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();

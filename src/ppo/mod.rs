@@ -6,7 +6,6 @@
 
 mod acting;
 mod adam;
-mod agreement;
 mod backend;
 mod candle;
 mod checkpoint;
@@ -99,7 +98,7 @@ impl Ppo {
         let policy = Policy::random(&config.net(), spaces, std, seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn Backend> = match config.backend {
-            config::Backend::Fused => Box::new(Kernels::new(config, &policy, arithmetic)),
+            config::Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
             config::Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
@@ -158,7 +157,7 @@ impl Ppo {
 
     fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         let explained_variance = self.prepare(rollout);
-        self.backend.begin(&self.policy);
+        self.backend.begin(&self.policy, rollout);
         let size = rollout.samples() / self.config.minibatches;
         let mut shuffle = rng::stream(self.seed, "shuffle", iteration);
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
@@ -272,6 +271,9 @@ fn mean_and_variance<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> (f64,
 }
 
 #[cfg(test)]
+mod agreement;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::Config;
@@ -297,6 +299,16 @@ mod tests {
         assert_eq!(ppo.learning_rate, 5e-4);
         (0..9).for_each(|_| ppo.adapt_learning_rate(1e-4));
         assert_eq!(ppo.learning_rate, 2e-3);
+    }
+
+    #[test]
+    fn the_entropy_is_that_of_a_gaussian_with_these_standard_deviations() {
+        let mut ppo = learner(0.0);
+        let rollout = Rollout::new(1, &[4], &SPACES);
+        ppo.backend.begin(&ppo.policy, &rollout);
+        // Of a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of two actions.
+        let step = ppo.minibatch_step(&rollout, &[0, 1, 2, 3], true).unwrap();
+        assert!((step.entropy - 2.0 * 0.908_113).abs() < 1e-5, "{}", step.entropy);
     }
 
     #[test]

@@ -8,8 +8,8 @@ use mujoco_rs::prelude::{
     MjData, MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
 
+use super::Look;
 use super::fatal::quieten_mujoco;
-use super::{Look, Simulation};
 
 /// The scene that is built into the program.
 const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -149,11 +149,6 @@ impl Scene {
             );
         }
         Ok(scene)
-    }
-
-    /// A new simulation of this scene, in its default state.
-    pub fn simulate(&self) -> Simulation {
-        Simulation::new(self.model.clone())
     }
 
     /// A number that is another one for a scene that differs in anything.

@@ -38,8 +38,9 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    pub(super) fn new(model: Arc<MjModel>) -> Self {
-        Self { data: MjData::new(model) }
+    /// A simulation of this scene, in its default state.
+    pub fn new(scene: &Scene) -> Self {
+        Self { data: MjData::new(scene.model.clone()) }
     }
 
     /// The default state, without warm start and warnings; call [`Simulation::refresh`] after changing it.

@@ -14,7 +14,7 @@ use crate::cli::TrainArgs;
 use crate::dump;
 use crate::env::{Lesson, Recent, Score};
 use crate::evaluate::{Actor, Episodes, evaluate};
-use crate::run::{self, Report, Requests, Status};
+use crate::run::{self, Report, Requests, RunFolder, Status};
 use crate::schedule::panic_message;
 use log::{row, tags};
 use saver::Saver;
@@ -53,16 +53,12 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     saver.save_at_first()?;
     let mut report = open_report(&session, &saver)?;
     while !session.finished() {
-        let (iteration, evaluation) = match session.iterate(requests.stop(), &report) {
-            Ok(Some(done)) => done,
-            Ok(None) => return stop(saver, &mut report, requests),
+        let dumps = args.dump_diverged.then_some(saver.folder());
+        match session.iterate(requests.stop(), &mut report, dumps) {
+            Ok(true) => saver.take(session.checkpoint()),
+            Ok(false) => return stop(saver, &mut report, requests),
             Err(error) => return Err(give_up(error, saver, &mut report)),
-        };
-        if args.dump_diverged {
-            session.dump_diverged(&saver, &report);
         }
-        session.report(&mut report, &iteration, evaluation);
-        saver.take(session.checkpoint());
         let due = session.agent.iteration.is_multiple_of(session.config.run.checkpoint_every);
         if (requests.take_save() || due)
             && !session.finished()
@@ -76,30 +72,35 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     Ok(Outcome::Finished)
 }
 
-/// What is known of an iteration, and its evaluation, if there was one.
-type Done = (Iteration<Lesson>, Option<Score>);
-
 impl Session {
-    /// One iteration, whatever happens in it, and its evaluation, if there is one; none if `stop` was set meanwhile. Where it does
-    /// not come to its end, only the end of the one before can be used.
-    fn iterate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Done>> {
+    /// One iteration, whatever happens in it; false if `stop` was set meanwhile. Where it does not come to its end, only the end of
+    /// the one before can be used. What led to diverged episodes is written into the folder `dumps`, if there is one.
+    fn iterate(&mut self, stop: &AtomicBool, report: &mut Report, dumps: Option<&RunFolder>) -> Result<bool> {
         let number = self.agent.iteration + 1;
-        let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report)));
+        let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report, dumps)));
         let result = caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
         result.with_context(|| format!("iteration {number}"))
     }
 
-    fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Done>> {
-        let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
-        if !self.agent.iteration.is_multiple_of(self.config.run.eval_every) {
-            return Ok(Some((iteration, None)));
+    fn collect_learn_evaluate(
+        &mut self,
+        stop: &AtomicBool,
+        report: &mut Report,
+        dumps: Option<&RunFolder>,
+    ) -> Result<bool> {
+        let Some(iteration) = self.agent.iterate(stop)? else { return Ok(false) };
+        let mut evaluation = Score::of(&[]);
+        if self.agent.iteration.is_multiple_of(self.config.run.eval_every) {
+            let Some(score) = self.evaluate(stop, report)? else { return Ok(false) };
+            let found = [score.goals, score.rot_dist];
+            self.best = if is_better(found, self.best) { Some(found) } else { self.best };
+            evaluation = score;
         }
-        let Some(score) = self.evaluate(stop, report)? else { return Ok(None) };
-        let found = [score.goals, score.rot_dist];
-        if is_better(found, self.best) {
-            self.best = Some(found);
+        if let Some(folder) = dumps {
+            self.dump_diverged(folder, report);
         }
-        Ok(Some((iteration, Some(score))))
+        self.report(report, &iteration, &evaluation);
+        Ok(true)
     }
 
     /// Plays the evaluation episodes.
@@ -122,25 +123,24 @@ impl Session {
         Ok(Some(score))
     }
 
-    fn report(&mut self, report: &mut Report, iteration: &Iteration<Lesson>, evaluation: Option<Score>) {
+    fn report(&mut self, report: &mut Report, iteration: &Iteration<Lesson>, evaluation: &Score) {
         let episodes = Score::of(&self.agent.pool.take_finished());
         let mut recent = Recent::default();
         for env in self.agent.pool.envs_mut() {
             recent += env.take_recent();
         }
-        let evaluation = evaluation.unwrap_or_else(|| Score::of(&[]));
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let status = Status { env_steps, steps_per_s, goals: episodes.goals, drop_rate: episodes.drop_rate };
-        report.iteration(self.agent.iteration, &row(iteration, &episodes, &recent, &evaluation), &status);
+        report.iteration(self.agent.iteration, &row(iteration, &episodes, &recent, evaluation), &status);
     }
 
     /// Writes what led to each episode that diverged.
-    fn dump_diverged(&mut self, saver: &Saver, report: &Report) {
+    fn dump_diverged(&mut self, folder: &RunFolder, report: &Report) {
         let iteration = self.agent.iteration;
         for (env, repose) in self.agent.pool.envs_mut().enumerate() {
             let Some(diverged) = repose.take_diverged() else { continue };
             let text = dump::of(&diverged, &self.config.env, iteration, env);
-            if let Err(error) = saver.folder().dump(&format!("iteration-{iteration:08}-env-{env}.json"), &text) {
+            if let Err(error) = folder.dump(&format!("iteration-{iteration:08}-env-{env}.json"), &text) {
                 report.warn(&format!("{error:#}"));
             }
         }
@@ -183,7 +183,6 @@ mod tests {
     use super::*;
     use crate::config::{Config, Override};
     use crate::ppo::Checkpoint;
-    use crate::run::RunFolder;
 
     #[test]
     fn a_panic_on_a_worker_thread_is_an_error_and_the_iteration_before_is_saved() {
@@ -194,11 +193,11 @@ mod tests {
         let (folder, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let mut saver = session.saver(folder, lock, &TrainArgs::default(), false);
         let (mut report, never) = (open_report(&session, &saver).unwrap(), AtomicBool::new(false));
-        assert!(session.iterate(&never, &report).unwrap().is_some(), "nothing stops it");
+        assert!(session.iterate(&never, &mut report, None).unwrap(), "nothing stops it");
         saver.take(session.checkpoint());
         // Room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, &report).unwrap_err();
+        let error = session.iterate(&never, &mut report, None).unwrap_err();
         let latest = saver.folder().checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");

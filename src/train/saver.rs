@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Error, Result, anyhow};
 
+use crate::load;
 use crate::ppo::Checkpoint;
 use crate::run::{self, Locked, Report, RunFolder};
 use crate::{env, sim};
@@ -17,8 +18,8 @@ pub struct Saver {
     /// The options with which this training is resumed.
     options: String,
     end: Arc<Checkpoint>,
-    /// The newest checkpoint of the folder is that end.
-    is_saved: bool,
+    /// The newest checkpoint of the folder is where this session begins.
+    begins_saved: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
     best: Option<Arc<Checkpoint>>,
     best_is_saved: bool,
@@ -32,12 +33,12 @@ impl Saver {
         keep: Option<usize>,
         options: String,
         end: Checkpoint,
-        is_saved: bool,
+        begins_saved: bool,
     ) -> Self {
         // The newest, and one in case it is damaged.
         let keep = keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
         let (lock, end) = (Arc::new(lock), Arc::new(end));
-        let saver = Self { folder, lock, keep, options, end, is_saved, best: None, best_is_saved: true };
+        let saver = Self { folder, lock, keep, options, end, begins_saved, best: None, best_is_saved: true };
         saver.save_before_fatal_errors();
         saver
     }
@@ -55,7 +56,7 @@ impl Saver {
     /// Takes the end of another iteration. If its best evaluation is another one than before, it is its own.
     pub fn take(&mut self, end: Checkpoint) {
         let is_best = end.progress.best != self.end.progress.best;
-        (self.end, self.is_saved) = (Arc::new(end), false);
+        self.end = Arc::new(end);
         if is_best {
             (self.best, self.best_is_saved) = (Some(self.end.clone()), false);
         }
@@ -91,18 +92,13 @@ impl Saver {
     ///
     /// # Errors
     /// A folder that cannot be written to.
-    pub fn save_at_first(&mut self) -> Result<()> {
-        if !self.is_saved {
-            self.write()?;
-        }
-        Ok(())
+    pub fn save_at_first(&self) -> Result<()> {
+        if self.begins_saved { Ok(()) } else { self.write() }
     }
 
-    fn write(&mut self) -> Result<()> {
+    fn write(&self) -> Result<()> {
         let unsaved = !self.best_is_saved || !self.folder.checkpoints().best().exists();
-        write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.end, self.keep)?;
-        self.is_saved = true;
-        Ok(())
+        write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.end, self.keep)
     }
 
     /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report.
@@ -144,8 +140,7 @@ impl Saver {
 
 /// The evaluation that a checkpoint or a policy is the best of; none where the file is not there or damaged.
 pub fn best_of(path: &Path) -> Option<[f64; 2]> {
-    let checkpoint = run::read_bytes(path).and_then(|bytes| Checkpoint::parse(&bytes));
-    checkpoint.ok().and_then(|checkpoint| checkpoint.progress.best)
+    load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best)
 }
 
 /// Writes the best, if there is one to be written, and the checkpoint into a run folder. As long as nothing was scored, the

@@ -50,7 +50,7 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Goes on with a training from the newest checkpoint of a run that can be used, or from the one that is named.
+    /// Goes on with a training from the newest checkpoint of a run that is not damaged, or from the one that is named.
     ///
     /// # Errors
     /// Settings that cannot be changed; a run that cannot be gone on with.

@@ -160,10 +160,9 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
     let header: Vec<&String> = lines[0].as_object().unwrap().keys().collect();
     let expected = "sim_dt ctrl_dt act_moving_average success_tolerance max_consecutive_successes max_episode_steps model \
                     friction_scale cube_mass_scale checkpoint observation joint_names actuator_names fingertip_names \
-                    quaternion_order";
+                    quaternion_order vel_obs_scale";
     assert_eq!(header.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" "), expected);
-    let part =
-        serde_json::json!({ "name": "cube_angvel", "start": 58, "length": 3, "unit": "rad/s * env.vel_obs_scale" });
+    let part = serde_json::json!({ "name": "cube_angvel", "start": 58, "length": 3, "unit": "rad/s * vel_obs_scale" });
     assert_eq!((&lines[0]["observation"][5], &lines[0]["quaternion_order"]), (&part, &Value::from("wxyz")));
     let names = |key: &str| lines[0][key].as_array().unwrap().iter().map(|name| name.as_str().unwrap()).collect();
     let (joints, actuators): (Vec<&str>, Vec<&str>) = (names("joint_names"), names("actuator_names"));
@@ -255,16 +254,35 @@ fn policies_and_runs_of_0_1_0_are_played_and_begun_with() {
 }
 
 #[test]
+fn runs_of_0_1_0_are_plotted() {
+    let folder = of_0_1();
+    let header = "iteration,env_steps,episode/goals,training/goal,training/goal_angle,episode/rot_dist,eval/goals,\
+                  episode/drop_rate,time/collect_s,time/update_s";
+    let table = format!("{header}\n1,16384,0,0,3.14,2.2,,0.1,0.5,0.3\n2,32768,0.1,0,3.14,2.1,0.2,0.1,0.5,0.3\n");
+    fs::write(folder.path().join("old/metrics.csv"), table).unwrap();
+    succeeded(program(folder.path(), &["plot", "old", "--smooth", "1"]));
+    succeeded(program(folder.path(), &["plot", "old", "--metric", "training/goal_angle", "--out", "angle.svg"]));
+}
+
+#[test]
 fn a_checkpoint_of_0_1_0_is_not_resumed_and_nothing_is_changed() {
     let folder = of_0_1();
-    let before = names(&folder.path().join("old/checkpoints"));
+    let run = folder.path().join("old");
+    let bytes = || -> Vec<(String, Vec<u8>)> {
+        let files =
+            [names(&run), names(&run.join("checkpoints")).iter().map(|name| format!("checkpoints/{name}")).collect()];
+        let files = files.concat().into_iter().filter(|name| name != "run.lock" && name != "checkpoints");
+        files.map(|name| (name.clone(), fs::read(run.join(name)).unwrap())).collect()
+    };
+    let before = bytes();
+    assert_eq!(before.len(), 4);
     for place in ["old", "old/checkpoints/latest.safetensors"] {
         let refused = program(folder.path(), &["train", "--resume", place]);
         assert_eq!(refused.status.code(), Some(1));
         assert!(stderr(&refused).contains("made by 0.1.0: go on with that version"), "{}", stderr(&refused));
         assert!(!stderr(&refused).contains("warning"), "it is not damaged: {}", stderr(&refused));
     }
-    assert_eq!(names(&folder.path().join("old/checkpoints")), before);
+    assert!(bytes() == before);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use shadow_repose::env::{Env, Hand, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::sim::{BareSimulation, Physics, Scene, Variation};
+use shadow_repose::sim::{BareSimulation, Physics, Scene, Simulation, Variation};
 
 use crate::support::{SCENE, env_config, started, task};
 
@@ -102,7 +102,7 @@ fn bodies_are_of_the_same_instant_as_joints() {
     }
     // The same joints and velocities in another simulation, whose bodies are computed from them alone.
     let tip = task.scene().body("rh_ffdistal").unwrap();
-    let mut other = task.scene().simulate();
+    let mut other = Simulation::new(task.scene());
     other.qpos_mut().copy_from_slice(env.simulation().qpos());
     other.qvel_mut().copy_from_slice(env.simulation().qvel());
     other.refresh();

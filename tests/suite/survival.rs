@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use rand::RngExt;
 use shadow_repose::rng;
-use shadow_repose::sim::{Physics, Scene, Variation};
+use shadow_repose::sim::{Physics, Scene, Simulation, Variation};
 
 use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train, weights};
 
@@ -80,6 +80,7 @@ const LONG: &[&str] = &[
     "--set=training.task_reward={from=1,to=0.03,steps=4000}",
     "--set=ppo.symmetry=cube",
     "--set=ppo.max_std={from=0.6,to=0.4,steps=4000}",
+    "--set=ppo.min_std={from=0,to=0.4,steps=4500}",
     "--set=ppo.away_std=0.7",
 ];
 
@@ -348,7 +349,7 @@ fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
     let diverged: u64 = rows[1..].iter().map(|row| row[column].parse::<u64>().unwrap()).sum();
     let dumps = names(&folder.path().join("run/diverged"));
     assert!(diverged > 100 && dumps.len() as u64 == diverged, "{diverged} diverged, {} dumps", dumps.len());
-    let mut simulation = Scene::load(Some(&model), Variation::none(0.01)).unwrap().simulate();
+    let mut simulation = Simulation::new(&Scene::load(Some(&model), Variation::none(0.01)).unwrap());
     for dump in [&dumps[0], &dumps[dumps.len() - 1]] {
         let text = fs::read_to_string(folder.path().join("run/diverged").join(dump)).unwrap();
         let dump: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -1,5 +1,5 @@
 //! The same computation in candle's own tensors, layers and automatic gradients: slower, the reference that the kernels are
-//! compared with, and the place to try a change of the algorithm first. No other folder names candle.
+//! compared with, and the place to try a change of the algorithm first. No other folder names candle's crates.
 
 mod loss;
 mod nets;
@@ -57,7 +57,7 @@ impl Reference {
 }
 
 impl Backend for Reference {
-    fn begin(&mut self, policy: &Policy) {
+    fn begin(&mut self, policy: &Policy, _: &Rollout) {
         self.old_log_std = policy.log_std().to_vec();
     }
 

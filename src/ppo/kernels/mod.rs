@@ -1,7 +1,7 @@
 //! Our own kernels: a minibatch in one pass over its samples, without a graph.
 //!
-//! The samples are split into groups, and each (group, net) is one task for one thread: it gathers and normalises a block of
-//! rows at a time, takes it forward, computes the loss and goes backward while all of it lies in the cache of that core, and
+//! What the nets see of all samples is computed once. A minibatch is split into groups, and each (group, net) is one task for one
+//! thread: it gathers a block of rows at a time, takes it forward, computes the loss and goes backward while all of it lies in the cache of that core, and
 //! adds up the gradient of its group. Then the groups are added in a fixed order. How samples are grouped depends on
 //! their number alone, so the result is the same for any number of threads. After the first minibatch no array of samples or
 //! weights is allocated, but for what gemm packs matrices into.
@@ -26,7 +26,6 @@ pub use product::Matrix;
 
 use super::Policy;
 use super::backend::{Backend, Losses};
-use super::perception::Reader;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use loss::{Loss, Sums};
@@ -51,7 +50,8 @@ pub struct Kernels {
     workspaces: Vec<Mutex<Workspace>>,
     /// For each group and net.
     parts: Vec<Part>,
-    reader: Reader,
+    /// `[B, O]`, what the nets see of the samples of the rollout.
+    seen: Vec<f32>,
     old_log_std: Vec<f32>,
 }
 
@@ -81,14 +81,14 @@ enum Role {
 const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 
 impl Kernels {
-    /// For minibatches of what `policy` collects.
-    pub fn new(config: &PpoConfig, policy: &Policy, arithmetic: Arithmetic) -> Self {
+    /// With these settings.
+    pub fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
         Self {
             config: config.clone(),
             arithmetic,
             workspaces: Vec::new(),
             parts: Vec::new(),
-            reader: policy.reader(),
+            seen: Vec::new(),
             old_log_std: Vec::new(),
         }
     }
@@ -119,8 +119,11 @@ impl Kernels {
 }
 
 impl Backend for Kernels {
-    fn begin(&mut self, policy: &Policy) {
-        self.reader = policy.reader();
+    fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
+        let (reader, size) = (policy.reader(), policy.spaces.observation_size);
+        self.seen.resize(rollout.samples() * size, 0.0);
+        let of_blocks = self.seen.par_chunks_mut(rollout.blocks[0].samples() * size);
+        of_blocks.zip(&rollout.blocks).for_each(|(seen, block)| reader.read(block.acted_on(), seen));
         self.old_log_std = policy.log_std().to_vec();
     }
 
@@ -138,9 +141,8 @@ impl Backend for Kernels {
             let thread = rayon::current_thread_index().expect("rayon runs this");
             let work = &mut *self.workspaces[thread].lock().expect("no task has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
-                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(self.reader.size())) {
-                    let (of, i) = rollout.locate(sample);
-                    self.reader.read(&of.observations[RolloutBlock::row(row.len(), i)], row);
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
+                    row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
                 }
                 net.forward(block.len(), work);
                 let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());

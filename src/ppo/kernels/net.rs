@@ -69,6 +69,11 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
+    /// Numbers in an input.
+    pub fn inputs(&self) -> usize {
+        self.layers[0].inputs
+    }
+
     /// Numbers in an output.
     pub fn outputs(&self) -> usize {
         self.layers.last().expect("a net has layers").outputs

@@ -7,7 +7,7 @@ use anyhow::{Result, anyhow};
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
-use super::{Film, FilmFormat};
+use super::format::{Film, FilmFormat};
 use crate::run::OutputFile;
 
 /// Colours of the palette; the index after them leaves a pixel as it was.

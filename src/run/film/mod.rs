@@ -3,6 +3,7 @@
 //! A film is drawn by one thread and encoded by another, so that both cores of a small machine work.
 
 mod caption;
+mod format;
 mod gif;
 mod mp4;
 
@@ -13,26 +14,18 @@ use std::thread::{self, JoinHandle};
 use anyhow::{Context, Result, bail, ensure};
 
 use self::caption::Captions;
+use self::format::Film;
 use self::gif::GifFilm;
 use self::mp4::Mp4Film;
 use super::OutputFile;
+
+pub use self::format::FilmFormat;
 
 /// Pictures that may wait for the encoder.
 const WAITING: usize = 4;
 
 /// The most frames of a film: the index of an MP4 is kept in memory, and room for it in the file.
 const MOST_FRAMES: usize = 2_000_000;
-
-/// What a film file is made for.
-#[derive(Clone, Copy, Debug)]
-pub struct FilmFormat {
-    /// Width and height in pixels.
-    pub size: [u32; 2],
-    /// Frames per second.
-    pub fps: u32,
-    /// The most frames it can have.
-    pub longest: usize,
-}
 
 /// A film being written; it is there once it is finished.
 pub struct FilmWriter {
@@ -47,15 +40,6 @@ struct Frame {
     /// `[height, width, 3]`
     rgb: Vec<u8>,
     caption: Vec<String>,
-}
-
-/// A kind of film file.
-trait Film {
-    /// Takes the next frame `[height, width, 3]`.
-    fn push(&mut self, rgb: &[u8]) -> Result<()>;
-
-    /// Writes what is still to be written.
-    fn finish(self: Box<Self>) -> Result<OutputFile>;
 }
 
 impl FilmWriter {

@@ -16,7 +16,7 @@ use shiguredo_mp4::bitstream::h264::{
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::mux::{Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size};
 
-use super::{Film, FilmFormat};
+use super::format::{Film, FilmFormat};
 use crate::run::OutputFile;
 
 /// Seconds between two pictures that stand for themselves, to which a player can jump.
