@@ -12,6 +12,7 @@ use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
 use crate::env::{Env, EnvPool, EnvState, Lesson, Repose, Resumable, Task};
 use crate::ppo::{Array, Checkpoint, Ppo, Progress, Rollout, UpdateStats};
+use crate::ranks::Division;
 
 // Where a checkpoint keeps the states of the environments.
 const NUMBERS: &str = "envs.numbers";
@@ -28,6 +29,8 @@ pub struct Agent<E: Env> {
     scratch: Scratch,
     /// What is trained after so many control steps.
     lessons: Box<dyn Fn(u64) -> E::Lesson + Send>,
+    /// Control steps of an iteration over the environments of all ranks.
+    steps: u64,
     /// Iterations finished.
     pub iteration: u64,
     /// Control steps over all environments.
@@ -64,12 +67,14 @@ impl Agent<Repose> {
     pub fn of_task(task: &Arc<Task>, config: &Config) -> Result<Self> {
         let envs = (0..config.env.num_envs).map(|_| Repose::new(task)).collect();
         let training = config.training.clone();
-        Self::new(envs, &config.ppo, config.run.seed, move |env_steps| Lesson::at(env_steps, &training))
+        let division = Division::alone(config.shards());
+        Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &training))
     }
 }
 
 impl<E: Env> Agent<E> {
-    /// A learner in these environments, which are at the start of their first episodes; all randomness follows from `seed`.
+    /// A learner in these environments, those of this rank's shards, which are at the start of their first episodes; all randomness
+    /// follows from `seed`.
     ///
     /// # Errors
     /// A precision that this machine does not have, or a symmetry that the observations do not have.
@@ -77,15 +82,17 @@ impl<E: Env> Agent<E> {
         envs: Vec<E>,
         config: &PpoConfig,
         seed: u64,
+        division: Division,
         lessons: impl Fn(u64) -> E::Lesson + Send + 'static,
     ) -> Result<Self> {
-        let mut pool = EnvPool::new(seed, envs);
-        let ppo = Ppo::new(config, E::SPACES, seed)?;
+        let mut pool = EnvPool::of_shards(seed, envs, &division);
+        let steps = (config.horizon * pool.count() / division.own().len() * division.shards()) as u64;
+        let ppo = Ppo::new(config, E::SPACES, seed, division)?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
-        Ok(Self { pool, ppo, rollout, scratch, lessons: Box::new(lessons), iteration: 0, env_steps: 0 })
+        Ok(Self { pool, ppo, rollout, scratch, lessons: Box::new(lessons), steps, iteration: 0, env_steps: 0 })
     }
 
     /// Collects and learns. `None` if `stop` was set meanwhile; then, and after an error, the agent must be restored before it is
@@ -99,7 +106,7 @@ impl<E: Env> Agent<E> {
         let collected = Instant::now();
         let Some(update) = self.ppo.update(&mut self.rollout, self.iteration + 1, stop)? else { return Ok(None) };
         self.rollout.carry_over();
-        let steps = self.rollout.samples() as u64;
+        let steps = self.steps;
         (self.iteration, self.env_steps) = (self.iteration + 1, self.env_steps + steps);
         let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))

@@ -58,9 +58,9 @@ pub fn collect<E: Env>(
     interrupted: &AtomicBool,
 ) -> Result<bool> {
     let (acting, horizon) = (ppo.acting(), rollout.horizon());
-    let parts = pool.blocks_mut().iter_mut().zip(&mut rollout.blocks).zip(&mut scratch.blocks).enumerate();
-    let blocks = parts.map(|(i, ((envs, rollout), scratch))| {
-        let noise = ppo.noise(iteration, i);
+    let parts = pool.blocks_mut().iter_mut().zip(&mut rollout.blocks).zip(&mut scratch.blocks);
+    let blocks = parts.map(|((envs, rollout), scratch)| {
+        let noise = ppo.noise(iteration, envs.number());
         Collecting { envs, rollout, scratch, noise, result: Ok(()) }
     });
     let collected = in_rounds(blocks, horizon, |block, t| {

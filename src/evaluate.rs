@@ -226,6 +226,7 @@ mod tests {
     use crate::config::{Config, Symmetry};
     use crate::env::SPACES;
     use crate::ppo::Ppo;
+    use crate::ranks::Division;
 
     #[test]
     fn a_policy_with_the_symmetry_of_the_cube_acts_alike_however_the_cube_is_turned_onto_itself() {
@@ -233,7 +234,7 @@ mod tests {
             let mut config = Config::resolve(None, &[]).unwrap();
             config.ppo.symmetry = symmetry;
             let task = Task::new(&config.env).unwrap();
-            let ppo = Ppo::new(&config.ppo, SPACES, 0).unwrap();
+            let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal are one: as they are, and turned by half a turn about their own x.

@@ -27,12 +27,14 @@
 //! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
 //! | [`sim`] | the fence around MuJoCo |
 //! | [`ppo`] | the learner: flat parameters, policy, two ways to a gradient (`kernels`, ours; `candle`), one Adam, checkpoints |
+//! | [`ranks`] | how a training is divided: shards, and the ranks that compute them |
 //! | [`spaces`] | what a learner must know of observations and actions |
 //! | [`run`] | the outside: run folder, logs, terminal, signals |
 //! | [`quat`], [`rng`] | rotations; generators named by (seed, purpose, index) |
 //!
 //! Direction of knowledge: `main → commands (train, play, view, plot, bench) → {agent, evaluate, window, film} → {collect, load} →
-//! {env → sim, ppo, run} → {config, spaces, rng, quat, schedule}`. `env` and `ppo` do not know each other, `run` knows neither; a test holds the fences up.
+//! {env → sim, ppo, run} → {config, ranks, spaces, rng, quat, schedule}`. `env` and `ppo` do not know each other, `run` knows neither;
+//! a test holds the fences up.
 //!
 //! # Data path of an iteration
 //! N environments in blocks of n, T steps, O and A numbers in an observation and an action; a block's arrays are time-major
@@ -44,7 +46,8 @@
 //! ```
 //! Then the learner takes all blocks together:
 //! ```text
-//! rollout --ppo.update--> advantages, epochs × minibatches of (loss → flat gradient → norm → Adam); then the normaliser
+//! rollout --ppo.update--> advantages, epochs × minibatches (as many samples of each shard) of (loss → flat gradient, added over
+//!                         the shards as a tree → norm → Adam); then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
 //! Observations are raw everywhere: a policy perceives (its symmetry) and normalises them as it reads them. How a minibatch is
@@ -75,6 +78,7 @@ pub mod play;
 pub mod plot;
 pub mod ppo;
 pub mod quat;
+pub mod ranks;
 pub mod rng;
 pub mod run;
 pub mod scenery;

@@ -8,10 +8,10 @@ use std::any::Any;
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
-/// The number of items in each block, for `items` of them: enough blocks for many threads, enough items for whole vectors
-/// of work.
-pub fn block_sizes(items: usize) -> Vec<usize> {
-    let size = (items / 32).clamp(8, 64);
+/// The number of items in each block, for `items` that belong together of so many `in_all`: enough blocks for many threads, enough
+/// items for whole vectors of work.
+pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
+    let size = (in_all / 32).clamp(8, 64);
     (0..items).step_by(size).map(|first| size.min(items - first)).collect()
 }
 
@@ -101,11 +101,12 @@ mod tests {
     #[test]
     fn blocks_hold_all_items_once() {
         for items in [1, 7, 8, 9, 64, 1000, 1024, 8192] {
-            let sizes = block_sizes(items);
+            let sizes = block_sizes(items, items);
             assert_eq!(sizes.iter().sum::<usize>(), items);
             let (last, first) = sizes.split_last().unwrap();
             assert!(first.iter().all(|size| size == &sizes[0]) && *last <= sizes[0] && *last > 0);
         }
-        assert_eq!((block_sizes(1024)[0], block_sizes(8192)[0], block_sizes(1).len()), (32, 64, 1));
+        assert_eq!((block_sizes(1024, 1024)[0], block_sizes(8192, 8192)[0], block_sizes(1, 1).len()), (32, 64, 1));
+        assert_eq!(block_sizes(64, 1024), [32, 32], "a shard of many");
     }
 }

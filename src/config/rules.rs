@@ -82,6 +82,10 @@ fn learning(config: &Config, rules: &mut Rules) {
     let divides = ppo.minibatches == 0 || samples.is_multiple_of(ppo.minibatches);
     let rule = format!("divide num_envs * horizon = {samples}");
     rules.check(divides, "ppo.minibatches", ppo.minibatches, &rule);
+    let shards = config.run.shards;
+    let dealt = !divides || ppo.minibatches == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
+    let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
+    rules.check(dealt, "run.shards", shards, rule);
     let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
     let precision = Value::try_from(ppo.precision).expect("a word");
     rules.check(computable, "ppo.precision", precision, "be \"f32\" with ppo.backend = \"candle\"");

@@ -162,6 +162,7 @@ pub struct RunConfig {
     pub eval_every: u64,
     pub eval_episodes: usize,
     pub seed: u64,
+    pub shards: usize,
     pub threads: usize,
 }
 
@@ -180,6 +181,22 @@ impl Config {
     /// Control steps in one iteration.
     pub fn steps_per_iteration(&self) -> u64 {
         (self.env.num_envs * self.ppo.horizon) as u64
+    }
+
+    /// Samples of a minibatch.
+    pub fn samples_per_minibatch(&self) -> usize {
+        self.env.num_envs * self.ppo.horizon / self.ppo.minibatches
+    }
+
+    /// The shards of the training: those that are asked for, or else the most that fit, up to 16.
+    pub fn shards(&self) -> usize {
+        let found = [16, 8, 4, 2].into_iter().find(|&shards| self.divides(shards)).unwrap_or(1);
+        if self.run.shards == 0 { found } else { self.run.shards }
+    }
+
+    /// Whether environments and minibatches can be dealt to so many shards.
+    pub(super) fn divides(&self, shards: usize) -> bool {
+        self.env.num_envs.is_multiple_of(shards) && self.samples_per_minibatch().is_multiple_of(shards)
     }
 }
 

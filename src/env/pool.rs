@@ -10,6 +10,7 @@ use anyhow::{Context, Result, bail, ensure};
 use rayon::prelude::*;
 
 use super::{End, Env, EnvState, Resumable, Transition};
+use crate::ranks::Division;
 use crate::rng;
 use crate::schedule::{block_sizes, panic_message};
 use crate::spaces::Spaces;
@@ -23,6 +24,8 @@ pub struct EnvPool<E: Env> {
 pub struct EnvBlock<E: Env> {
     slots: Vec<Slot<E>>,
     seed: u64,
+    /// Its number among the blocks of all ranks.
+    number: usize,
     /// The number of its first environment.
     first: usize,
     /// The number of environments in the whole pool: so far apart are the numbers of an environment's episodes.
@@ -51,15 +54,25 @@ pub struct StepBuffers<'a> {
 impl<E: Env> EnvPool<E> {
     /// A pool of these environments (at least one, all of one kind), whose episodes are drawn from `seed`.
     pub fn new(seed: u64, envs: Vec<E>) -> Self {
-        let (sizes, stride) = (block_sizes(envs.len()), envs.len() as u64);
+        Self::of_shards(seed, envs, &Division::alone(1))
+    }
+
+    /// The same of the environments of this rank's shards, which have as many each; no block is of two shards.
+    pub fn of_shards(seed: u64, envs: Vec<E>, division: &Division) -> Self {
+        let (shards, own) = (division.shards(), division.own());
+        let in_shard = envs.len() / own.len();
+        assert_eq!(in_shard * own.len(), envs.len(), "environments of {} shards", own.len());
+        let sizes = block_sizes(in_shard, in_shard * shards);
+        let mut first = own.start * in_shard;
         let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
-        let mut first = 0;
-        let block = |size| {
+        let block = |(i, &size): (usize, &usize)| {
             let slots = slots.by_ref().take(size).collect();
             first += size;
-            EnvBlock { slots, seed, first: first - size, stride, finished: Vec::new() }
+            let (number, stride) = (own.start * sizes.len() + i, (in_shard * shards) as u64);
+            EnvBlock { slots, seed, number, first: first - size, stride, finished: Vec::new() }
         };
-        Self { blocks: sizes.into_iter().map(block).collect() }
+        let of_all_shards = own.clone().flat_map(|_| &sizes);
+        Self { blocks: of_all_shards.enumerate().map(block).collect() }
     }
 
     /// The number of environments.
@@ -81,8 +94,9 @@ impl<E: Env> EnvPool<E> {
     /// `observations` `[n, O]` of each block.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = E::SPACES.observation_size;
-        let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
-        (0..).zip(slots).for_each(|(episode, slot)| slot.next_episode = episode);
+        for block in &mut self.blocks {
+            (block.first as u64..).zip(&mut block.slots).for_each(|(episode, slot)| slot.next_episode = episode);
+        }
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
             for (slot, row) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)) {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
@@ -147,6 +161,11 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
+    /// Its number among the blocks of all ranks.
+    pub fn number(&self) -> usize {
+        self.number
+    }
+
     /// The number n of its environments.
     pub fn count(&self) -> usize {
         self.slots.len()

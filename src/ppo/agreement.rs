@@ -4,10 +4,11 @@
 mod tests {
     use std::sync::atomic::AtomicBool;
 
-    use super::super::backend::Losses;
+    use super::super::backend::Minibatch;
     use super::super::kernels::{Arithmetic, Kernels};
-    use super::super::{Policy, Ppo, Rollout};
+    use super::super::{Losses, Policy, Ppo, Rollout};
     use crate::config::{self, Activation, Config, Precision};
+    use crate::ranks::Division;
     use crate::rng;
     use crate::spaces::Spaces;
 
@@ -21,8 +22,8 @@ mod tests {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
         config.bounds_coef = 0.1;
-        let mut ppo = Ppo::new(&config, SPACES, 3).unwrap();
-        ppo.policy.see(&[&[[0.3; 157], [0.9; 157]].concat()]);
+        let mut ppo = Ppo::new(&config, SPACES, 3, Division::alone(1)).unwrap();
+        ppo.policy.see(&[vec![&[[0.3; 157], [0.9; 157]].concat()]], &ppo.division);
         let mut rollout = Rollout::new(16, &[32, 32, 21], &SPACES);
         let mut rng = rng::stream(0, "test", 0);
         let mut fill = |numbers: &mut [f32], scale: f64| {
@@ -54,7 +55,12 @@ mod tests {
 
     /// The gradient of these samples, which stays in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
-        ppo.backend.gradient(&ppo.policy, rollout, samples, &mut ppo.gradient).unwrap()
+        gradient_of(ppo, rollout, Minibatch { samples, own_shards: 1, shards: 1 })
+    }
+
+    fn gradient_of(ppo: &mut Ppo, rollout: &Rollout, minibatch: Minibatch) -> Losses {
+        let sums = ppo.backend.gradient(&ppo.policy, rollout, minibatch, &mut ppo.gradient).unwrap();
+        ppo.losses(&sums, minibatch.count() as f64)
     }
 
     /// These numbers parameter by parameter.
@@ -100,6 +106,24 @@ mod tests {
                     );
                 }
             }
+        }
+    }
+
+    #[test]
+    fn the_gradient_of_a_minibatch_is_the_same_in_any_number_of_shards_but_for_rounding() {
+        for backend in BACKENDS {
+            let [one, eight] = [1, 8].map(|shards| {
+                let (mut ppo, rollout) = learner(backend, Activation::Elu);
+                ppo.division = Division::alone(shards);
+                let samples: Vec<u32> = (0..1024).collect();
+                let minibatch = Minibatch { samples: &samples, own_shards: shards, shards };
+                (gradient_of(&mut ppo, &rollout, minibatch), ppo)
+            });
+            for (found, expected) in [(eight.0.total, one.0.total), (eight.0.kl, one.0.kl)] {
+                assert_close(found, expected, 1e-4, "losses");
+            }
+            let largest = one.1.gradient.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+            assert!(one.1.gradient.iter().zip(&eight.1.gradient).all(|(a, b)| (a - b).abs() < 1e-5 * largest));
         }
     }
 
@@ -170,7 +194,7 @@ mod tests {
         let [fused, candle] = BACKENDS.map(|backend| {
             let mut config = Config::resolve(None, &[]).unwrap().ppo;
             (config.backend, config.hidden, config.symmetry) = (backend, vec![1], config::Symmetry::None);
-            let mut ppo = Ppo::new(&config, spaces, 3).unwrap();
+            let mut ppo = Ppo::new(&config, spaces, 3, Division::alone(1)).unwrap();
             let mut rollout = Rollout::new(1, &[1], &spaces);
             rollout.blocks[0].observations.fill(0.7);
             rollout.blocks[0].actions.fill(0.4);

@@ -268,6 +268,7 @@ mod tests {
     use super::*;
     use crate::config::{Backend, Config, PpoConfig, Symmetry};
     use crate::ppo::Rollout;
+    use crate::ranks::Division;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
@@ -278,7 +279,7 @@ mod tests {
     }
 
     fn learner(hidden: &[usize]) -> Ppo {
-        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0).unwrap()
+        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0, Division::alone(1)).unwrap()
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
@@ -292,8 +293,8 @@ mod tests {
 
     /// A learner that has taken a step of its optimizer.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
-        let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed).unwrap();
-        ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]);
+        let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Division::alone(1)).unwrap();
+        ppo.policy.see(&[vec![&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]], &ppo.division);
         ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
@@ -337,7 +338,7 @@ mod tests {
     #[test]
     fn a_learner_begins_with_the_policy_of_another_and_nothing_else_of_it() {
         let from = learnt(Backend::Fused, 1);
-        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5).unwrap();
+        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Division::alone(1)).unwrap();
         to.begin_with(&saved(&from)).unwrap();
         assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
         let fresh = config(Backend::Fused, &[8]).learning_rate;

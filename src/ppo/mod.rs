@@ -39,10 +39,11 @@ pub use policy::{FrozenPolicy, Policy};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{self, PpoConfig};
+use crate::ranks::Division;
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
 use adam::{Adam, norm};
-use backend::{Backend, Losses};
+use backend::{Backend, Minibatch, ShardSums};
 use candle::Reference;
 use kernels::{Arithmetic, Kernels};
 
@@ -57,6 +58,7 @@ pub struct Ppo {
     gradient: Vec<f32>,
     adam: Adam,
     learning_rate: f64,
+    division: Division,
 }
 
 /// Means over the minibatches of an update, where nothing else is said.
@@ -89,11 +91,11 @@ pub struct UpdateStats {
 }
 
 impl Ppo {
-    /// A new learner for environments with these spaces; all its randomness follows from `seed`.
+    /// A new learner for environments with these spaces, of which it computes some shards; all its randomness follows from `seed`.
     ///
     /// # Errors
     /// A precision that this machine does not have, or a symmetry that the observations do not have.
-    pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64) -> Result<Self> {
+    pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, division: Division) -> Result<Self> {
         let [_, std] = config.std_bounds(0);
         let policy = Policy::random(&config.net(), spaces, std, seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
@@ -102,8 +104,8 @@ impl Ppo {
             config::Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
-        let learning_rate = config.learning_rate;
-        Ok(Self { config: config.clone(), seed, policy, backend, arithmetic, gradient, adam, learning_rate })
+        let (config, learning_rate) = (config.clone(), config.learning_rate);
+        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division })
     }
 
     /// The policy as it is now.
@@ -158,23 +160,30 @@ impl Ppo {
     fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         let explained_variance = self.prepare(rollout);
         self.backend.begin(&self.policy, rollout);
-        let size = rollout.samples() / self.config.minibatches;
-        let mut shuffle = rng::stream(self.seed, "shuffle", iteration);
+        let own = self.division.own();
+        let in_shard = rollout.samples() / own.len();
+        // Of each shard, as many in each part.
+        let size = in_shard / self.config.minibatches;
+        let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
+        let mut shuffles: Vec<Rng> = own.clone().map(stream).collect();
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
-        let mut steps = Vec::new();
+        let (mut samples, mut steps) = (Vec::new(), Vec::new());
         for epoch in 0..self.config.epochs {
-            order.shuffle(&mut shuffle);
-            for (part, samples) in order.chunks_exact(size).enumerate() {
+            order.chunks_mut(in_shard).zip(&mut shuffles).for_each(|(shard, shuffle)| shard.shuffle(shuffle));
+            for part in 0..self.config.minibatches {
                 if stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
-                let step = self.minibatch_step(rollout, samples, steps.is_empty());
+                samples.clear();
+                order.chunks(in_shard).for_each(|shard| samples.extend_from_slice(&shard[part * size..][..size]));
+                let step = self.minibatch_step(rollout, &samples, steps.is_empty());
                 steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
             }
         }
         self.check_weights()?;
         let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
-        self.policy.see(&seen);
+        let seen: Vec<Vec<&[f32]>> = seen.chunks(seen.len() / own.len()).map(<[_]>::to_vec).collect();
+        self.policy.see(&seen, &self.division);
         Ok(Some(self.stats(&steps, explained_variance)))
     }
 
@@ -204,9 +213,8 @@ impl Ppo {
         rollout.blocks.par_iter_mut().for_each(|block| {
             gae(factors, &block.rewards, &block.values, &block.dones, &mut block.advantages, &mut block.returns);
         });
-        let all = |of: fn(&RolloutBlock) -> &[f32]| rollout.blocks.iter().flat_map(of);
-        let (_, spread) = mean_and_variance(all(|block| &block.returns));
-        let (mean, residual) = mean_and_variance(all(|block| &block.advantages));
+        let (_, spread) = self.mean_and_variance(rollout, |block| &block.returns);
+        let (mean, residual) = self.mean_and_variance(rollout, |block| &block.advantages);
         let scale = 1.0 / (residual.sqrt() + 1e-8);
         for x in rollout.blocks.iter_mut().flat_map(|block| &mut block.advantages) {
             *x = ((f64::from(*x) - mean) * scale) as f32;
@@ -214,9 +222,27 @@ impl Ppo {
         if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
     }
 
-    /// One gradient step on these samples. The `first` of an update still sees the policy that acted.
+    /// Mean and variance of what all samples of all ranks have there.
+    fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
+        let shards = self.division.own().len();
+        let sum = |term: &dyn Fn(f64) -> f64| {
+            let blocks = rollout.blocks.chunks(rollout.blocks.len() / shards);
+            let of_shard =
+                |blocks: &[RolloutBlock]| blocks.iter().flat_map(of).map(|&x| term(f64::from(x))).sum::<f64>();
+            self.division.total(blocks.map(|blocks| vec![of_shard(blocks)]))[0]
+        };
+        let count = (rollout.samples() / shards * self.division.shards()) as f64;
+        let mean = sum(&|x| x) / count;
+        (mean, sum(&|x| (x - mean).powi(2)) / count)
+    }
+
+    /// One gradient step on these samples, shard after shard. The `first` of an update still sees the policy that acted.
     fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Step> {
-        let losses = self.backend.gradient(&self.policy, rollout, samples, &mut self.gradient)?;
+        let (own_shards, shards) = (self.division.own().len(), self.division.shards());
+        let minibatch = Minibatch { samples, own_shards, shards };
+        let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
+        self.division.add_up(&mut self.gradient);
+        let losses = self.losses(&sums, minibatch.count() as f64);
         let grad_norm = norm(&self.gradient, &self.policy.layout.groups());
         for (what, value) in [("the loss", losses.total), ("the norm of the gradient", grad_norm)] {
             if !value.is_finite() {
@@ -232,6 +258,17 @@ impl Ppo {
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         self.adam.step(&mut self.policy.parameters, &self.gradient, self.learning_rate, scale);
         Ok(Step { losses, grad_norm, entropy })
+    }
+
+    /// The figures of a minibatch of so many samples, from the sums of the shards of this rank.
+    fn losses(&self, sums: &[ShardSums], samples: f64) -> Losses {
+        let row = |sums: &ShardSums| vec![sums.surrogate, sums.value_error, sums.excess, sums.kl, sums.clipped];
+        let totals = self.division.total(sums.iter().map(row));
+        let mean = |i: usize| totals[i] / samples;
+        let (policy, value, excess, kl, clip_fraction) = (-mean(0), mean(1), mean(2), mean(3), mean(4));
+        let total = policy + self.config.value_coef * value + self.config.bounds_coef * excess;
+        let ratio_error = self.division.largest(sums.iter().map(|sums| sums.ratio_error).fold(0.0, f64::max));
+        Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
     }
 
     fn check_weights(&self) -> Result<()> {
@@ -257,17 +294,30 @@ impl Ppo {
     }
 }
 
+/// Figures of one minibatch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Losses {
+    /// What is minimised.
+    total: f64,
+    /// The clipped surrogate, negated.
+    policy: f64,
+    /// The clipped squared error of the values.
+    value: f64,
+    /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
+    excess: f64,
+    /// Mean KL divergence of the present distribution from the one that acted, nats.
+    kl: f64,
+    /// Fraction of the samples whose ratio was clipped.
+    clip_fraction: f64,
+    /// The largest |ratio - 1|.
+    ratio_error: f64,
+}
+
 /// What is known of one gradient step.
 struct Step {
     losses: Losses,
     grad_norm: f64,
     entropy: f64,
-}
-
-fn mean_and_variance<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> (f64, f64) {
-    let count = values.clone().count() as f64;
-    let mean = values.clone().map(|&x| f64::from(x)).sum::<f64>() / count;
-    (mean, values.map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / count)
 }
 
 #[cfg(test)]
@@ -283,7 +333,7 @@ mod tests {
     fn learner(desired_kl: f64) -> Ppo {
         let mut config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
         (config.desired_kl, config.learning_rate, config.learning_rate_range) = (desired_kl, 1e-3, [5e-4, 2e-3]);
-        Ppo::new(&config, SPACES, 0).unwrap()
+        Ppo::new(&config, SPACES, 0, Division::alone(1)).unwrap()
     }
 
     #[test]

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::ranks::Division;
+
 /// Added to the variance, so that a constant input does not divide by zero.
 const EPSILON: f64 = 1e-5;
 
@@ -36,15 +38,21 @@ impl Normalizer {
         }
     }
 
-    /// Takes the rows of these raw arrays `[B, O]` into the statistics, each as `perceive` leaves it.
+    /// Takes the raw rows `[B, O]` of these shards, each as `perceive` leaves it, and those of the other ranks into the statistics. Each
+    /// shard has several arrays, and as many rows as the others.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances"
     /// (1979), eq. 2.1.
-    pub fn update(&mut self, raw: &[&[f32]], perceive: impl Fn(&mut [f32]) + Sync) {
+    pub fn update(&mut self, shards: &[Vec<&[f32]>], division: &Division, perceive: impl Fn(&mut [f32]) + Sync) {
         let size = self.mean.len();
-        let rows = raw.iter().map(|part| part.len() / size).sum::<usize>() as f64;
-        let mean = column_means(raw, size, &perceive, |x, _| x);
-        let variance = column_means(raw, size, &perceive, |x, column| (x - mean[column]).powi(2));
+        let in_shard = shards[0].iter().map(|part| part.len() / size).sum::<usize>();
+        let rows = (in_shard * division.shards()) as f64;
+        let means = |f: &(dyn Fn(f64, usize) -> f64 + Sync)| -> Vec<f64> {
+            let totals = division.total(column_sums(shards, size, &perceive, f).into_iter());
+            totals.into_iter().map(|total| total / rows).collect()
+        };
+        let mean = means(&|x, _| x);
+        let variance = means(&|x, column| (x - mean[column]).powi(2));
         let total = self.count + rows;
         for i in 0..size {
             let delta = mean[i] - self.mean[i];
@@ -56,30 +64,30 @@ impl Normalizer {
     }
 }
 
-/// The mean of `f(value, column)` over the perceived rows, for each column.
-fn column_means(
-    raw: &[&[f32]],
+/// The sums of `f(value, column)` over the perceived rows of each shard, for each column.
+fn column_sums(
+    shards: &[Vec<&[f32]>],
     size: usize,
     perceive: impl Fn(&mut [f32]) + Sync,
     f: impl Fn(f64, usize) -> f64 + Sync,
-) -> Vec<f64> {
-    let tasks: Vec<&[f32]> = raw.iter().flat_map(|part| part.chunks(ROWS_PER_TASK * size)).collect();
-    let partial: Vec<Vec<f64>> = tasks
-        .into_par_iter()
-        .map(|rows| {
-            let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
-            for row in rows.chunks_exact(size) {
-                seen.copy_from_slice(row);
-                perceive(&mut seen);
-                for (column, (sum, &x)) in sums.iter_mut().zip(&seen).enumerate() {
-                    *sum += f(f64::from(x), column);
-                }
+) -> Vec<Vec<f64>> {
+    let of_task = |rows: &[f32]| {
+        let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
+        for row in rows.chunks_exact(size) {
+            seen.copy_from_slice(row);
+            perceive(&mut seen);
+            for (column, (sum, &x)) in sums.iter_mut().zip(&seen).enumerate() {
+                *sum += f(f64::from(x), column);
             }
-            sums
-        })
-        .collect();
-    let rows = raw.iter().map(|part| part.len() / size).sum::<usize>() as f64;
-    (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum::<f64>() / rows).collect()
+        }
+        sums
+    };
+    let of_shard = |parts: &Vec<&[f32]>| -> Vec<f64> {
+        let tasks: Vec<&[f32]> = parts.iter().flat_map(|part| part.chunks(ROWS_PER_TASK * size)).collect();
+        let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
+        (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum()).collect()
+    };
+    shards.par_iter().map(of_shard).collect()
 }
 
 /// `(x - mean) · factor`, clipped.
@@ -120,7 +128,7 @@ mod tests {
             .collect();
         let mut normalizer = Normalizer::new(2);
         for batch in [&[&rows[..14]][..], &[&rows[14..3000], &rows[3000..3004]], &[&rows[3004..]]] {
-            normalizer.update(batch, |_| {});
+            normalizer.update(&[batch.to_vec()], &Division::alone(1), |_| {});
         }
         for column in 0..2 {
             let values: Vec<f64> = rows.iter().skip(column).step_by(2).map(|&x| f64::from(x)).collect();

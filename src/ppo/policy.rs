@@ -8,6 +8,7 @@ use super::kernels::{Arithmetic, Net, Workspace};
 use super::parameters::{Layer, Layout};
 use super::perception::{Perception, Reader};
 use crate::config::{Activation, NetConfig};
+use crate::ranks::Division;
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
 
@@ -83,10 +84,10 @@ impl Policy {
         self.log_std().iter().map(|log_std| log_std.exp()).collect()
     }
 
-    /// Takes the raw rows of these arrays `[B, O]` into the normaliser.
-    pub(super) fn see(&mut self, raw: &[&[f32]]) {
+    /// Takes the raw rows `[B, O]` of these shards and of those of the other ranks into the normaliser.
+    pub(super) fn see(&mut self, shards: &[Vec<&[f32]>], division: &Division) {
         let perception = self.perception;
-        self.normalizer.update(raw, |row| perception.turn(row));
+        self.normalizer.update(shards, division, |row| perception.turn(row));
     }
 
     /// How it reads observations at this moment.

@@ -11,6 +11,10 @@ use crate::spaces::Spaces;
 pub struct Rollout {
     /// In the order of the environments.
     pub blocks: Vec<RolloutBlock>,
+    /// Of each sample, block after block, the block that holds it.
+    block_of: Vec<u32>,
+    /// Of each block its first sample.
+    firsts: Vec<u32>,
 }
 
 /// T steps of the n environments of a block; all arrays are time-major.
@@ -39,13 +43,16 @@ pub struct RolloutBlock {
 }
 
 impl Rollout {
-    /// An empty rollout of `horizon` steps of blocks of so many environments, all blocks but the last of one size.
+    /// An empty rollout of `horizon` steps of blocks of so many environments.
     pub fn new(horizon: usize, block_sizes: &[usize], spaces: &Spaces) -> Self {
-        let (last, others) = block_sizes.split_last().expect("a rollout has a block");
-        let even = others.iter().all(|size| *size == block_sizes[0]) && *last <= block_sizes[0];
-        assert!(even, "only the last block may be smaller: {block_sizes:?}");
         let block = |&envs: &usize| RolloutBlock::new([horizon, envs, spaces.observation_size, spaces.action_size]);
-        Self { blocks: block_sizes.iter().map(block).collect() }
+        let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
+        let (mut block_of, mut firsts) = (Vec::new(), Vec::new());
+        for (i, block) in blocks.iter().enumerate() {
+            firsts.push(block_of.len() as u32);
+            block_of.resize(block_of.len() + block.samples(), i as u32);
+        }
+        Self { blocks, block_of, firsts }
     }
 
     /// The number of steps T.
@@ -55,13 +62,13 @@ impl Rollout {
 
     /// Samples in it: T × N.
     pub fn samples(&self) -> usize {
-        self.blocks.iter().map(RolloutBlock::samples).sum()
+        self.block_of.len()
     }
 
     /// The block that holds a sample, and the sample's row in the block's arrays.
     pub fn locate(&self, sample: u32) -> (&RolloutBlock, usize) {
-        let in_block = self.blocks[0].samples();
-        (&self.blocks[sample as usize / in_block], sample as usize % in_block)
+        let block = self.block_of[sample as usize] as usize;
+        (&self.blocks[block], (sample - self.firsts[block]) as usize)
     }
 
     /// Makes the observations after the last step those of the next iteration's first.

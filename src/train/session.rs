@@ -74,6 +74,12 @@ impl Session {
         expect_states(&checkpoint, &config).with_context(context)?;
         settle_model(&mut config)?;
         run::start_threads(config.run.threads)?;
+        if config.run.shards == 0 {
+            run::say(&format!(
+                "note: {} was made before trainings had shards: what follows is another sequence than before",
+                path.display()
+            ));
+        }
         let mut session = Self::new(config)?;
         let restored = session.agent.restore(&mut checkpoint).and_then(|()| checkpoint.take_counters(SCENE));
         if restored.with_context(context)? != [session.scene] {
@@ -91,7 +97,9 @@ impl Session {
     ///
     /// # Errors
     /// A scene or a precision that cannot be used.
-    pub fn new(config: Config) -> Result<Self> {
+    pub fn new(mut config: Config) -> Result<Self> {
+        // What is written says how it was divided.
+        config.run.shards = config.shards();
         let task = Task::new(&config.env)?;
         let (agent, scene) = (Agent::of_task(&task, &config)?, task.scene().fingerprint()?);
         Ok(Self { config, task, agent, best: None, scene })

@@ -40,6 +40,7 @@ fn a_training_leaves_its_files_and_nothing_else() {
     assert!(fs::read_to_string(run.join("version.txt")).unwrap().contains("mujoco 3.17.0"));
     let config: toml::Table = fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap();
     assert_eq!(config["env"]["num_envs"].as_integer(), Some(16));
+    assert_eq!(config["run"]["shards"].as_integer(), Some(16), "the number that was found");
     assert_eq!(config["env"]["reach_goal_bonus"].as_float(), Some(2.0), "the resolved configuration is whole");
     let rows = metrics(&run);
     assert_eq!(rows.len(), 3);
@@ -226,6 +227,21 @@ fn the_same_training_writes_the_same_bytes() {
         let [one, other] = runs.each_ref().map(|run| fs::read(run.path().join("run").join(file)).unwrap());
         assert!(one == other, "{file}");
     }
+}
+
+#[test]
+fn a_checkpoint_from_before_there_were_shards_is_resumed_with_a_line_that_says_so() {
+    let folder = trained(&[]);
+    let path = folder.path().join("run/checkpoints/latest.safetensors");
+    let mut older = Checkpoint::parse(&fs::read(&path).unwrap()).unwrap();
+    assert!(older.config.contains("shards = 16\n"), "{}", older.config);
+    older.config = older.config.replace("shards = 16\n", "");
+    fs::write(&path, older.to_bytes().unwrap()).unwrap();
+    let resume = ["train", "--resume", "run", "--total-steps", "384"];
+    let said = stderr(&succeeded(program(folder.path(), &resume)));
+    assert!(said.contains("what follows is another sequence than before"), "{said}");
+    let said = stderr(&succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512"])));
+    assert!(!said.contains("another sequence"), "{said}");
 }
 
 /// A run folder of version 0.1.0: a checkpoint of one hand, with nets of one neuron.

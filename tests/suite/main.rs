@@ -10,6 +10,7 @@ mod binary;
 mod pictures;
 mod point_mass;
 mod pool;
+mod ranks;
 mod run_folder;
 mod scene;
 mod support;

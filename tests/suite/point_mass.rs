@@ -6,6 +6,7 @@ use shadow_repose::agent::Agent;
 use shadow_repose::config::{Backend, PpoConfig, Precision, Ramp};
 use shadow_repose::env::{End, Env, Transition};
 use shadow_repose::ppo::Ppo;
+use shadow_repose::ranks::Division;
 use shadow_repose::rng::{self, Rng};
 use shadow_repose::spaces::Spaces;
 
@@ -16,7 +17,7 @@ const STEPS: u32 = 20;
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// A point in the plane that is moved by up to 0.2 a step and should come to the origin.
-struct PointMass {
+pub struct PointMass {
     position: [f64; 2],
     age: u32,
     /// Where it panics.
@@ -87,11 +88,16 @@ fn agent(settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
 }
 
 fn agent_of(envs: usize, settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
-    let point = |_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS };
-    Agent::new((0..envs).map(point).collect(), settings, seed, |_| ()).unwrap()
+    divided(envs, settings, seed, Division::alone(1))
 }
 
-fn settings() -> PpoConfig {
+/// The agent of one rank, for so many points of its own.
+pub fn divided(envs: usize, settings: &PpoConfig, seed: u64, division: Division) -> Agent<PointMass> {
+    let point = |_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS };
+    Agent::new((0..envs).map(point).collect(), settings, seed, division, |_| ()).unwrap()
+}
+
+pub fn settings() -> PpoConfig {
     let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.max_std.from=0.5", "ppo.gamma=0.9"];
     config(&[&settings[..], &["ppo.symmetry=none"]].concat()).ppo
 }
@@ -130,7 +136,7 @@ fn ppo_learns_with_candles_tensors_too() {
 #[test]
 fn ppo_learns_on_tiles_where_there_are_any() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
-    if Ppo::new(&settings, PointMass::SPACES, 0).is_ok() {
+    if Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).is_ok() {
         let [first, last] = distances(&settings, 0);
         assert!(first > 0.5 && last < 0.15, "{first} → {last}");
     }
@@ -140,14 +146,14 @@ fn ppo_learns_on_tiles_where_there_are_any() {
 fn a_policy_starts_with_the_upper_bound_of_its_standard_deviations_which_then_falls_by_equal_factors() {
     let max_std = Ramp { from: 0.5, to: 0.125, steps: 100 };
     let settings = PpoConfig { max_std, min_std: Ramp::constant(0.0), ..settings() };
-    let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0).unwrap();
+    let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.5).abs() < 1e-6));
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.125)] {
         ppo.limit_std(env_steps);
         assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{env_steps}");
     }
     let at_once = PpoConfig { max_std: Ramp { steps: 0, ..max_std }, ..settings };
-    let ppo = Ppo::new(&at_once, PointMass::SPACES, 0).unwrap();
+    let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.125).abs() < 1e-6), "no steps: the end at once");
 }
 
@@ -155,7 +161,8 @@ fn a_policy_starts_with_the_upper_bound_of_its_standard_deviations_which_then_fa
 fn standard_deviations_stay_above_a_lower_bound_and_are_raised_to_it() {
     for (min_std, expected) in [(0.25, 0.5f32), (0.75, 0.75)] {
         let (min_std, max_std) = (Ramp { from: 0.0, to: min_std, steps: 10 }, Ramp { from: 0.5, to: 1.0, steps: 10 });
-        let mut ppo = Ppo::new(&PpoConfig { min_std, max_std, ..settings() }, PointMass::SPACES, 0).unwrap();
+        let mut ppo =
+            Ppo::new(&PpoConfig { min_std, max_std, ..settings() }, PointMass::SPACES, 0, Division::alone(1)).unwrap();
         ppo.limit_std(1000);
         assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{min_std}");
     }

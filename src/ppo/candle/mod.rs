@@ -8,9 +8,10 @@ use anyhow::Result;
 use candle_core::{Device, Module, Tensor};
 
 use super::Policy;
-use super::backend::{self, Backend};
+use super::backend::{self, Backend, ShardSums};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
+use crate::ranks::tree_sum;
 use crate::spaces::Spaces;
 use loss::{Gaussian, Minibatch};
 use nets::Nets;
@@ -65,30 +66,34 @@ impl Backend for Reference {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        samples: &[u32],
+        minibatch: backend::Minibatch,
         out: &mut [f32],
-    ) -> Result<backend::Losses> {
-        let (batch, nets) = (self.minibatch(policy, rollout, samples)?, Nets::new(policy)?);
-        let means = nets.actor.forward(&batch.observations)?;
-        let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
-        let log_std = nets.log_std.as_tensor().clone();
-        let new = Gaussian { means, log_std, scales: batch.old.scales.clone() };
-        let losses = loss::losses(&self.config, &batch, &new, &values)?;
-        nets.write_gradient(&losses.total.backward()?, out)?;
-        let ratios = losses.ratios.to_vec1::<f32>()?;
-        let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
-        Ok(backend::Losses {
-            total: scalar(&losses.total)?,
-            policy: scalar(&losses.policy)?,
-            value: scalar(&losses.value)?,
-            excess: scalar(&losses.excess)?,
-            kl: scalar(&losses.kl)?,
-            clip_fraction: errors().filter(|&error| error > self.config.clip).count() as f64 / ratios.len() as f64,
-            ratio_error: errors().fold(0.0, f64::max),
-        })
+    ) -> Result<Vec<ShardSums>> {
+        let (mut sums, mut gradients) = (Vec::new(), Vec::new());
+        for shard in minibatch.samples.chunks(minibatch.in_shard()) {
+            let (batch, nets) = (self.minibatch(policy, rollout, shard)?, Nets::new(policy)?);
+            let means = nets.actor.forward(&batch.observations)?;
+            let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
+            let log_std = nets.log_std.as_tensor().clone();
+            let new = Gaussian { means, log_std, scales: batch.old.scales.clone() };
+            let losses = loss::losses(&self.config, &batch, &new, &values)?;
+            let mut gradient = vec![0.0; out.len()];
+            let share = 1.0 / minibatch.shards as f64;
+            nets.write_gradient(&(losses.total * share)?.backward()?, &mut gradient)?;
+            gradients.push(gradient);
+            let ratios = losses.ratios.to_vec1::<f32>()?;
+            let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
+            let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
+            sums.push(ShardSums {
+                surrogate: -sum(&losses.policy)?,
+                value_error: sum(&losses.value)?,
+                excess: sum(&losses.excess)?,
+                kl: sum(&losses.kl)?,
+                clipped: errors().filter(|&error| error > self.config.clip).count() as f64,
+                ratio_error: errors().fold(0.0, f64::max),
+            });
+        }
+        tree_sum(out, &gradients.iter().map(|gradient| &gradient[..]).collect::<Vec<_>>());
+        Ok(sums)
     }
-}
-
-fn scalar(tensor: &Tensor) -> Result<f64> {
-    Ok(f64::from(tensor.to_scalar::<f32>()?))
 }
