@@ -11,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
 use crate::env::{Env, EnvPool, EnvState, Lesson, Repose, Resumable, Task};
-use crate::ppo::{Array, Checkpoint, Ppo, Progress, Rollout, UpdateStats};
+use crate::ppo::{Array, Checkpoint, Fork, Ppo, Progress, Rollout, UpdateStats};
 use crate::ranks::Division;
 
 // Where a checkpoint keeps the states of the environments.
@@ -35,6 +35,8 @@ pub struct Agent<E: Env> {
     pub iteration: u64,
     /// Control steps over all environments.
     pub env_steps: u64,
+    /// Where it left another training, if it did.
+    pub fork: Option<Fork>,
 }
 
 /// What is known of an iteration.
@@ -92,7 +94,17 @@ impl<E: Env> Agent<E> {
         let scratch = Scratch::new(&pool, &ppo);
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
-        Ok(Self { pool, ppo, rollout, scratch, lessons: Box::new(lessons), steps, iteration: 0, env_steps: 0 })
+        Ok(Self {
+            pool,
+            ppo,
+            rollout,
+            scratch,
+            lessons: Box::new(lessons),
+            steps,
+            iteration: 0,
+            env_steps: 0,
+            fork: None,
+        })
     }
 
     /// Collects and learns. `None` if `stop` was set meanwhile; then, and after an error, the agent must be restored before it is
@@ -129,7 +141,8 @@ impl<E: Env> Agent<E> {
 impl<E: Resumable> Agent<E> {
     /// The state at the end of an iteration, whole, with the configuration of the run (TOML) and its best evaluation.
     pub fn checkpoint(&self, config: &str, best: Option<[f64; 2]>) -> Checkpoint {
-        let progress = Progress { iteration: self.iteration, env_steps: self.env_steps, best };
+        let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
+        let progress = Progress { iteration, env_steps, best, fork };
         let mut checkpoint = self.ppo.checkpoint(config, progress);
         let EnvState { numbers, counters } = self.pool.save();
         let rows = self.pool.count();
@@ -143,7 +156,8 @@ impl<E: Resumable> Agent<E> {
     /// # Errors
     /// A state that no such agent can have saved.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
-        (self.iteration, self.env_steps) = (checkpoint.progress.iteration, checkpoint.progress.env_steps);
+        let Progress { iteration, env_steps, fork, .. } = &checkpoint.progress;
+        (self.iteration, self.env_steps, self.fork) = (*iteration, *env_steps, fork.clone());
         self.ppo.restore(checkpoint)?;
         let numbers = checkpoint.take_doubles(NUMBERS)?;
         let state = EnvState { numbers, counters: checkpoint.take_counters(COUNTERS)? };
@@ -157,9 +171,12 @@ impl<E: Resumable> Agent<E> {
 /// # Errors
 /// A policy alone; other numbers.
 pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
-    let Progress { iteration, env_steps, .. } = checkpoint.progress;
-    let steps = iteration.checked_mul(config.steps_per_iteration());
-    ensure!(steps == Some(env_steps), "{iteration} iterations cannot have made {env_steps} steps");
+    let Progress { iteration, env_steps, ref fork, .. } = checkpoint.progress;
+    // The run that a fork left may have made others in each.
+    let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
+    let own = iteration.checked_sub(before).and_then(|own| own.checked_mul(config.steps_per_iteration()));
+    let possible = own.is_some() && own == env_steps.checked_sub(steps_before);
+    ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
     for name in [NUMBERS, COUNTERS] {
         let shape =
             checkpoint.shape(name).context("it holds a policy alone, which can be played but not trained on")?;

@@ -80,6 +80,10 @@ pub struct TrainArgs {
     /// run
     #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume")]
     pub init: Option<PathBuf>,
+    /// Begin a new run with everything of another one's checkpoint (weights, hands, counters; ramps go on), under changed settings;
+    /// takes the folder or one of its checkpoints
+    #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"])]
+    pub fork: Option<PathBuf>,
     /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub keep: Option<usize>,

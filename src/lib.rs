@@ -18,7 +18,7 @@
 //! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
 //! | [`dump`] | what led to a diverged state, as JSON |
 //! | [`load`] | checkpoints and policies from files that nobody vouches for |
-//! | [`play`], [`trace`] | a policy plays: scores as table and JSON; episodes as JSON lines |
+//! | [`play`], [`pace`], [`trace`] | a policy plays: scores as table and JSON; how long goals take; episodes as JSON lines |
 //! | [`mod@view`] | the scene without a policy |
 //! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
 //! | [`plot`] | learning curves of runs |
@@ -74,6 +74,7 @@ pub mod evaluate;
 #[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
 pub mod film;
 pub mod load;
+pub mod pace;
 pub mod play;
 pub mod plot;
 pub mod ppo;

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 
-use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig};
+use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::env::SPACES;
 use crate::ppo::Checkpoint;
 use crate::run;
@@ -78,13 +78,29 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
 /// A checkpoint of another version, or whose configuration is invalid, belongs to another policy, or names a scene that no override
 /// names.
 pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<Config> {
-    ensure!(
-        !checkpoint.is_of_0_1,
-        "made by 0.1.0: go on with that version, or begin a new run with its policy (--init)"
-    );
+    expect_trainable(checkpoint)?;
     let config = Config::from_text(path, &checkpoint.config, overrides)?;
     expect_usable(checkpoint, &config.ppo.net(), &config.env, overrides)?;
     Ok(config)
+}
+
+/// The configuration of the training that has left a checkpoint in the file `path`, and that of a fork of it, with the `user`'s
+/// file and `overrides` on top.
+///
+/// # Errors
+/// As [`for_training`].
+pub fn for_fork(
+    checkpoint: &Checkpoint,
+    path: &Path,
+    user: Option<&Source>,
+    overrides: &[Override],
+) -> Result<(Config, Config)> {
+    expect_trainable(checkpoint)?;
+    let parent = Config::from_text(path, &checkpoint.config, &[])?;
+    checkpoint.expect_policy(&parent.ppo.net(), &SPACES)?;
+    let config = parent.changed(user, overrides)?;
+    expect_named_scene(&parent.env, config.env.model_file().is_some())?;
+    Ok((parent, config))
 }
 
 /// How the policy of a checkpoint in the file `path` is to be played, with `overrides` on top.
@@ -104,7 +120,18 @@ fn cannot_use(path: &Path) -> String {
 /// Makes sure that a checkpoint holds this policy, and that a scene comes from who runs the program, not from the file.
 fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
     checkpoint.expect_policy(net, &SPACES)?;
-    let named = overrides.iter().any(|set| set.key == MODEL);
+    expect_named_scene(env, overrides.iter().any(|set| set.key == MODEL))
+}
+
+/// Makes sure that it holds more than a policy, in a form that this version goes on from.
+fn expect_trainable(checkpoint: &Checkpoint) -> Result<()> {
+    let advice = "go on with that version, or begin a new run with its policy (--init)";
+    ensure!(!checkpoint.is_of_0_1, "made by 0.1.0: {advice}");
+    Ok(())
+}
+
+/// Makes sure that a scene is named by who runs the program, if it is not the built-in one.
+fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
     if let Some(model) = env.model_file().filter(|_| !named) {
         let set = run::quoted(&format!("{MODEL}={}", model.display()));
         bail!(

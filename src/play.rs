@@ -11,9 +11,10 @@ use serde_json::{Map, Value, json};
 use crate::cli::{Baseline, PlayArgs};
 use crate::config::{Config, EnvConfig, Override};
 use crate::env::{SPACES, Score, Task};
-use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::evaluate::{Actor, Episodes, Moment, evaluate};
 use crate::film::Film;
 use crate::load::Origin;
+use crate::pace::Pace;
 use crate::ppo::Policy;
 use crate::run::{self, Requests};
 use crate::scenery::task_to_see;
@@ -49,21 +50,28 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     // Opened before playing: a place that cannot be written to should not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
     let mut trace = output.as_ref().map(|_| Trace::new(&config, checkpoint.as_deref()));
+    let mut pace = Pace::new(&config);
     // Only a film is worth having if it is interrupted.
     let requests = if args.video.is_some() { Requests::listen()? } else { Requests::none() };
-    let score = |actor: &Actor, trace: Option<&mut Trace>| {
-        score(&Task::new(&config)?, actor, episodes(args, 256), requests.stop(), trace)
+    let mut observe = |moment: &Moment| {
+        pace.observe(moment);
+        if let Some(trace) = &mut trace {
+            trace.record(moment);
+        }
+    };
+    let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
+        score(&Task::new(&config)?, actor, episodes(args, 256), requests.stop(), observe)
     };
     let played = match &args.video {
-        Some(path) => film(path, &config, &actor, args, &requests, trace.as_mut())?,
-        None => score(&actor, trace.as_mut())?,
+        Some(path) => film(path, &config, &actor, args, &requests, &mut observe)?,
+        None => score(&actor, &mut observe)?,
     };
     let Some(played) = played else { return Ok(Outcome::Stopped(requests.exit_code())) };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
     if args.json {
-        run::print(&format!("{}\n", json_score(&played, checkpoint.as_deref(), args.seed)));
+        run::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)));
         return Ok(Outcome::Finished);
     }
     let name = match &actor {
@@ -77,7 +85,7 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     }
     let mut columns = vec![(name, played)];
     if loaded.is_some() && args.video.is_none() {
-        columns.push(("zero actions", score(&Actor::Zero, None)?.context("nothing interrupts these episodes")?));
+        columns.push(("zero actions", score(&Actor::Zero, &mut |_| {})?.context("nothing interrupts these episodes")?));
     }
     run::print(&table(&columns));
     Ok(Outcome::Finished)
@@ -120,7 +128,7 @@ fn film(
     actor: &Actor,
     args: &PlayArgs,
     requests: &Requests,
-    mut trace: Option<&mut Trace>,
+    observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
     let task = task_to_see(config, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
@@ -129,9 +137,7 @@ fn film(
     for first in all.first..all.first + all.count {
         let one = Episodes { first, count: 1, ..all };
         let result = evaluate(&task, actor, one, requests.stop(), &mut |moment| {
-            if let Some(trace) = &mut trace {
-                trace.record(&moment);
-            }
+            observe(&moment);
             film.observe(&moment)
         });
         match result {
@@ -190,13 +196,11 @@ fn score(
     actor: &Actor,
     episodes: Episodes,
     interrupted: &AtomicBool,
-    mut trace: Option<&mut Trace>,
+    observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
     let progress = run::Bar::new(episodes.count as u64, "episodes");
     let played = evaluate(task, actor, episodes, interrupted, &mut |moment| {
-        if let Some(trace) = &mut trace {
-            trace.record(&moment);
-        }
+        observe(&moment);
         if moment.step.is_some_and(|(_, end)| end.is_some()) {
             progress.count();
         }
@@ -206,9 +210,9 @@ fn score(
 }
 
 /// One object with everything that is known; what has no value is null.
-fn json_score(score: &Score, checkpoint: Option<&str>, seed: u64) -> Value {
+fn json_score(score: &Score, pace: &Pace, checkpoint: Option<&str>, seed: u64) -> Value {
     let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
-    json!({
+    let mut value = json!({
         "episodes": score.episodes,
         "env_steps": score.env_steps,
         "goals_per_episode": score.goals,
@@ -223,7 +227,11 @@ fn json_score(score: &Score, checkpoint: Option<&str>, seed: u64) -> Value {
         "diverged": score.diverged,
         "checkpoint": checkpoint,
         "seed": seed,
-    })
+    });
+    for (name, known) in pace.named() {
+        value[name] = known;
+    }
+    value
 }
 
 /// A row for each figure, a column for each score.
@@ -268,10 +276,11 @@ mod tests {
 
     #[test]
     fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {
-        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), None, 3);
+        let pace = Pace::new(&Config::resolve(None, &[]).unwrap().env);
+        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), &pace, None, 3);
         let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
         let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal drop_rate \
-                        episode_length return reward diverged checkpoint seed";
+                        episode_length return reward diverged checkpoint seed steps_to_goal drops_first_second steps_fit";
         assert_eq!(keys.join(" "), expected);
         assert!(value["steps_per_goal"].is_null() && value["checkpoint"].is_null());
         assert_eq!(value["reward"].as_object().unwrap().len(), 5);

@@ -9,7 +9,7 @@ use toml::{Table, Value};
 use super::BASE;
 use super::overlay::{overlay, table_of};
 use super::rules::violations;
-use super::settings::{Config, EnvConfig, NetConfig};
+use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
@@ -72,6 +72,23 @@ impl Config {
     /// As [`Config::resolve`].
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
         Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
+    }
+
+    /// These settings, overlaid by the user's file and then by `overrides`; but for the scene: no path in a file is followed. The
+    /// shards stay where they fit.
+    ///
+    /// # Errors
+    /// As [`Config::resolve`].
+    pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        let mut own = self.clone();
+        (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
+        let mut tables = vec![Table::try_from(own).expect("a configuration is a tree of tables")];
+        tables.extend(user.map(Source::table).transpose()?);
+        let mut changed = layered(user.map(|source| source.path.as_path()), &tables, overrides)?;
+        if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
+            changed.run.shards = self.run.shards;
+        }
+        Ok(changed)
     }
 
     /// The whole configuration as TOML.

@@ -25,7 +25,7 @@ const LONGEST_CONFIG: usize = 1 << 16;
 const LEARNING_RATE: &str = "learning_rate";
 
 /// How far a run has come.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
     /// Iterations finished.
@@ -34,6 +34,21 @@ pub struct Progress {
     pub env_steps: u64,
     /// Goals per episode and rotation error (rad) of the best evaluation.
     pub best: Option<[f64; 2]>,
+    /// Where it left another run, if it is a fork of one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fork: Option<Fork>,
+}
+
+/// The checkpoint of another run that a run began with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fork {
+    /// Its file, where it was then; only ever shown.
+    pub from: String,
+    /// The iterations that the other run had finished.
+    pub iteration: u64,
+    /// The control steps that it had made.
+    pub env_steps: u64,
 }
 
 /// A checkpoint, or a policy alone, outside of any learner.
@@ -92,7 +107,8 @@ impl Checkpoint {
             |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
         let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
-        Self { config: self.config.clone(), content: Content { arrays, ..Content::default() }, ..*self }
+        let (config, progress) = (self.config.clone(), self.progress.clone());
+        Self { config, progress, is_of_0_1: self.is_of_0_1, content: Content { arrays, ..Content::default() } }
     }
 
     /// Adds an array.
@@ -138,7 +154,7 @@ impl Checkpoint {
     }
 
     /// Takes out the floats that these views name, each with this prefix, as one array in the order of the views.
-    fn take_floats(&mut self, prefix: &str, views: &[View]) -> Result<Vec<f32>> {
+    pub(super) fn take_floats(&mut self, prefix: &str, views: &[View]) -> Result<Vec<f32>> {
         let mut all = Vec::new();
         for View { name, shape, .. } in views {
             let name = format!("{prefix}{name}");
@@ -282,8 +298,12 @@ mod tests {
         Ppo::new(&config(Backend::Fused, hidden), SPACES, 0, Division::alone(1)).unwrap()
     }
 
+    fn progress() -> Progress {
+        Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]), fork: None }
+    }
+
     fn saved(ppo: &Ppo) -> Checkpoint {
-        ppo.checkpoint("[env]", Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) })
+        ppo.checkpoint("[env]", progress())
     }
 
     fn refusal(mut checkpoint: Checkpoint, into: &mut Ppo) -> String {
@@ -310,8 +330,7 @@ mod tests {
             let bytes = saved(&from).to_bytes().unwrap();
             for mut to in [learnt(backend, 2), learnt(other, 3)] {
                 let mut checkpoint = Checkpoint::parse(&bytes).unwrap();
-                let progress = Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]) };
-                assert_eq!((checkpoint.config.as_str(), checkpoint.progress), ("[env]", progress));
+                assert_eq!((checkpoint.config.as_str(), &checkpoint.progress), ("[env]", &progress()));
                 to.restore(&mut checkpoint).unwrap();
                 checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);

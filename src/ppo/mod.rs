@@ -11,6 +11,7 @@ mod candle;
 mod checkpoint;
 mod format;
 mod gae;
+mod growth;
 mod kernels;
 mod measure;
 mod normalizer;
@@ -27,7 +28,7 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 pub use acting::Acting;
-pub use checkpoint::{Checkpoint, Progress};
+pub use checkpoint::{Checkpoint, Fork, Progress};
 pub use format::{Array, sealed};
 pub use gae::gae;
 pub use kernels::Workspace;
@@ -271,6 +272,17 @@ impl Ppo {
         Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
     }
 
+    /// Goes on with the learning rate of its settings, where they name another one than `before` or keep it fixed; an adapted one
+    /// stays within its range.
+    pub fn settle_learning_rate(&mut self, before: &PpoConfig) {
+        let PpoConfig { learning_rate, learning_rate_range: [lowest, highest], desired_kl, .. } = self.config;
+        if desired_kl == 0.0 || learning_rate != before.learning_rate {
+            self.learning_rate = learning_rate;
+        } else {
+            self.learning_rate = self.learning_rate.clamp(lowest, highest);
+        }
+    }
+
     fn check_weights(&self) -> Result<()> {
         for View { name, range, .. } in self.policy.layout.views() {
             let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
@@ -349,6 +361,20 @@ mod tests {
         assert_eq!(ppo.learning_rate, 5e-4);
         (0..9).for_each(|_| ppo.adapt_learning_rate(1e-4));
         assert_eq!(ppo.learning_rate, 2e-3);
+    }
+
+    #[test]
+    fn a_fork_takes_the_learning_rate_of_its_settings_where_they_name_another_or_keep_it_fixed() {
+        let mut ppo = learner(0.01);
+        let before = ppo.config.clone();
+        // As adapted, what the settings name now, the divergence that is desired, and the rate that it goes on with.
+        for (adapted, named, desired, expected) in
+            [(7e-4, 1e-3, 0.01, 7e-4), (7e-4, 6e-4, 0.01, 6e-4), (7e-4, 1e-3, 0.0, 1e-3), (1e-4, 1e-3, 0.01, 5e-4)]
+        {
+            (ppo.learning_rate, ppo.config.learning_rate, ppo.config.desired_kl) = (adapted, named, desired);
+            ppo.settle_learning_rate(&before);
+            assert_eq!(ppo.learning_rate, expected);
+        }
     }
 
     #[test]

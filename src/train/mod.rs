@@ -1,5 +1,6 @@
 //! Training, from top to bottom: collect, learn, evaluate, report, save.
 
+mod fork;
 mod log;
 mod saver;
 mod session;
@@ -37,9 +38,10 @@ pub enum Outcome {
 /// Settings, files or a scene that cannot be used; a run folder that cannot be written to at the beginning or in the end; a
 /// loss that is not finite; a panic.
 pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
-    let (mut session, mut saver) = match &args.resume {
-        Some(place) => Session::resume(place, args)?,
-        None => Session::begin(args)?,
+    let (mut session, mut saver) = match (&args.resume, &args.fork) {
+        (Some(place), _) => Session::resume(place, args)?,
+        (None, Some(place)) => Session::fork(place, args)?,
+        (None, None) => Session::begin(args)?,
     };
     let place = saver.folder().path().display().to_string();
     if session.finished() {

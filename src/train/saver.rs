@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Error, Result, anyhow};
 
 use crate::load;
-use crate::ppo::Checkpoint;
+use crate::ppo::{Checkpoint, Fork};
 use crate::run::{self, Locked, Report, RunFolder};
 use crate::{env, sim};
 
@@ -68,7 +68,10 @@ impl Saver {
     /// # Errors
     /// A folder that cannot be written to.
     pub fn describe(&self) -> Result<()> {
-        self.folder.describe(&self.end.config, &version())
+        let fork = self.end.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
+            format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
+        });
+        self.folder.describe(&format!("{fork}{}", self.end.config), &version())
     }
 
     /// Writes logs, the best policy and the checkpoint, each before what speaks of it.

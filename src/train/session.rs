@@ -15,7 +15,7 @@ use crate::ppo::{Array, Checkpoint};
 use crate::run::{self, Locked, RunFolder};
 
 /// Where a checkpoint keeps the fingerprint of the scene that its environments live in.
-const SCENE: &str = "scene";
+pub const SCENE: &str = "scene";
 
 /// All that a training owns, but for what saves it.
 pub struct Session {
@@ -68,7 +68,7 @@ impl Session {
         let newest = checkpoints.newest_first();
         let places = if place.is_dir() { newest.clone() } else { vec![place.to_owned()] };
         let (path, mut checkpoint) =
-            first_sound(&places).with_context(|| format!("cannot resume {}", place.display()))?;
+            newest_sound(&places).with_context(|| format!("cannot resume {}", place.display()))?;
         let context = || format!("cannot resume from {}", path.display());
         let mut config = load::for_training(&checkpoint, &path, &overrides(args)).with_context(context)?;
         expect_states(&checkpoint, &config).with_context(context)?;
@@ -136,7 +136,7 @@ pub fn user_file(settings: &Settings) -> Result<Option<Source>> {
 }
 
 /// The single settings, with those that have options of their own.
-fn overrides(args: &TrainArgs) -> Vec<Override> {
+pub fn overrides(args: &TrainArgs) -> Vec<Override> {
     let options = [
         ("run.seed", args.seed),
         ("run.threads", args.threads.map(|n| n as u64)),
@@ -148,7 +148,10 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
 }
 
 /// Makes the run independent of the folder that it was begun in.
-fn settle_model(config: &mut Config) -> Result<()> {
+///
+/// # Errors
+/// A scene that is not there.
+pub fn settle_model(config: &mut Config) -> Result<()> {
     if let Some(model) = config.env.model_file() {
         let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
         config.env.model = model.display().to_string();
@@ -156,8 +159,11 @@ fn settle_model(config: &mut Config) -> Result<()> {
     Ok(())
 }
 
-/// The first of these files that is not damaged, with a warning for each one before it.
-fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
+/// The first of these files, the newest first, that is not damaged, with a warning for each one before it.
+///
+/// # Errors
+/// No file; of the last one, if all are damaged.
+pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match load::read(path) {

@@ -6,6 +6,8 @@
 mod architecture;
 mod bad_input;
 mod binary;
+mod fork;
+mod pace;
 #[cfg(feature = "video")]
 mod pictures;
 mod point_mass;

@@ -1,0 +1,128 @@
+//! How long the goals of episodes take, and how soon cubes are dropped: what a score does not tell about a policy's weaknesses.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+
+use crate::config::EnvConfig;
+use crate::env::Env;
+use crate::evaluate::Moment;
+
+/// The goals that were reached in some episodes, and their early drops.
+pub struct Pace {
+    /// Steps within tolerance that a goal asks for.
+    hold: u32,
+    /// Control steps of a second.
+    second: u32,
+    /// Of each episode under way: the goals it has reached, and when and how the present one began.
+    under_way: BTreeMap<usize, (u32, Goal)>,
+    /// With the steps that each took.
+    reached: Vec<Goal>,
+    episodes: usize,
+    early_drops: usize,
+}
+
+/// A goal that was given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Goal {
+    /// Control steps: until it was reached; before that, the step of the episode at which it was given.
+    steps: u32,
+    /// Rotation error when it was given, rad.
+    angle: f64,
+}
+
+impl Pace {
+    /// Of episodes with these settings, none of them seen yet.
+    pub fn new(config: &EnvConfig) -> Self {
+        let (hold, second) = (config.max_consecutive_successes, (1.0 / config.ctrl_dt).round() as u32);
+        Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
+    }
+
+    /// Takes a moment; those of one episode in order.
+    pub fn observe(&mut self, moment: &Moment) {
+        let (stats, angle) = (moment.env.episode(), moment.env.rot_dist());
+        let next = Goal { steps: stats.length, angle };
+        let Some((_, end)) = moment.step else {
+            self.under_way.insert(moment.episode, (0, next));
+            return;
+        };
+        let (goals, goal) = self.under_way.entry(moment.episode).or_insert((0, next));
+        if stats.goals > *goals {
+            self.reached.push(Goal { steps: stats.length - goal.steps, angle: goal.angle });
+            (*goals, *goal) = (stats.goals, next);
+        }
+        if end.is_some() {
+            self.under_way.remove(&moment.episode);
+            self.episodes += 1;
+            self.early_drops += usize::from(stats.dropped && stats.length <= self.second);
+        }
+    }
+
+    /// `steps_to_goal` (mean and percentiles, control steps with the hold), `drops_first_second` (fraction of the episodes), `steps_fit`
+    /// (the straight line of the steps less the hold over the angle: its offset, and its slope, steps per rad); null where not known.
+    pub fn named(&self) -> [(&'static str, Value); 3] {
+        let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
+        steps.sort_by(f64::total_cmp);
+        let known = |value: f64| if steps.is_empty() { f64::NAN } else { value };
+        let at = |share: f64| known(percentile(&steps, share));
+        let to_goal = json!({
+            "mean": known(steps.iter().sum::<f64>() / steps.len() as f64),
+            "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
+        });
+        let turning = |goal: &Goal| [goal.angle, f64::from(goal.steps) - f64::from(self.hold)];
+        let [settle, per_rad] = line(self.reached.iter().map(turning));
+        [
+            ("steps_to_goal", to_goal),
+            ("drops_first_second", json!(self.early_drops as f64 / self.episodes as f64)),
+            ("steps_fit", json!({ "settle": settle, "per_rad": per_rad })),
+        ]
+    }
+}
+
+/// The value below which this share of the `sorted` ones lies, between neighbours in proportion.
+fn percentile(sorted: &[f64], share: f64) -> f64 {
+    let place = share * sorted.len().saturating_sub(1) as f64;
+    let (below, part) = (place as usize, place.fract());
+    let [low, high] = [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
+    low + part * (high - low)
+}
+
+/// Offset and slope of the straight line y(x) with the least squared error; `NaN` for fewer than two different x.
+fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
+    let count = points.clone().count() as f64;
+    let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;
+    let [x_mean, y_mean] = [mean(&|[x, _]| x), mean(&|[_, y]| y)];
+    let spread = mean(&|[x, _]| (x - x_mean).powi(2));
+    let slope = if spread > 0.0 { mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread } else { f64::NAN };
+    [y_mean - slope * x_mean, slope]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn pace(reached: &[(u32, f64)]) -> Pace {
+        let mut pace = Pace::new(&Config::resolve(None, &[]).unwrap().env);
+        pace.reached = reached.iter().map(|&(steps, angle)| Goal { steps, angle }).collect();
+        pace
+    }
+
+    #[test]
+    fn percentiles_lie_between_neighbours_and_the_line_is_the_one_that_was_laid() {
+        // 50 to hold, 34 to settle, 30 a rad.
+        let reached: Vec<(u32, f64)> = (0..=10).map(|i| (84 + 3 * i, 0.1 * f64::from(i))).collect();
+        let named = pace(&reached).named();
+        assert_eq!(named[0].1, json!({ "mean": 99.0, "p10": 87.0, "p50": 99.0, "p90": 111.0, "p99": 113.7 }));
+        let [settle, per_rad] = ["settle", "per_rad"].map(|key| named[2].1[key].as_f64().unwrap());
+        assert!((settle - 34.0).abs() < 1e-9 && (per_rad - 30.0).abs() < 1e-9, "{settle} {per_rad}");
+    }
+
+    #[test]
+    fn of_no_goals_nothing_is_known_and_of_one_no_line() {
+        let none = pace(&[]).named();
+        assert!(none[0].1["mean"].is_null() && none[0].1["p50"].is_null() && none[1].1.is_null());
+        let one = pace(&[(90, 1.0)]).named();
+        assert_eq!((&one[0].1["p99"], &one[2].1["per_rad"]), (&json!(90.0), &Value::Null));
+    }
+}
