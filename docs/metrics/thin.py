@@ -20,7 +20,9 @@ def numbers(rows, column):
 
 def main(run, table):
     rows = list(csv.DictReader(open(Path(run) / "metrics.csv")))
-    groups, begun = [[]], 0
+    # A fork begins later than at nothing.
+    length = int(rows[1]["env_steps"]) - int(rows[0]["env_steps"])
+    groups, begun = [[]], int(rows[0]["env_steps"]) - length
     for row in rows:
         groups[-1].append(row)
         if int(row["env_steps"]) - begun >= STEPS or row["eval/goals"]:

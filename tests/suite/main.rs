@@ -6,6 +6,7 @@
 mod architecture;
 mod bad_input;
 mod binary;
+mod experiment;
 mod fork;
 mod pace;
 #[cfg(feature = "video")]

@@ -1,0 +1,148 @@
+"""What the runs of an experiment came to: turning, goals and drops at equal steps and at equal time, seed against seed."""
+import csv
+import datetime
+import math
+import pathlib
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import tomllib
+
+THIN = pathlib.Path(__file__).resolve().parents[2] / "docs/metrics/thin.py"
+# Name in tables, digits.
+METRICS = {"turned": 3, "eval/goals": 2, "eval/drop_rate": 3}
+# Iterations whose seconds are taken as one, by their median: what stopped a training for a while does not count.
+TIMED = 50
+
+
+class Log:
+    """The metrics of a run."""
+
+    def __init__(self, path):
+        with (path / "metrics.csv").open(newline="") as file:
+            self.rows = list(csv.DictReader(file))
+        self.steps = [int(row["env_steps"]) for row in self.rows]
+        self.seed = path.name
+        text = path / "config.toml"
+        self.progress_reward = tomllib.loads(text.read_text())["training"]["progress_reward"]
+        seconds = [float(row["time/collect_s"]) + float(row["time/update_s"]) for row in self.rows]
+        self.seconds, spent = [], 0.0
+        for first in range(0, len(seconds), TIMED):
+            part = seconds[first:first + TIMED]
+            for _ in part:
+                spent += statistics.median(part)
+                self.seconds.append(spent)
+
+    def value(self, metric, at, window):
+        """The mean of the steps up to `at`, or of an evaluation the last one; NaN if it is not there yet."""
+        if not self.steps or self.steps[-1] < at:
+            return math.nan
+        # rad in a hundred steps: training/progress is what is paid for it.
+        column, scale = ("training/progress", 100) if metric == "turned" else (metric, 1)
+        scale = scale / self.progress_reward if metric == "turned" and self.progress_reward else scale
+        end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
+        rows = zip(self.steps[:end], self.rows)
+        known = [(steps, float(row[column])) for steps, row in rows if row.get(column) not in ("", "NaN", None)]
+        if metric.startswith("eval/"):
+            return known[-1][1] if known else math.nan
+        found = [value for steps, value in known if steps > self.steps[end - 1] - window]
+        return scale * statistics.fmean(found) if found else math.nan
+
+    def seconds_at(self, steps):
+        return next((spent for made, spent in zip(self.steps, self.seconds) if made >= steps), math.nan)
+
+    def steps_after(self, seconds):
+        return next((made for made, spent in zip(self.steps, self.seconds) if spent >= seconds), math.inf)
+
+
+def fails(rule, base, variant, window):
+    """Why a rule stops a variant, or None: its metric is below (or above) that share of the base's in all seeds."""
+    pairs = [[log.value(rule["metric"], rule["at"], window) for log in both] for both in zip(base, variant)]
+    ratios = [ours / theirs if theirs else math.nan for theirs, ours in pairs]
+    below = "below" in rule and all(ratio < rule["below"] for ratio in ratios)
+    above = "above" in rule and all(ratio > rule["above"] for ratio in ratios)
+    if not (below or above):
+        return None
+    found = ", ".join(f"{ratio:.2f}" for ratio in ratios)
+    return f"{rule['metric']} at {rule['at']:,} steps is {found} of the base's, {'below' if below else 'above'} in all seeds"
+
+
+def spread(values):
+    return statistics.stdev(values) if len(values) > 1 else math.nan
+
+
+def cell(pairs, digits, is_base):
+    """Mean over the seeds; of a variant also the mean of its differences from the base, their standard deviation, and its signs."""
+    pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
+    if not pairs:
+        return "-"
+    mean = f"{statistics.fmean(ours for _, ours in pairs):.{digits}f}"
+    if is_base:
+        return f"{mean} ± {spread([ours for _, ours in pairs]):.{digits}f}"
+    apart = [ours - theirs for theirs, ours in pairs]
+    up = sum(difference > 0 for difference in apart)
+    return f"{mean} ({statistics.fmean(apart):+.{digits}f} ± {spread(apart):.{digits}f}, up in {up} of {len(apart)})"
+
+
+def tables(experiment):
+    """Markdown: a table for each milestone that the base has reached, at equal steps; and the same at equal time."""
+    logs = {name: {log.seed: log for log in experiment.logs(name)} for name in experiment.runs_of}
+    text = ""
+    for at in experiment.milestones:
+        base = {seed: log for seed, log in logs["base"].items() if log.steps and log.steps[-1] >= at}
+        if not base:
+            continue
+        hours = statistics.fmean(log.seconds_at(at) for log in base.values()) / 3600
+        equal = [(f"at {at:,} steps", lambda log, seed: at)]
+        if len(logs) > 1:
+            time = lambda log, seed: log.steps_after(base[seed].seconds_at(at))
+            equal.append((f"after the time that the base of that seed took for them, {hours:.2f} hours in the mean", time))
+        for title, where in equal:
+            text += f"\n{title}:\n\n| | {' | '.join(METRICS)} | steps |\n|---|{'---|' * (len(METRICS) + 1)}\n"
+            for name, of in logs.items():
+                shared = {seed: where(of[seed], seed) for seed in base if seed in of}
+                cells = []
+                for metric, digits in METRICS.items():
+                    value = lambda log, steps: log.value(metric, steps, experiment.window)
+                    pairs = [(value(base[seed], at), value(of[seed], steps)) for seed, steps in shared.items()]
+                    cells.append(cell(pairs, digits, name == "base"))
+                made = [steps for seed, steps in shared.items() if of[seed].steps and steps <= of[seed].steps[-1]]
+                steps = f"{statistics.fmean(made) / 1e6:.2f} M" if made else "-"
+                text += f"| {name} | {' | '.join(cells)} | {steps} |\n"
+    for name, runs in experiment.runs_of.items():
+        verdict = experiment.verdict(name, max(run.position() for run in runs))
+        text += f"\n{name} is stopped: {verdict}\n" if verdict not in (None, "waits") else ""
+    note = "turned: rad in a hundred steps, in training, mean of the last {:,} steps; eval: the last evaluation until then.\n" \
+           "Mean over the seeds; of the base ± its standard deviation; in brackets the mean of the differences from the base in the\n" \
+           "same seed ± their standard deviation."
+    return note.format(experiment.window) + "\n" + text if text else "the base has not come to the first milestone yet"
+
+
+def draw(program, runs, picture, smooth):
+    metrics = [word for column in ("training/progress", "eval/goals", "eval/drop_rate") for word in ("--metric", column)]
+    subprocess.run([program, "plot", *runs, "--out", picture, "--smooth", str(smooth), *metrics], check=False)
+
+
+def publish(experiment, folder):
+    """Thinned tables of all runs, the settings, and the tables and the picture of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for run in experiment.all_runs():
+        if (run.path / "metrics.csv").exists():
+            found.append(folder / f"{run.variant}-{run.seed}")
+            subprocess.run([sys.executable, THIN, run.path, found[-1] / "metrics.csv"], check=True)
+    shutil.copyfile(experiment.file, folder / "experiment.toml")
+    draw(experiment.program, found, folder / "picture.svg", smooth=1)
+    version = (experiment.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
+    machine = f"{datetime.date.today()}, {processor()}, {experiment.runs} runs at a time, threads of each: {experiment.threads}"
+    facts = f"{machine}.\nProgram: {version}."
+    (folder / "README.md").write_text(f"# {folder.name}\n\n{facts}\n\n{tables(experiment)}\n![curves](picture.svg)\n")
+
+
+def processor():
+    lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines() if pathlib.Path("/proc/cpuinfo").exists() else []
+    facts = {line.split(":")[0].strip(): line.split(":")[1].strip() for line in lines if ":" in line}
+    family = f", family {facts['cpu family']} model {facts['model']}" if "cpu family" in facts else ""
+    return facts.get("model name", platform.machine()) + family

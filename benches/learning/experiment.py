@@ -1,0 +1,258 @@
+"""Trains variants of a base, seed by seed, and compares them with it: python experiment.py FILE.toml DIR
+
+FILE.toml says what to train (README.md beside this file), DIR takes the runs. Stopped or killed, the same command goes on where
+it was. Needs Python 3.11 and the program; nothing else.
+"""
+import argparse
+import ctypes
+import datetime
+import fcntl
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+
+sys.dont_write_bytecode = True
+import compare
+
+HERE = pathlib.Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+DEFAULTS = {"seeds": [0, 1], "threads": 1, "runs": 2, "keep": [], "table": [], "stop": [], "set": [], "variants": {},
+            "fork": None, "config": None, "window": 1_000_000}
+
+
+class Experiment:
+    """What the file says, with the runs of it in a folder."""
+
+    def __init__(self, file, folder, program):
+        self.file, self.folder, self.program = file, folder, program
+        given = tomllib.loads(file.read_text())
+        unknown = set(given) - set(DEFAULTS) - {"steps"}
+        if unknown or "steps" not in given:
+            sys.exit(f"{file}: " + (f"unknown: {', '.join(sorted(unknown))}" if unknown else "`steps` is missing"))
+        self.__dict__.update(DEFAULTS | given)
+        if "base" in self.variants:
+            sys.exit(f"{file}: the base is what the variants are compared with, not one of them")
+        for name, of in self.variants.items():
+            if set(of) - {"set", "steps"}:
+                sys.exit(f"{file}: a variant has `set` and `steps`, and nothing else: {name}")
+        for rule in self.stop:
+            if not {"at", "metric"} < set(rule) <= {"at", "metric", "below", "above"}:
+                sys.exit(f"{file}: a rule to stop by needs `at`, `metric`, and `below` or `above`: {rule}")
+        if self.fork and "{seed}" not in self.fork and len(self.seeds) > 1:
+            sys.exit(f"{file}: all seeds would go on from the same checkpoint, as the same training; `fork` must have {{seed}} in it")
+        # Checkpoints lie beside the runs, settings beside the file.
+        self.fork = self.fork and str(folder / self.fork)
+        self.config = self.config and str(file.resolve().parent / self.config)
+        for seed in self.seeds if self.fork else []:
+            if not pathlib.Path(self.fork.format(seed=seed)).is_file():
+                sys.exit(f"{self.fork.format(seed=seed)}: there is no such checkpoint")
+        # Where trainings pause: to be judged, or for a copy of their checkpoint.
+        self.pauses = {rule["at"] for rule in self.stop} | set(self.keep)
+        self.runs_of = {name: [Run(self, name, seed) for seed in self.seeds] for name in ["base", *self.variants]}
+        self.milestones = sorted(at for at in self.pauses | set(self.table) | {self.steps} if at <= self.steps)
+
+    def all_runs(self):
+        return [run for runs in self.runs_of.values() for run in runs]
+
+    def verdict(self, name, position):
+        """Whether a variant at this position may go on: None; or why it is stopped; or "waits" for the runs that it is judged by."""
+        for rule in sorted(self.stop, key=lambda rule: rule["at"]):
+            if name == "base" or rule["at"] > position:
+                continue
+            judged = self.runs_of["base"] + self.runs_of[name]
+            if any(run.position() < rule["at"] for run in judged):
+                return "waits"
+            reason = compare.fails(rule, *(self.logs(of) for of in ("base", name)), self.window)
+            if reason:
+                return reason
+        return None
+
+    def logs(self, name):
+        return [compare.Log(run.path) for run in self.runs_of[name] if (run.path / "metrics.csv").exists()]
+
+
+class Run:
+    """One training: a variant under a seed."""
+
+    def __init__(self, experiment, variant, seed):
+        self.experiment, self.variant, self.seed = experiment, variant, seed
+        self.path = experiment.folder / variant / f"seed-{seed}"
+        own = experiment.variants.get(variant, {})
+        self.set = experiment.set + own.get("set", [])
+        self.fork = experiment.fork and experiment.fork.format(seed=seed)
+        end = own.get("steps", experiment.steps)
+        self.pauses = sorted({at for at in experiment.pauses if at < end} | {end})
+        self.failed = None
+
+    def name(self):
+        return f"{self.variant}, seed {self.seed}"
+
+    def checkpoints(self):
+        return sorted((self.path / "checkpoints").glob("iteration-*.safetensors"))
+
+    def position(self):
+        """Control steps of its newest checkpoint, which is what it goes on from."""
+        found = self.checkpoints()
+        if found:
+            return steps_of(found[-1])
+        return steps_of(pathlib.Path(self.fork)) if self.fork else 0
+
+    def pause(self):
+        """Where it pauses next; None at its end."""
+        position = self.position()
+        return next((at for at in self.pauses if at > position), None)
+
+    def command(self):
+        of, pause = self.experiment, str(self.pause())
+        if self.checkpoints():
+            return [of.program, "train", "--resume", self.path, "--threads", str(of.threads), "--total-steps", pause]
+        begin = ["--fork", self.fork] if self.fork else ["--seed", str(self.seed)]
+        config = ["--config", of.config] if of.config else []
+        sets = [word for setting in self.set for word in ("--set", setting)]
+        end = ["--threads", str(of.threads), "--total-steps", pause, "--run-dir", self.path]
+        return [of.program, "train", *begin, *config, *sets, *end]
+
+    def keep_copy(self):
+        """Copies the checkpoint of a pause that it is at, if the copy is wanted and not there."""
+        position = self.position()
+        passed = [at for at in self.pauses if at <= position]
+        if not passed or passed[-1] not in self.experiment.keep:
+            return
+        copy = self.experiment.folder / "kept" / f"{self.variant}-{self.seed}-{passed[-1]}.safetensors"
+        if not copy.exists():
+            copy.parent.mkdir(exist_ok=True)
+            partial = copy.with_suffix(".partial")
+            partial.write_bytes(self.checkpoints()[-1].read_bytes())
+            partial.rename(copy)
+
+    def wait_until_free(self):
+        """If this program was killed, its trainings end by themselves, but not at once."""
+        lock = self.path / "run.lock"
+        if not lock.exists():
+            return
+        with lock.open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+
+    def expect_settings(self):
+        """A folder goes on with what it was begun with."""
+        of = self.experiment
+        config = pathlib.Path(of.config).read_text() if of.config else None
+        settings = {"fork": self.fork, "config": config, "set": self.set}
+        record = self.path.with_suffix(".json")
+        if not record.exists():
+            record.parent.mkdir(parents=True, exist_ok=True)
+            record.write_text(json.dumps(settings, indent=1))
+        elif json.loads(record.read_text()) != settings:
+            sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; name another folder")
+
+    def start(self):
+        self.wait_until_free()
+        if self.path.exists() and not self.checkpoints():
+            # Killed before it had saved anything.
+            subprocess.run(["rm", "-r", self.path], check=True)
+        with self.path.with_suffix(".log").open("ab") as log:
+            return subprocess.Popen([str(word) for word in self.command()], stdout=log, stderr=log, start_new_session=True,
+                                    preexec_fn=at_low_priority)
+
+    def last_words(self):
+        return "\n".join(self.path.with_suffix(".log").read_text(errors="replace").splitlines()[-5:])
+
+
+def steps_of(checkpoint):
+    """The control steps that a training had made when it wrote this file."""
+    with checkpoint.open("rb") as file:
+        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    return json.loads(header["__metadata__"]["progress"])["env_steps"]
+
+
+def at_low_priority():
+    """In a training that is about to start: it gives way to all else, and saves and ends if this program is killed."""
+    os.nice(19)
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop(number, _):
+    raise Stopped(number)
+
+
+def train(experiment):
+    """Trains all runs as far as they are to go. True if none failed."""
+    for run in experiment.all_runs():
+        run.expect_settings()
+    said, at_work = set(), {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, stop)
+    try:
+        while True:
+            for run in [run for run, child in at_work.items() if child.poll() is not None]:
+                child = at_work.pop(run)
+                if child.returncode != 0:
+                    run.failed = f"exit code {child.returncode}:\n{run.last_words()}"
+                    say(f"{run.name()} failed, {run.failed}")
+                else:
+                    run.keep_copy()
+                    say(f"{run.name()}: {run.position():,} steps")
+            ready = []
+            for run in experiment.all_runs():
+                if run in at_work or run.failed or run.pause() is None:
+                    continue
+                verdict = experiment.verdict(run.variant, run.position())
+                if verdict is None:
+                    ready.append(run)
+                elif verdict != "waits" and run.variant not in said:
+                    said.add(run.variant)
+                    say(f"{run.variant} is stopped: {verdict}")
+            # The base first, since the others are judged by it; then who is least far, so that all can be compared early.
+            ready.sort(key=lambda run: (run.pause(), run.variant != "base"))
+            for run in ready[:experiment.runs - len(at_work)]:
+                run.keep_copy()
+                at_work[run] = run.start()
+            if not at_work:
+                return not any(run.failed for run in experiment.all_runs())
+            time.sleep(1)
+    except Stopped as stopped:
+        for child in at_work.values():
+            child.terminate()
+        for child in at_work.values():
+            child.wait()
+        say("stopped; the same command goes on")
+        sys.exit(128 + stopped.args[0])
+
+
+def say(text):
+    print(f"{datetime.datetime.now():%H:%M:%S} {text}", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=pathlib.Path)
+    parser.add_argument("folder", type=pathlib.Path)
+    parser.add_argument("--program", type=pathlib.Path, default=ROOT / "target/release/shadow-repose")
+    parser.add_argument("--table", action="store_true", help="print what there is, without training")
+    parser.add_argument("--publish", type=pathlib.Path, metavar="FOLDER",
+                        help="write thinned tables, settings and results there, without training")
+    args = parser.parse_args()
+    if not args.file.is_file() or not args.program.is_file():
+        sys.exit(f"{args.program if args.file.is_file() else args.file}: there is no such file")
+    experiment = Experiment(args.file, args.folder.resolve(), args.program.resolve())
+    whole = args.table or args.publish is not None or train(experiment)
+    print(compare.tables(experiment))
+    runs = [run.path for run in experiment.all_runs() if (run.path / "metrics.csv").exists()]
+    if args.publish:
+        compare.publish(experiment, args.publish)
+    elif runs:
+        compare.draw(experiment.program, runs, experiment.folder / "picture.svg", smooth=25)
+    return 0 if whole else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
