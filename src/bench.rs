@@ -82,11 +82,10 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         figures.insert("threads".into(), json!(rayon::current_num_threads()));
         figures.insert("hidden".into(), json!(config.ppo.hidden));
         figures.insert("num_envs".into(), json!(config.env.num_envs));
-        run::print(&format!("{}\n", serde_json::Value::Object(figures)));
+        run::print(&format!("{}\n", serde_json::Value::Object(figures)))
     } else {
-        run::print(&lines);
+        run::print(&lines)
     }
-    Ok(())
 }
 
 /// What an environment did in a turn.

@@ -6,11 +6,11 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Error, Result, bail, ensure};
 
 use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::env::SPACES;
-use crate::ppo::Checkpoint;
+use crate::ppo::{Checkpoint, Damaged};
 use crate::run;
 
 /// The key of the one setting that is a path.
@@ -70,6 +70,27 @@ impl fmt::Display for Origin {
 /// A file that cannot be read, or is damaged or none of this program.
 pub fn read(path: &Path) -> Result<Checkpoint> {
     Checkpoint::parse(&run::read_bytes(path)?).with_context(|| cannot_use(path))
+}
+
+/// The first of these files, the newest first, that is not damaged, with a warning for each one before it. One that cannot be read,
+/// or used, is not passed over: it may be all right tomorrow, and what comes after the one before it would be lost.
+///
+/// # Errors
+/// No file; one that cannot be read; of the last one, if all are damaged.
+pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
+    let (last, others) = places.split_last().context("there is no checkpoint")?;
+    for path in others {
+        match read(path) {
+            Err(error) if is_damage(&error) => run::say(&format!("warning: {error:#}\n  The one before is tried.")),
+            result => return Ok((path.clone(), result?)),
+        }
+    }
+    Ok((last.clone(), read(last)?))
+}
+
+/// Whether it is the bytes of a file that are wrong, and not whether or how they can be used.
+pub fn is_damage(error: &Error) -> bool {
+    error.is::<Damaged>()
 }
 
 /// The configuration to go on training with, from a checkpoint in the file `path`, with `overrides` on top.

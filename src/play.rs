@@ -27,7 +27,7 @@ use crate::window::{self, Window};
 ///
 /// # Errors
 /// A checkpoint, setting or scene that cannot be used; a window that cannot be opened; a trace or film that cannot be written.
-pub fn play(args: &PlayArgs) -> Result<Outcome> {
+pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
     let loaded = match args.policy {
         Some(_) => None,
         None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
@@ -51,8 +51,13 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
     let mut trace = output.as_ref().map(|_| Trace::new(&config, checkpoint.as_deref()));
     let mut pace = Pace::new(&config);
-    // Only a film is worth having if it is interrupted.
-    let requests = if args.video.is_some() { Requests::listen()? } else { Requests::none() };
+    if let (Some(output), Some(video)) = (&output, &args.video) {
+        ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
+    }
+    if args.video.is_some() {
+        // Only a film is worth having if it is interrupted.
+        requests.wait_for_end();
+    }
     let mut observe = |moment: &Moment| {
         pace.observe(moment);
         if let Some(trace) = &mut trace {
@@ -63,15 +68,20 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
         score(&Task::new(&config)?, actor, episodes(args, 256), requests.stop(), observe)
     };
     let played = match &args.video {
-        Some(path) => film(path, &config, &actor, args, &requests, &mut observe)?,
+        Some(path) => film(path, &config, &actor, args, requests, &mut observe)?,
         None => score(&actor, &mut observe)?,
     };
-    let Some(played) = played else { return Ok(Outcome::Stopped(requests.exit_code())) };
+    let Some(played) = played else {
+        output
+            .into_iter()
+            .for_each(|output| run::say(&format!("{}: interrupted, not written", output.path().display())));
+        return Ok(Outcome::Stopped(requests.exit_code()));
+    };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
     if args.json {
-        run::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)));
+        run::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)))?;
         return Ok(Outcome::Finished);
     }
     let name = match &actor {
@@ -81,13 +91,13 @@ pub fn play(args: &PlayArgs) -> Result<Outcome> {
         Actor::Zero | Actor::Wave => "zero actions",
     };
     if let Some(checkpoint) = &checkpoint {
-        run::print(&format!("checkpoint {checkpoint}\n"));
+        run::print(&format!("checkpoint {checkpoint}\n"))?;
     }
     let mut columns = vec![(name, played)];
     if loaded.is_some() && args.video.is_none() {
         columns.push(("zero actions", score(&Actor::Zero, &mut |_| {})?.context("nothing interrupts these episodes")?));
     }
-    run::print(&table(&columns));
+    run::print(&table(&columns))?;
     Ok(Outcome::Finished)
 }
 

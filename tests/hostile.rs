@@ -138,7 +138,8 @@ fn growth(rows: u64) -> i64 {
     let place = tempfile::tempdir().unwrap();
     let names: Vec<String> = (0..30).map(|i| format!("group/value_{i}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut report = Report::open(place.path(), &names, 0, 0, rows);
+    let mut report = Report::new(place.path(), &names, 0, rows);
+    report.open_logs(0..0, 0);
     let mut early = 0;
     for row in 1..=rows {
         let values: Vec<(&str, f64)> = names.iter().map(|name| (*name, (row as f64).sqrt())).collect();
@@ -153,7 +154,8 @@ fn growth(rows: u64) -> i64 {
     report.finish();
     drop(report);
     // A resumed session goes through all of it.
-    let resumed = Report::open(place.path(), &names, rows - 1, rows - 1, rows);
+    let mut resumed = Report::new(place.path(), &names, rows - 1, rows);
+    resumed.open_logs(0..rows - 1, rows - 1);
     resumed.finish();
     let text = fs::metadata(place.path().join("metrics.csv")).unwrap().len();
     assert!(text > rows * 300, "the rows were written");

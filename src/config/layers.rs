@@ -91,6 +91,24 @@ impl Config {
         Ok(changed)
     }
 
+    /// What `other` says differently, but for what may change in the course of a run: how far it goes, on how many threads, and where
+    /// its scene lies.
+    pub fn differences(&self, other: &Self) -> Vec<String> {
+        let table = |of: &Self| {
+            let mut same = of.clone();
+            (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, of.shards());
+            same.env.model = BUILTIN_MODEL.into();
+            Table::try_from(same).expect("a configuration is a tree of tables")
+        };
+        let (own, other) = (table(self), table(other));
+        let keys =
+            own.iter().flat_map(|(section, keys)| keys.as_table().into_iter().flatten().map(move |key| (section, key)));
+        let differing = keys.filter(|(section, (key, value))| other[*section][*key] != **value);
+        differing
+            .map(|(section, (key, value))| format!("{section}.{key} = {}, not {value}", other[section][key]))
+            .collect()
+    }
+
     /// The whole configuration as TOML.
     pub fn to_text(&self) -> String {
         let sections = Table::try_from(self).expect("a configuration is a tree of tables");

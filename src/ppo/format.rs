@@ -4,6 +4,7 @@
 //! checksum does not vouch for is refused.
 
 use std::collections::{BTreeMap, HashMap};
+use std::fmt;
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -24,6 +25,18 @@ pub enum Array {
     /// Whole numbers.
     U64(Vec<usize>, Vec<u64>),
 }
+
+/// What is wrong with bytes that are not as they were written: cut off, or changed since.
+#[derive(Debug)]
+pub struct Damaged(String);
+
+impl fmt::Display for Damaged {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Damaged {}
 
 /// The content of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -55,8 +68,12 @@ impl Content {
     /// Reads the bytes of a file.
     ///
     /// # Errors
-    /// Bytes that were not written by [`Content::to_bytes`] or have been changed since.
+    /// [`Damaged`]: bytes that were not written by [`Content::to_bytes`] or have been changed since.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
+        Self::read(bytes).map_err(|error| Damaged(format!("{error:#}")).into())
+    }
+
+    fn read(bytes: &[u8]) -> Result<Self> {
         let (mut texts, views) = read(bytes)?;
         let stored =
             texts.remove(CHECKSUM).context("no checksum: not a file of this program, or of an older version")?;

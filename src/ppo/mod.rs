@@ -29,7 +29,7 @@ use rayon::prelude::*;
 
 pub use acting::Acting;
 pub use checkpoint::{Checkpoint, Fork, Progress};
-pub use format::{Array, sealed};
+pub use format::{Array, Damaged, sealed};
 pub use gae::gae;
 pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};

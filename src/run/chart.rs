@@ -7,7 +7,7 @@ use plotters::coord::Shift;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
-use super::write_whole;
+use super::OutputFile;
 
 /// Curves of one quantity.
 pub struct Panel {
@@ -74,7 +74,7 @@ impl Chart {
             Some("svg") => {
                 let mut text = String::new();
                 self.draw(SVGBackend::with_string(&mut text, (width, height)).into_drawing_area())?;
-                write_whole(path, text.as_bytes())
+                OutputFile::create(path)?.finish(text.as_bytes())
             }
             #[cfg(feature = "video")]
             Some("png") => {

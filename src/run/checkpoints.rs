@@ -5,13 +5,17 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-use super::file::{name_also, same_file, sync_folder, write_whole};
+use super::file::same_file;
+use super::output::{name_also, sync_folder, unused_name, write_whole};
 
 const LATEST: &str = "latest.safetensors";
 const BEST: &str = "best.safetensors";
 
 /// How the name of a checkpoint ends that has been put aside.
 const LATER: &str = "later";
+
+/// The same of a best one that is damaged.
+const DAMAGED: &str = "damaged";
 
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
@@ -60,7 +64,7 @@ impl Checkpoints {
             let _ = fs::remove_file(path);
         }
         for (_, path) in later {
-            let aside = path.with_extension(LATER);
+            let aside = unused_name(&path.with_extension(LATER));
             fs::rename(&path, &aside).with_context(|| format!("cannot rename {}", path.display()))?;
         }
         Ok(())
@@ -73,6 +77,16 @@ impl Checkpoints {
     pub fn write_best(&self, bytes: &[u8]) -> Result<()> {
         self.create_folder()?;
         write_whole(&self.best(), bytes)
+    }
+
+    /// Puts a best one aside that is not to be used any more; where it is then.
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn put_best_aside(&self) -> Result<PathBuf> {
+        let aside = unused_name(&self.best().with_extension(DAMAGED));
+        fs::rename(self.best(), &aside).with_context(|| format!("cannot rename {}", self.best().display()))?;
+        Ok(aside)
     }
 
     pub(super) fn create_folder(&self) -> Result<()> {

@@ -11,7 +11,8 @@ use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
 use tensorboard_proto::summary::{Summary, Summary_Value};
 use tensorboard_rs::record_writer::RecordWriter;
 
-use super::file::{expect_named, sync_folder};
+use super::file::expect_named;
+use super::output::{make_own, sync_folder};
 
 /// How the names of event files begin and end.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
@@ -109,9 +110,13 @@ impl EventFile {
 pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     for (_, path) in event_files(folder)? {
         let cut = || {
-            let file = OpenOptions::new().read(true).write(true).open(&path)?;
+            let file = File::open(&path)?;
             let kept = length_up_to(&file, last_step)?;
-            if kept < file.metadata()?.len() { file.set_len(kept) } else { Ok(()) }
+            if kept == file.metadata()?.len() {
+                return Ok(());
+            }
+            make_own(&path)?;
+            OpenOptions::new().write(true).open(&path)?.set_len(kept)
         };
         cut().with_context(|| format!("cannot shorten {}", path.display()))?;
     }

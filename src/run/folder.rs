@@ -1,14 +1,16 @@
 //! The folder of a run and what lies in it.
 
-use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
-use std::io::{ErrorKind, Read, Write};
+use std::fs::{self, DirEntry};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::Checkpoints;
-use super::file::{PARTIAL, expect_named, read_text, sync_folder, write_whole};
+use super::file::{read_text, same_file};
+use super::lock::{LOCK, Locked};
+use super::output::{OUR_PARTIAL, PARTIAL, is_abandoned, sync_folder, write_whole};
 
 /// Where runs go when nothing else is said.
 const RUNS: &str = "runs/shadow-hand-repose";
@@ -16,7 +18,6 @@ const RUNS: &str = "runs/shadow-hand-repose";
 const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
-const LOCK: &str = "run.lock";
 const DIVERGED: &str = "diverged";
 /// How the names of a run's files begin.
 const OURS: [&[u8]; 8] = [
@@ -40,20 +41,6 @@ pub struct RunFolder {
     path: PathBuf,
 }
 
-/// A run folder that no other training uses. The system gives it free when the program ends, however it ends.
-#[derive(Debug)]
-pub struct Locked {
-    path: PathBuf,
-    file: File,
-}
-
-impl Locked {
-    /// Whether the folder still has this lock: it may have been deleted and made anew.
-    pub fn holds(&self) -> bool {
-        expect_named(&self.path, &self.file).is_ok()
-    }
-}
-
 impl RunFolder {
     /// A new run's folder: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
     ///
@@ -65,22 +52,34 @@ impl RunFolder {
             None => create_unused(name)?,
         };
         let run = Self { path };
-        run.expect_empty()?;
-        let created = run.checkpoints().create_folder().and_then(|()| Ok(sync_folder(&run.path)?));
+        run.expect_free(None)?;
+        let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
         created.with_context(|| format!("cannot create the run folder {}", run.path.display()))?;
         let lock = run.lock()?;
         // Another training may have begun and ended meanwhile.
-        run.expect_empty()?;
+        run.expect_free(Some(LOCK))?;
+        run.checkpoints().create_folder()?;
+        let lock = run.claim(lock)?;
         Ok((run, lock))
     }
 
-    fn expect_empty(&self) -> Result<()> {
-        let written = [CONFIG, VERSION, METRICS].iter().any(|file| self.path.join(file).exists());
-        ensure!(
-            !self.checkpoints().begun() && !written,
-            "{} already holds a run; go on with it by --resume, or name another folder",
-            self.path.display()
-        );
+    /// Makes sure that nothing of a run is in the folder, `but` for this, and that it is not a folder of one.
+    fn expect_free(&self, but: Option<&str>) -> Result<()> {
+        let taken =
+            self.entries()?.into_iter().map(|entry| entry.file_name()).find(|name| but.is_none_or(|but| name != but));
+        if let Some(name) = taken {
+            bail!(
+                "{} already holds a run, or a part of one ({}); resume it with --resume, or name another folder",
+                self.path.display(),
+                name.to_string_lossy()
+            );
+        }
+        let there = self.path.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
+        let above = there.ancestors().skip(usize::from(self.path.exists()));
+        for folder in above.map(|path| Self { path: path.to_owned() }) {
+            let holds_a_run = folder.checkpoints().begun() || folder.path.join(LOCK).exists();
+            ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
+        }
         Ok(())
     }
 
@@ -99,14 +98,14 @@ impl RunFolder {
         let _ = fs::remove_dir_all(self.path);
     }
 
-    /// The folder of an existing run that `place` is, or that the checkpoint `place` lies in.
+    /// The folder of an existing run that `place` is, or whose checkpoints it is, or that the checkpoint `place` lies in.
     ///
     /// # Errors
     /// Nothing there, or a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
         ensure!(place.exists(), "{}: there is no such run folder or checkpoint", place.display());
         let path = if place.is_dir() {
-            place.to_owned()
+            run_of(place)
         } else {
             let place = place.canonicalize().with_context(|| format!("cannot read {}", place.display()))?;
             let run = place.parent().and_then(Path::parent);
@@ -118,42 +117,29 @@ impl RunFolder {
         Ok(Self { path })
     }
 
-    /// Keeps every other training out of it for as long as the result lives, and removes what a crash left half written.
+    /// Keeps every other training out of it for as long as the result lives; changes nothing in it.
     ///
     /// # Errors
     /// Another training uses it, or it cannot be written to.
     pub fn lock(&self) -> Result<Locked> {
         self.expect_plain()?;
-        let path = self.path.join(LOCK);
-        let context = || format!("cannot write {}", path.display());
-        fs::create_dir_all(&self.path).with_context(context)?;
-        let mut file =
-            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).with_context(context)?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let mut holder = String::new();
-                let _ = file.take(100).read_to_string(&mut holder);
-                bail!("{} is being trained in by another program{holder}", self.path.display());
-            }
-            // Some network file systems have no locks: then there is nothing to keep anyone out with.
-            Err(TryLockError::Error(_)) => {}
-        }
-        // Whom it may concern; on a full disk it stays unsaid.
-        let _ = file.set_len(0).and_then(|()| write!(file, ": process {}", std::process::id()));
-        self.clean()?;
-        Ok(Locked { path, file })
+        Locked::take(&self.path)
     }
 
-    /// Removes what a crash in the middle of writing left.
-    fn clean(&self) -> Result<()> {
+    /// Begins to write into a folder that is locked: removes what a crash in the middle of writing left.
+    ///
+    /// # Errors
+    /// A folder that cannot be written to.
+    pub fn claim(&self, lock: Locked) -> Result<Locked> {
         for entry in self.entries()? {
-            let path = entry.path();
-            if path.extension().is_some_and(|extension| extension == PARTIAL) {
+            let (path, name) = (entry.path(), entry.file_name());
+            // Those of 0.1.0 had the name of the file that they were to become.
+            let left = path.extension().is_some_and(|extension| extension == PARTIAL);
+            if left && (is_abandoned(&name.to_string_lossy()) || !name.as_encoded_bytes().starts_with(b".")) {
                 fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
             }
         }
-        Ok(())
+        lock.sign()
     }
 
     /// Makes sure that nothing in the folder leads out of it: it may come from somebody else, and will be written into.
@@ -172,6 +158,7 @@ impl RunFolder {
 
     /// What lies in it under the names of a run's files; there may be other things beside.
     fn entries(&self) -> Result<Vec<DirEntry>> {
+        let begins: Vec<&[u8]> = OURS.into_iter().chain([OUR_PARTIAL.as_bytes()]).collect();
         let mut found = Vec::new();
         for folder in [&self.path, self.checkpoints().folder(), &self.path.join(DIVERGED)] {
             if folder.exists() {
@@ -184,7 +171,7 @@ impl RunFolder {
         let ours = |entry: &DirEntry| {
             let name = entry.file_name();
             entry.path().parent() != Some(&self.path)
-                || OURS.iter().any(|&begin| name.as_encoded_bytes().starts_with(begin))
+                || begins.iter().any(|begin| name.as_encoded_bytes().starts_with(begin))
         };
         found.retain(ours);
         Ok(found)
@@ -218,6 +205,15 @@ impl RunFolder {
         write_whole(&folder.join(name), text.as_bytes())
     }
 
+    /// The configuration as it stands in the folder, with its file; `None` if it is not there.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn config(&self) -> Result<Option<(PathBuf, String)>> {
+        let path = self.path.join(CONFIG);
+        if path.exists() { read_text(&path).map(|text| Some((path, text))) } else { Ok(None) }
+    }
+
     /// Writes the configuration and the facts about the program, if they are not there.
     ///
     /// # Errors
@@ -242,10 +238,16 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
         ensure!(place.exists(), "{}: there is no such checkpoint or run folder", place.display());
         return Ok(place.to_owned());
     }
-    let run = RunFolder::containing(place)?;
-    let checkpoints = run.checkpoints();
+    let checkpoints = RunFolder::containing(place)?.checkpoints();
     let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
+}
+
+/// The run that a folder is, or whose folder of checkpoints it is.
+fn run_of(folder: &Path) -> PathBuf {
+    let run = folder.canonicalize().ok().and_then(|whole| Some(whole.parent()?.to_owned()));
+    let inside = run.filter(|run| same_file(Checkpoints::of(run).folder(), folder));
+    inside.unwrap_or_else(|| folder.to_owned())
 }
 
 /// The checkpoint of the newest run that has one, if any does.
@@ -298,16 +300,6 @@ mod tests {
     }
 
     #[test]
-    fn a_second_training_in_a_folder_is_refused_until_the_first_ends() {
-        let place = tempfile::tempdir().unwrap();
-        let (run, first) = RunFolder::create(Some(place.path()), None).unwrap();
-        let refusal = run.lock().unwrap_err().to_string();
-        assert!(refusal.contains(&format!("another program: process {}", std::process::id())), "{refusal}");
-        drop(first);
-        run.lock().unwrap();
-    }
-
-    #[test]
     fn no_link_in_a_run_folder_is_followed() {
         let place = tempfile::tempdir().unwrap();
         let victim = place.path().join("victim");
@@ -338,12 +330,53 @@ mod tests {
     #[test]
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
-        let (run, _) = RunFolder::create(Some(place.path()), None).unwrap();
-        let half = run.checkpoints().folder().join("iteration-00000020.safetensors.partial");
-        fs::write(&half, "half").unwrap();
+        let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
+        // As 0.1.0 named it, and now.
+        let left = ["iteration-00000020.safetensors.partial", ".shadow-repose-999999999-0.partial"];
+        let left = left.map(|name| run.checkpoints().folder().join(name));
+        left.iter().for_each(|half| fs::write(half, "half").unwrap());
+        let living = place.path().join(format!(".shadow-repose-{}-9999.partial", std::process::id()));
+        fs::write(&living, "of a trace that is being written").unwrap();
         assert!(run.checkpoints().newest_first().is_empty());
-        run.lock().unwrap();
-        assert!(!half.exists());
+        drop(lock);
+        let lock = run.lock().unwrap();
+        assert!(left.iter().all(|half| half.exists()), "who only looks changes nothing");
+        run.claim(lock).unwrap();
+        assert!(!left.iter().any(|half| half.exists()) && living.exists());
+    }
+
+    #[test]
+    fn a_folder_with_any_part_of_a_run_or_inside_one_is_not_taken() {
+        let place = tempfile::tempdir().unwrap();
+        for name in ["policy.safetensors", "run.lock", "metrics.csv", "events.out.tfevents.1.1.x"] {
+            let folder = place.path().join(format!("has-{name}"));
+            fs::create_dir(&folder).unwrap();
+            fs::write(folder.join(name), "foreign").unwrap();
+            let refusal = RunFolder::create(Some(&folder), None).unwrap_err().to_string();
+            assert!(refusal.contains("already holds a run") && refusal.contains(name), "{refusal}");
+            assert_eq!(fs::read_to_string(folder.join(name)).unwrap(), "foreign");
+            assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        }
+        for name in ["checkpoints", "diverged"] {
+            let folder = place.path().join(format!("has-{name}"));
+            fs::create_dir_all(folder.join(name)).unwrap();
+            assert!(RunFolder::create(Some(&folder), None).is_err());
+        }
+        let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
+        for inside in ["checkpoints", "new/deeper"] {
+            let refusal = RunFolder::create(Some(&run.path.join(inside)), None).unwrap_err().to_string();
+            assert!(refusal.contains("lies inside the run") && !run.path.join("new").exists(), "{refusal}");
+        }
+    }
+
+    #[test]
+    fn the_folder_of_its_checkpoints_means_the_run() {
+        let place = tempfile::tempdir().unwrap();
+        let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
+        write_whole(&run.checkpoints().latest(), b"latest").unwrap();
+        let found = RunFolder::containing(run.checkpoints().folder()).unwrap();
+        assert!(same_file(&found.path, &run.path), "{found:?}");
+        assert!(same_file(&resolve_checkpoint(run.checkpoints().folder()).unwrap(), &run.checkpoints().latest()));
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Signals and the time limit: what asks the program to save and stop, or to save and go on. Whoever asks twice to stop ends it
-//! at once.
+//! Signals and the time limit: what asks the program to save and stop, or to save and go on. Whoever asks twice to stop, or where
+//! there is nothing to be saved, ends it at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
@@ -7,9 +7,11 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGXFSZ};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
+
+use super::output::remove_unfinished;
 
 /// A terminal that is closed sends SIGHUP twice, and some schedulers send SIGTERM and SIGHUP: within this time they are one
 /// request.
@@ -22,6 +24,8 @@ const ONE_KEY: Duration = Duration::from_millis(200);
 #[derive(Clone, Debug)]
 pub struct Requests {
     since: Instant,
+    /// The first request to stop is waited for; before that is said, it ends the program at once.
+    patient: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     /// Which signal asked to stop, or 0.
     signal: Arc<AtomicI32>,
@@ -31,24 +35,32 @@ pub struct Requests {
 impl Requests {
     /// What nobody can ask anything of.
     pub fn none() -> Self {
-        Self { since: Instant::now(), stop: Arc::default(), signal: Arc::default(), save: Arc::default() }
+        let (patient, stop, signal, save) = Default::default();
+        Self { since: Instant::now(), patient, stop, signal, save }
     }
 
-    /// Catches SIGINT, SIGTERM, SIGHUP (unless it is ignored, as under `nohup`) and SIGUSR1 from now on.
+    /// Catches SIGINT, SIGTERM and SIGHUP from now on, and SIGUSR1 where it is a request to save; not what was ignored when the
+    /// program began, as SIGHUP is under `nohup`. A file that grows beyond its limit (SIGXFSZ) is an error like a full disk.
     ///
     /// # Errors
     /// A handler or a thread that the system refuses.
-    pub fn listen() -> Result<Self> {
+    pub fn listen(saves: bool) -> Result<Self> {
         let requests = Self::none();
-        let caught: &[i32] = match hangup_is_ignored() {
-            true => &[SIGINT, SIGTERM, SIGUSR1],
-            false => &[SIGINT, SIGTERM, SIGUSR1, SIGHUP],
-        };
+        let mut caught = vec![SIGINT, SIGTERM, SIGHUP];
+        caught.extend(saves.then_some(SIGUSR1));
+        let ignored = ignored();
+        caught.retain(|signal| ignored >> (signal - 1) & 1 == 0);
+        signal_hook::flag::register(SIGXFSZ, Arc::default()).context("cannot catch signals")?;
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
         let listener = thread::Builder::new().name("signals".into());
         listener.spawn(move || shared.take(&mut signals)).context("cannot start a thread for signals")?;
         Ok(requests)
+    }
+
+    /// From now on the program looks for requests, and ends by itself.
+    pub fn wait_for_end(&self) {
+        self.patient.store(true, Ordering::Relaxed);
     }
 
     fn take(&self, signals: &mut Signals) {
@@ -59,14 +71,15 @@ impl Requests {
                 continue;
             }
             let together = if signal == SIGINT { ONE_KEY } else { ONE_REQUEST };
-            match first {
-                Some(first) if first.elapsed() > together => exit(128 + signal),
-                Some(_) => {}
-                None => {
-                    first = Some(Instant::now());
-                    self.signal.store(signal, Ordering::Relaxed);
-                    self.stop.store(true, Ordering::Relaxed);
-                }
+            let again = first.is_some_and(|first| first.elapsed() > together);
+            if again || !self.patient.load(Ordering::Relaxed) {
+                remove_unfinished();
+                exit(128 + signal);
+            }
+            if first.is_none() {
+                first = Some(Instant::now());
+                self.signal.store(signal, Ordering::Relaxed);
+                self.stop.store(true, Ordering::Relaxed);
             }
         }
     }
@@ -103,9 +116,9 @@ impl Requests {
     }
 }
 
-/// Whoever starts a program with SIGHUP ignored wants it to outlive the terminal.
-fn hangup_is_ignored() -> bool {
+/// The signals that were ignored when the program began, as bits: whoever starts it so means it to be left alone by them.
+fn ignored() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask >> (SIGHUP - 1) & 1 == 1)
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0)
 }

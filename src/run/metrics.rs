@@ -4,12 +4,14 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-use super::file::{expect_named, sync_folder};
+use super::file::expect_named;
 use super::folder::METRICS;
+use super::output::{make_own, sync_folder, unused_name};
 
 /// A million rows take half of this.
 const LARGEST_TABLE: u64 = 1 << 30;
@@ -26,32 +28,47 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Opens or begins the table with this header, behind the rows of the first `iterations`; with the number of rows that
-    /// were cut off. A table with another header is kept under another name.
+    /// Opens or begins the table with this header, behind the rows of these iterations; with what there is to say of it: rows that
+    /// are cut off, or missing. A table with another header is kept under another name.
     ///
     /// # Errors
     /// A file that cannot be written.
-    pub fn open(path: &Path, header: &str, iterations: u64) -> Result<(Self, u64)> {
+    pub fn open(path: &Path, header: &str, iterations: Range<u64>) -> Result<(Self, Vec<String>)> {
         let context = || format!("cannot write {}", path.display());
-        let (mut length, mut dropped) = (0, 0);
+        let (mut found, mut notes) = (Rows::default(), Vec::new());
+        let mut expected = iterations.end - iterations.start;
         match File::open(path) {
-            Ok(file) => match rows(file, header, iterations).with_context(context)? {
-                Some(found) => (length, dropped) = found,
+            Ok(file) => match rows(file, header, iterations.end).with_context(context)? {
+                Some(rows) => found = rows,
                 None => {
-                    fs::rename(path, path.with_extension(format!("before-{iterations}.csv"))).with_context(context)?
+                    let aside = unused_name(&path.with_extension(format!("before-{}.csv", iterations.end)));
+                    fs::rename(path, &aside).with_context(context)?;
+                    notes.push(format!(
+                        "{METRICS} has other columns than this program writes: it is now {}",
+                        aside.display()
+                    ));
+                    expected = 0;
                 }
             },
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => return Err(error).with_context(context),
         }
+        if found.dropped > 0 {
+            notes.push(format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
+        }
+        if found.kept < expected && fs::metadata(path).map_or(true, |facts| facts.is_file()) {
+            let lacking = expected - found.kept;
+            notes.push(format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
+        }
+        make_own(path).with_context(context)?;
         let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).with_context(context)?;
-        let mut metrics = Self { path: path.to_owned(), file, length };
+        let mut metrics = Self { path: path.to_owned(), file, length: found.length };
         metrics.repair().with_context(context)?;
-        if length == 0 {
+        if found.length == 0 {
             metrics.row(&format!("{header}\n"))?;
             sync_folder(path).with_context(context)?;
         }
-        Ok((metrics, dropped))
+        Ok((metrics, notes))
     }
 
     /// Adds a row, which ends with a line feed.
@@ -115,11 +132,22 @@ pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
     Ok(table)
 }
 
-/// Bytes of header and rows up to an iteration, and the number of rows after it; `None` where the header is another.
-fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u64, u64)>> {
+/// What a table holds.
+#[derive(Default)]
+struct Rows {
+    /// Bytes of the header and of the rows up to an iteration.
+    length: u64,
+    /// The number of these rows.
+    kept: u64,
+    /// The number of those after them.
+    dropped: u64,
+}
+
+/// What a table holds up to an iteration, and after it; `None` where the header is another.
+fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Rows>> {
     // A device has no rows to keep, and may have no end.
     if !file.metadata()?.is_file() {
-        return Ok(Some((0, 0)));
+        return Ok(Some(Rows::default()));
     }
     let (mut reader, mut line) = (BufReader::new(file), Vec::new());
     let mut next = |line: &mut Vec<u8>| {
@@ -127,27 +155,27 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<(u6
         reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
     };
     if next(&mut line)? == 0 {
-        return Ok(Some((0, 0)));
+        return Ok(Some(Rows::default()));
     }
     match line.strip_suffix(b"\n") {
         Some(found) if found == header.as_bytes() => {}
         // There was no room for more of it.
-        None if header.as_bytes().starts_with(&line) => return Ok(Some((0, 0))),
+        None if header.as_bytes().starts_with(&line) => return Ok(Some(Rows::default())),
         _ => return Ok(None),
     }
-    let (mut length, mut dropped) = (line.len() as u64, 0);
+    let mut found = Rows { length: line.len() as u64, ..Rows::default() };
     while next(&mut line)? > 0 {
         let number =
             line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse::<u64>().ok());
         let whole =
             line.ends_with(b"\n") && line.iter().filter(|&&byte| byte == b',').count() == header.matches(',').count();
-        if dropped == 0 && whole && number.is_some_and(|number| number <= iterations) {
-            length += line.len() as u64;
+        if found.dropped == 0 && whole && number.is_some_and(|number| number <= iterations) {
+            (found.length, found.kept) = (found.length + line.len() as u64, found.kept + 1);
         } else {
-            dropped += 1;
+            found.dropped += 1;
         }
     }
-    Ok(Some((length, dropped)))
+    Ok(Some(found))
 }
 
 #[cfg(test)]
@@ -180,9 +208,12 @@ mod tests {
             ("", 3, 0, ""),
         ] {
             let (_place, path) = table(rows);
-            let (mut metrics, found) = Metrics::open(&path, "iteration,loss", iterations).unwrap();
+            let (mut metrics, notes) = Metrics::open(&path, "iteration,loss", 0..iterations).unwrap();
             metrics.row("9,9\n").unwrap();
-            assert_eq!(found, dropped);
+            let said = |text: &str| notes.iter().any(|note| note.contains(text));
+            assert_eq!(said("dropped"), dropped > 0, "{notes:?}");
+            let lacking = iterations - kept.lines().count() as u64;
+            assert_eq!(said(&format!("lacks {lacking} of the {iterations} rows")), lacking > 0, "{notes:?}");
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("iteration,loss\n{kept}9,9\n"));
         }
     }
@@ -190,17 +221,22 @@ mod tests {
     #[test]
     fn a_table_with_other_columns_is_kept_under_another_name() {
         let (place, path) = table("1,0.5\n");
-        Metrics::open(&path, "iteration,return", 1).unwrap();
-        assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,return\n");
-        let old = place.path().join("metrics.before-1.csv");
-        assert_eq!(fs::read_to_string(old).unwrap(), "iteration,loss\n1,0.5\n");
+        for columns in ["iteration,return", "iteration,loss"] {
+            let (_, notes) = Metrics::open(&path, columns, 0..1).unwrap();
+            assert!(notes.len() == 1 && notes[0].contains("other columns"), "{notes:?}");
+            assert_eq!(fs::read_to_string(&path).unwrap(), format!("{columns}\n"));
+        }
+        // Both, though of the same iteration.
+        let old = ["metrics.before-1.csv", "metrics.before-1-2.csv"];
+        let old = old.map(|name| fs::read_to_string(place.path().join(name)).unwrap());
+        assert_eq!(old, ["iteration,loss\n1,0.5\n", "iteration,return\n"]);
     }
 
     #[test]
     fn a_header_that_did_not_fit_is_written_again() {
         let (place, path) = table("");
         fs::write(&path, "iterat").unwrap();
-        Metrics::open(&path, "iteration,loss", 3).unwrap();
+        Metrics::open(&path, "iteration,loss", 0..3).unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n");
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
     }
@@ -208,7 +244,7 @@ mod tests {
     #[test]
     fn a_table_that_was_deleted_or_replaced_is_noticed() {
         let (_place, path) = table("");
-        let (mut metrics, _) = Metrics::open(&path, "iteration,loss", 0).unwrap();
+        let (mut metrics, _) = Metrics::open(&path, "iteration,loss", 0..0).unwrap();
         metrics.sync().unwrap();
         fs::remove_file(&path).unwrap();
         metrics.row("1,2\n").unwrap();

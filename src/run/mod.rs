@@ -8,27 +8,40 @@ mod file;
 mod film;
 mod folder;
 mod interrupt;
+mod lock;
 mod meshes;
 mod metrics;
+mod output;
 mod pip;
 mod report;
 
 pub use chart::{Chart, Curve, Panel};
 pub use checkpoints::Checkpoints;
-pub use file::{OutputFile, read_bytes, read_text, same_file, write_whole};
+pub use file::{read_bytes, read_text, same_file};
 #[cfg(feature = "video")]
 pub use film::{FilmFormat, FilmWriter, write_png};
-pub use folder::{Locked, RunFolder, newest_checkpoint, resolve_checkpoint};
+pub use folder::{RunFolder, newest_checkpoint, resolve_checkpoint};
 pub use interrupt::Requests;
+pub use lock::Locked;
 pub use meshes::hand_meshes;
 pub use metrics::read_metrics;
+pub use output::{OutputFile, expect_folder, write_whole};
 pub use report::{Bar, Report, Status};
 
-use anyhow::{Context, Result};
+use std::io::{ErrorKind, Write};
+
+use anyhow::{Context, Result, anyhow, ensure};
 
 /// Prints text on stdout; a reader that has gone away is no error.
-pub fn print(text: &str) {
-    let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
+///
+/// # Errors
+/// A place that cannot be written to, as a full disk.
+pub fn print(text: &str) -> Result<()> {
+    let mut stdout = std::io::stdout();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to stdout"),
+        _ => Ok(()),
+    }
 }
 
 /// Prints a line on stderr. What it quotes may come from a file of somebody else, and must not steer the terminal.
@@ -41,7 +54,7 @@ pub fn say(line: &str) {
             c => harmless.push(c),
         }
     }
-    let _ = std::io::Write::write_all(&mut std::io::stderr(), (harmless + "\n").as_bytes());
+    let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
 }
 
 /// A text as one word for a shell.
@@ -59,13 +72,20 @@ pub fn has_display() -> bool {
     ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
 }
 
+/// More worker threads for each core than this only take turns.
+const MOST_THREADS: usize = 16;
+
 /// Gives rayon, and with it every part of the program, this many worker threads (0: one for every core); once.
 ///
 /// # Errors
-/// Threads that the system refuses.
+/// More of them than make sense; threads that the system refuses.
 pub fn start_threads(threads: usize) -> Result<()> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let most = MOST_THREADS * cores;
+    ensure!(threads <= most, "{threads} worker threads: at most {most} on the {cores} cores of this machine");
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-    pool.build_global().with_context(|| format!("cannot start {threads} worker threads"))
+    // Its text has the one of its source in it.
+    pool.build_global().map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@
 
 use std::fs;
 use std::io::IsTerminal;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -28,6 +29,8 @@ pub struct Report {
     header: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
+    /// The iteration before the first one of the run.
+    first: u64,
     /// Of the last iteration that was logged.
     iteration: u64,
     env_steps: u64,
@@ -102,46 +105,49 @@ pub struct Status {
 }
 
 impl Report {
-    /// Opens the logs in `folder`, for metrics with these names, behind the first `iterations` rows of earlier sessions.
-    pub fn open(folder: &Path, tags: &[impl AsRef<str>], iteration: u64, env_steps: u64, total_steps: u64) -> Self {
+    /// Of a run in `folder` that has made so many steps, for metrics with these names; nothing is written yet.
+    pub fn new(folder: &Path, tags: &[impl AsRef<str>], env_steps: u64, total_steps: u64) -> Self {
         let columns: Vec<&str> = ["iteration", "env_steps"].into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
         let terminal = std::io::stderr().is_terminal();
-        let mut report = Self {
+        Self {
             folder: folder.to_owned(),
             header: columns.join(","),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
-            iteration,
+            first: 0,
+            iteration: 0,
             env_steps,
             bar: terminal.then(|| progress_bar(env_steps, total_steps)),
             last_line: None,
             shown: Status { env_steps, steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
             total_steps,
             begun: (Instant::now(), env_steps),
-        };
+        }
+    }
+
+    /// Opens the logs behind what was logged of these iterations, which ended after `env_steps` steps.
+    pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
+        (self.first, self.iteration, self.env_steps) = (iterations.start, iterations.end, env_steps);
         // Later steps of a session that did not come to its checkpoint are made again.
-        match cut_off_after(folder, env_steps).and_then(|()| report.open_events()) {
-            Ok(events) => report.events.writer = Some(events),
-            Err(error) => report.events.give_up(&error).into_iter().for_each(|warning| report.warn(&warning)),
+        match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
+            Ok(events) => self.events.writer = Some(events),
+            Err(error) => self.events.give_up(&error).into_iter().for_each(|warning| self.warn(&warning)),
         }
-        match report.open_metrics() {
-            Ok((metrics, dropped)) => {
-                report.metrics.writer = Some(metrics);
-                if dropped > 0 {
-                    report.say(&format!("{dropped} rows of {METRICS} after iteration {iteration} are dropped"));
-                }
+        match self.open_metrics() {
+            Ok((metrics, notes)) => {
+                self.metrics.writer = Some(metrics);
+                notes.iter().for_each(|note| self.say(note));
             }
-            Err(error) => report.metrics.give_up(&error).into_iter().for_each(|warning| report.warn(&warning)),
+            Err(error) => self.metrics.give_up(&error).into_iter().for_each(|warning| self.warn(&warning)),
         }
-        report
     }
 
     fn open_events(&self) -> Result<EventFile> {
         EventFile::create(&self.folder, self.env_steps + u64::from(self.iteration > 0))
     }
 
-    fn open_metrics(&self) -> Result<(Metrics, u64)> {
-        Metrics::open(&self.folder.join(METRICS), &self.header, self.iteration)
+    fn open_metrics(&self) -> Result<(Metrics, Vec<String>)> {
+        Metrics::open(&self.folder.join(METRICS), &self.header, self.first..self.iteration)
     }
 
     /// Logs the values of an iteration, in the order of the tags, and shows the status.
@@ -294,16 +300,22 @@ mod tests {
         Status { env_steps, steps_per_s: 10.0, goals: f64::NAN, drop_rate: 0.5 }
     }
 
+    fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64) -> Report {
+        let mut report = Report::new(folder, tags, env_steps, 100);
+        report.open_logs(0..iteration, env_steps);
+        report
+    }
+
     #[test]
     fn metrics_have_one_row_per_iteration_and_rows_after_the_checkpoint_are_written_anew() {
         let place = tempfile::tempdir().unwrap();
         let tags = ["loss/policy", "eval/goals"];
-        let mut report = Report::open(place.path(), &tags, 0, 0, 100);
+        let mut report = open(place.path(), &tags, 0, 0);
         for iteration in 1..=3 {
             let values = [("loss/policy", 0.5 * iteration as f64), ("eval/goals", f64::NAN)];
             report.iteration(iteration, &values, &status(10 * iteration));
         }
-        let mut resumed = Report::open(place.path(), &tags, 2, 20, 100);
+        let mut resumed = open(place.path(), &tags, 2, 20);
         resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &status(30));
         let text = std::fs::read_to_string(place.path().join("metrics.csv")).unwrap();
         assert_eq!(text, "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n");
@@ -313,7 +325,7 @@ mod tests {
     fn logs_that_cannot_be_written_are_counted_and_tried_again() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("gone");
-        let mut report = Report::open(&folder, &["a"], 0, 0, 100);
+        let mut report = open(&folder, &["a"], 0, 0);
         report.iteration(1, &[("a", 1.0)], &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
         report.sync();
@@ -333,7 +345,7 @@ mod tests {
     fn a_full_disk_is_a_warning() {
         let place = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
-        let mut report = Report::open(place.path(), &["a"], 0, 0, 100);
+        let mut report = open(place.path(), &["a"], 0, 0);
         report.iteration(1, &[("a", 1.0)], &status(10));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (1, 0));

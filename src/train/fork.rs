@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::saver::Saver;
-use super::session::{SCENE, Session, newest_sound, overrides, settle_model, user_file};
+use super::saver::{Begin, Saver};
+use super::session::{SCENE, Session, overrides, settle_model, user_file};
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::Config;
@@ -32,11 +32,11 @@ impl Session {
             vec![place.to_owned()]
         };
         let context = || format!("cannot fork {}", place.display());
-        let (path, checkpoint) = newest_sound(&places).with_context(context)?;
+        let (path, checkpoint) = load::newest_sound(&places).with_context(context)?;
         let session =
             Self::forked(&path, checkpoint, args).with_context(|| format!("cannot fork {}", path.display()))?;
         let (folder, lock) = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
-        let saver = session.saver(folder, lock, args, false);
+        let saver = session.saver(folder, lock, args, Begin::New);
         Ok((session, saver))
     }
 

@@ -51,14 +51,23 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     if let Some(limit) = args.stop_after {
         requests.stop_after(limit)?;
     }
+    requests.wait_for_end();
     run::say(&format!("run folder: {place}"));
-    saver.save_at_first()?;
-    let mut report = open_report(&session, &saver)?;
+    let mut report = new_report(&session, &saver);
+    if !saver.resumes() {
+        saver.begin(&mut report)?;
+    }
     while !session.finished() {
-        let dumps = args.dump_diverged.then_some(saver.folder());
-        match session.iterate(requests.stop(), &mut report, dumps) {
-            Ok(true) => saver.take(session.checkpoint()),
-            Ok(false) => return stop(saver, &mut report, requests),
+        match session.iterate(requests.stop(), &report) {
+            Ok(Some(made)) => {
+                saver.take(session.checkpoint());
+                saver.begin(&mut report)?;
+                if args.dump_diverged {
+                    session.dump_diverged(saver.folder(), &report);
+                }
+                session.report(&mut report, &made);
+            }
+            Ok(None) => return stop(saver, &mut report, requests),
             Err(error) => return Err(give_up(error, saver, &mut report)),
         }
         let due = session.agent.iteration.is_multiple_of(session.config.run.checkpoint_every);
@@ -69,40 +78,34 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
             report.warn(&format!("{error:#}; it is tried again at the next checkpoint"));
         }
     }
-    saver.save_at_last(&mut report)?;
+    let _ = saver.save_at_last(&mut report)?;
     run::say(&format!("finished: {}; {place}", saver.steps_made()));
     Ok(Outcome::Finished)
 }
 
+/// An iteration, and the score of its evaluation: of no episodes where there was none.
+type Made = (Iteration<Lesson>, Score);
+
 impl Session {
-    /// One iteration, whatever happens in it; false if `stop` was set meanwhile. Where it does not come to its end, only the end of
-    /// the one before can be used. What led to diverged episodes is written into the folder `dumps`, if there is one.
-    fn iterate(&mut self, stop: &AtomicBool, report: &mut Report, dumps: Option<&RunFolder>) -> Result<bool> {
+    /// One iteration, whatever happens in it; `None` if `stop` was set meanwhile. Where it does not come to its end, only the end of
+    /// the one before can be used.
+    fn iterate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
         let number = self.agent.iteration + 1;
-        let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report, dumps)));
+        let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report)));
         let result = caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
         result.with_context(|| format!("iteration {number}"))
     }
 
-    fn collect_learn_evaluate(
-        &mut self,
-        stop: &AtomicBool,
-        report: &mut Report,
-        dumps: Option<&RunFolder>,
-    ) -> Result<bool> {
-        let Some(iteration) = self.agent.iterate(stop)? else { return Ok(false) };
+    fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
+        let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
         let mut evaluation = Score::of(&[]);
         if self.agent.iteration.is_multiple_of(self.config.run.eval_every) {
-            let Some(score) = self.evaluate(stop, report)? else { return Ok(false) };
+            let Some(score) = self.evaluate(stop, report)? else { return Ok(None) };
             let found = [score.goals, score.rot_dist];
             self.best = if is_better(found, self.best) { Some(found) } else { self.best };
             evaluation = score;
         }
-        if let Some(folder) = dumps {
-            self.dump_diverged(folder, report);
-        }
-        self.report(report, &iteration, &evaluation);
-        Ok(true)
+        Ok(Some((iteration, evaluation)))
     }
 
     /// Plays the evaluation episodes.
@@ -125,7 +128,7 @@ impl Session {
         Ok(Some(score))
     }
 
-    fn report(&mut self, report: &mut Report, iteration: &Iteration<Lesson>, evaluation: &Score) {
+    fn report(&mut self, report: &mut Report, (iteration, evaluation): &Made) {
         let episodes = Score::of(&self.agent.pool.take_finished());
         let mut recent = Recent::default();
         for env in self.agent.pool.envs_mut() {
@@ -149,16 +152,14 @@ impl Session {
     }
 }
 
-fn open_report(session: &Session, saver: &Saver) -> Result<Report> {
-    saver.describe()?;
-    let (iteration, env_steps) = (session.agent.iteration, session.agent.env_steps);
+fn new_report(session: &Session, saver: &Saver) -> Report {
     let tags = tags(Lesson::task(&session.config.env));
-    Ok(Report::open(saver.folder().path(), &tags, iteration, env_steps, session.config.run.total_steps))
+    Report::new(saver.folder().path(), &tags, session.agent.env_steps, session.config.run.total_steps)
 }
 
 /// Saves the end of the last iteration, when it was asked to stop.
 fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<Outcome> {
-    saver.save_at_last(report)?;
+    let _ = saver.save_at_last(report)?;
     run::say(&format!("stopped after {}; go on with", saver.steps_made()));
     run::say(&format!("  {}", saver.how_to_resume()));
     Ok(Outcome::Stopped(requests.exit_code()))
@@ -167,7 +168,7 @@ fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<Ou
 /// Saves the end of the last iteration before the one that failed.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
     match saver.save_at_last(report) {
-        Ok(()) => run::say(&format!("saved the state after {}", saver.steps_made())),
+        Ok(saved) => run::say(&saved),
         Err(error) => run::say(&format!("error: {error:#}")),
     }
     error
@@ -185,6 +186,7 @@ mod tests {
     use super::*;
     use crate::config::{Config, Override};
     use crate::ppo::Checkpoint;
+    use crate::train::saver::Begin;
 
     #[test]
     fn a_panic_on_a_worker_thread_is_an_error_and_the_iteration_before_is_saved() {
@@ -193,13 +195,14 @@ mod tests {
         let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
         let mut session = Session::new(Config::resolve(None, &sets).unwrap()).unwrap();
         let (folder, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        let mut saver = session.saver(folder, lock, &TrainArgs::default(), false);
-        let (mut report, never) = (open_report(&session, &saver).unwrap(), AtomicBool::new(false));
-        assert!(session.iterate(&never, &mut report, None).unwrap(), "nothing stops it");
+        let mut saver = session.saver(folder, lock, &TrainArgs::default(), Begin::New);
+        let (mut report, never) = (new_report(&session, &saver), AtomicBool::new(false));
+        saver.begin(&mut report).unwrap();
+        assert!(session.iterate(&never, &report).unwrap().is_some(), "nothing stops it");
         saver.take(session.checkpoint());
         // Room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, &mut report, None).unwrap_err();
+        let error = session.iterate(&never, &report).unwrap_err();
         let latest = saver.folder().checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");

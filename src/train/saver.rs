@@ -6,39 +6,56 @@ use std::sync::Arc;
 use anyhow::{Error, Result, anyhow};
 
 use crate::load;
-use crate::ppo::{Checkpoint, Fork};
+use crate::ppo::{Checkpoint, Fork, Progress};
 use crate::run::{self, Locked, Report, RunFolder};
 use crate::{env, sim};
 
+/// What a training begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Begin {
+    /// A folder of its own.
+    New,
+    /// The newest checkpoint of its folder.
+    FromNewest,
+    /// An older one.
+    FromOlder,
+}
+
 /// What saves. It always holds the end of the last whole iteration: that is what is left if the next one does not come to its own.
+///
+/// Nothing in the folder of a run that is resumed is changed before the first iteration is done: until then whoever has named the
+/// wrong one, or the wrong checkpoint, can stop.
 pub struct Saver {
     folder: RunFolder,
-    lock: Arc<Locked>,
+    lock: Option<Locked>,
     keep: usize,
     /// The options with which this training is resumed.
     options: String,
     end: Arc<Checkpoint>,
-    /// The newest checkpoint of the folder is where this session begins.
-    begins_saved: bool,
+    begin: Begin,
+    /// Where it was taken up.
+    begun_at: Progress,
+    /// The folder is this training's to write into.
+    begun: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
     best: Option<Arc<Checkpoint>>,
     best_is_saved: bool,
 }
 
 impl Saver {
-    /// Of a training at this `end`, which may be saved already, in a folder in which it keeps so many checkpoints; it is resumed with
-    /// these `options`.
+    /// Of a training at this `end`, in a folder in which it keeps so many checkpoints; it is resumed with these `options`.
     pub fn new(
         (folder, lock): (RunFolder, Locked),
         keep: Option<usize>,
         options: String,
         end: Checkpoint,
-        begins_saved: bool,
+        begin: Begin,
     ) -> Self {
         // The newest, and one in case it is damaged.
         let keep = keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
-        let (lock, end) = (Arc::new(lock), Arc::new(end));
-        let saver = Self { folder, lock, keep, options, end, begins_saved, best: None, best_is_saved: true };
+        let (lock, begun_at) = (Some(lock), end.progress.clone());
+        let (end, begun, best) = (Arc::new(end), false, None);
+        let saver = Self { folder, lock, keep, options, end, begin, begun_at, begun, best, best_is_saved: true };
         saver.save_before_fatal_errors();
         saver
     }
@@ -46,6 +63,11 @@ impl Saver {
     /// The run folder.
     pub fn folder(&self) -> &RunFolder {
         &self.folder
+    }
+
+    /// Whether it goes on in the folder of a run.
+    pub fn resumes(&self) -> bool {
+        self.begin != Begin::New
     }
 
     /// How far the training has come.
@@ -63,11 +85,34 @@ impl Saver {
         self.save_before_fatal_errors();
     }
 
-    /// Writes what says with what the folder was made.
+    /// Makes the folder that of this training, if it is not yet: a checkpoint that can be resumed whatever happens then, logs that
+    /// hold nothing newer, the settings. In this order, so that a run that is killed between them is one that can be resumed.
     ///
     /// # Errors
     /// A folder that cannot be written to.
-    pub fn describe(&self) -> Result<()> {
+    pub fn begin(&mut self, report: &mut Report) -> Result<()> {
+        if self.begun {
+            return Ok(());
+        }
+        self.lock = self.lock.take().map(|lock| self.folder.claim(lock)).transpose()?;
+        let best = self.folder.checkpoints().best();
+        if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
+            let aside = self.folder.checkpoints().put_best_aside()?;
+            report.warn(&format!("{} is damaged; it is now {}", best.display(), aside.display()));
+        }
+        if self.begin != Begin::FromNewest {
+            self.write()?;
+        }
+        let first = self.begun_at.fork.as_ref().map_or(0, |fork| fork.iteration);
+        report.open_logs(first..self.begun_at.iteration, self.begun_at.env_steps);
+        self.describe()?;
+        self.begun = true;
+        self.save_before_fatal_errors();
+        Ok(())
+    }
+
+    /// Writes what says with what the folder was made.
+    fn describe(&self) -> Result<()> {
         let fork = self.end.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
             format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
         });
@@ -79,9 +124,9 @@ impl Saver {
     /// # Errors
     /// A folder that cannot be written to.
     pub fn save(&mut self, report: &mut Report) -> Result<()> {
-        if !self.lock.holds() {
+        if !self.lock.as_ref().is_some_and(Locked::holds) {
             // The folder was deleted and is made anew; if not by another training.
-            self.lock = Arc::new(self.folder.lock()?);
+            self.lock = Some(self.folder.claim(self.folder.lock()?)?);
         }
         report.sync();
         self.describe()?;
@@ -90,28 +135,24 @@ impl Saver {
         Ok(())
     }
 
-    /// Makes sure that the state at the beginning is in the folder: whatever happens then, it can be resumed, and nothing that is
-    /// in the logs is newer.
-    ///
-    /// # Errors
-    /// A folder that cannot be written to.
-    pub fn save_at_first(&self) -> Result<()> {
-        if self.begins_saved { Ok(()) } else { self.write() }
-    }
-
     fn write(&self) -> Result<()> {
         let unsaved = !self.best_is_saved || !self.folder.checkpoints().best().exists();
         write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.end, self.keep)
     }
 
-    /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report.
+    /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report; tells what is saved.
     ///
     /// # Errors
     /// A folder that cannot be written to; the message says where the state is instead.
-    pub fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
+    pub fn save_at_last(&mut self, report: &mut Report) -> Result<String> {
+        if !self.begun {
+            report.finish();
+            return Ok(format!("{} is as it was, after {}", self.folder.path().display(), self.steps_made()));
+        }
         let saved = self.save(report);
         report.finish();
-        saved.map_err(|error| elsewhere(error, self.best.as_deref(), &self.end, &self.options))
+        saved.map_err(|error| elsewhere(error, self.best.as_deref(), &self.end, &self.options))?;
+        Ok(format!("saved the state after {}", self.steps_made()))
     }
 
     /// The command that goes on with this training.
@@ -121,15 +162,17 @@ impl Saver {
 
     /// Has the end of the last iteration saved where MuJoCo ends the process by itself.
     fn save_before_fatal_errors(&self) {
-        let (end, folder, lock, keep) = (self.end.clone(), self.folder.clone(), self.lock.clone(), self.keep);
+        let (end, folder, keep, begun) = (self.end.clone(), self.folder.clone(), self.keep, self.begun);
+        let holds = self.lock.as_ref().map(Locked::watch);
         let best = self.best.clone().filter(|_| !self.best_is_saved);
         let options = self.options.clone();
         sim::before_fatal_error(move |said| {
             let whose = env::stepping().map_or(String::new(), |number| format!("environment {number}: "));
             run::say(&format!("error: {whose}MuJoCo cannot go on: {said}"));
-            let held =
-                if lock.holds() { Ok(()) } else { Err(anyhow!("{} has been replaced", folder.path().display())) };
-            match held.and_then(|()| write(&folder, best.as_deref(), &end, keep)) {
+            let replaced = || anyhow!("{} has been replaced", folder.path().display());
+            let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
+            let saved = held.and_then(|()| if begun { write(&folder, best.as_deref(), &end, keep) } else { Ok(()) });
+            match saved {
                 Ok(()) => {
                     let iteration = end.progress.iteration;
                     let command = how_to_resume(folder.path(), &options);
@@ -141,22 +184,43 @@ impl Saver {
     }
 }
 
-/// The evaluation that a checkpoint or a policy is the best of; none where the file is not there or damaged.
-pub fn best_of(path: &Path) -> Option<[f64; 2]> {
-    load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best)
+/// The score that an evaluation must beat in a folder that is resumed (goals per episode, rotation error in rad): that of its best
+/// checkpoint; if that is lost, of the policy that was made from it; if that is lost too, the one that the checkpoint remembers.
+pub fn best_so_far(folder: &RunFolder, of_checkpoint: Option<[f64; 2]>) -> Option<[f64; 2]> {
+    let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
+    score(&folder.checkpoints().best()).or_else(|| score(&folder.policy())).or(of_checkpoint)
 }
 
-/// Writes the best, if there is one to be written, and the checkpoint into a run folder. As long as nothing was scored, the
-/// policy to share is that of the checkpoint.
+/// Writes the best, if there is one to be written, and the checkpoint into a run folder.
 fn write(folder: &RunFolder, best: Option<&Checkpoint>, end: &Checkpoint, keep: usize) -> Result<()> {
     let checkpoints = folder.checkpoints();
-    if let Some(best) = best {
-        run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
-        checkpoints.write_best(&best.to_bytes()?)?;
-    } else if best_of(&folder.policy()).is_none() {
-        run::write_whole(&folder.policy(), &end.policy_alone().to_bytes()?)?;
+    match best {
+        Some(best) => {
+            run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
+            checkpoints.write_best(&best.to_bytes()?)?;
+        }
+        None => keep_policy(folder, end)?,
     }
     checkpoints.write(end.progress.iteration, &end.to_bytes()?, keep)
+}
+
+/// Makes sure that the policy to share is that of the best checkpoint, or where nothing was scored yet, that of this one.
+fn keep_policy(folder: &RunFolder, end: &Checkpoint) -> Result<()> {
+    let score = |checkpoint: &Checkpoint| checkpoint.progress.best;
+    let shared = load::read(&folder.policy()).ok().as_ref().and_then(score);
+    let policy = match load::read(&folder.checkpoints().best()) {
+        Ok(best) if score(&best) == shared => return Ok(()),
+        Ok(best) => best.policy_alone(),
+        // It is all that is left of the best one.
+        Err(_) if shared.is_some() => return Ok(()),
+        Err(_) => {
+            let mut latest = end.policy_alone();
+            // A score that is known is another policy's.
+            latest.progress.best = None;
+            latest
+        }
+    };
+    run::write_whole(&folder.policy(), &policy.to_bytes()?)
 }
 
 /// Saves a state that could not be saved in its place for this reason elsewhere; what there is to say of both.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::saver::{Saver, best_of};
+use super::saver::{Begin, Saver, best_so_far};
 use crate::agent::{Agent, expect_states};
 use crate::cli::{Settings, TrainArgs};
 use crate::config::{BUILTIN_MODEL, Config, Override, Source};
@@ -46,7 +46,7 @@ impl Session {
             session.agent.ppo.begin_with(&policy)?;
         }
         let (folder, lock) = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
-        let saver = session.saver(folder, lock, args, false);
+        let saver = session.saver(folder, lock, args, Begin::New);
         Ok((session, saver))
     }
 
@@ -68,10 +68,11 @@ impl Session {
         let newest = checkpoints.newest_first();
         let places = if place.is_dir() { newest.clone() } else { vec![place.to_owned()] };
         let (path, mut checkpoint) =
-            newest_sound(&places).with_context(|| format!("cannot resume {}", place.display()))?;
+            load::newest_sound(&places).with_context(|| format!("cannot resume {}", place.display()))?;
         let context = || format!("cannot resume from {}", path.display());
         let mut config = load::for_training(&checkpoint, &path, &overrides(args)).with_context(context)?;
         expect_states(&checkpoint, &config).with_context(context)?;
+        expect_config(&folder, &config)?;
         settle_model(&mut config)?;
         run::start_threads(config.run.threads)?;
         if config.run.shards == 0 {
@@ -85,11 +86,13 @@ impl Session {
         if restored.with_context(context)? != [session.scene] {
             run::say("warning: the scene is not the one of the checkpoint: what follows is another training");
         }
+        let checkpoint_best = checkpoint.progress.best;
         checkpoint.finish().with_context(context)?;
         // The best is what is in the folder. It may have been saved after the checkpoint that is resumed from, and is not given up
-        // for a worse one; if it is lost, the next one is the best.
-        session.best = best_of(&checkpoints.best());
-        let saver = session.saver(folder, lock, args, run::same_file(&path, &newest[0]));
+        // for a worse one.
+        session.best = best_so_far(&folder, checkpoint_best);
+        let begin = if run::same_file(&path, &newest[0]) { Begin::FromNewest } else { Begin::FromOlder };
+        let saver = session.saver(folder, lock, args, begin);
         Ok((session, saver))
     }
 
@@ -117,12 +120,12 @@ impl Session {
         self.agent.env_steps >= self.config.run.total_steps
     }
 
-    /// What saves it in this folder, whose newest checkpoint may be that of its present state.
-    pub fn saver(&self, folder: RunFolder, lock: Locked, args: &TrainArgs, is_saved: bool) -> Saver {
+    /// What saves it in this folder.
+    pub fn saver(&self, folder: RunFolder, lock: Locked, args: &TrainArgs, begin: Begin) -> Saver {
         let model = self.config.env.model_file().map(|model| run::quoted(&format!("{MODEL}={}", model.display())));
         let model = model.map_or(String::new(), |set| format!(" --set {set}"));
         let options = format!("{model}{}", if args.dump_diverged { " --dump-diverged" } else { "" });
-        Saver::new((folder, lock), args.keep, options, self.checkpoint(), is_saved)
+        Saver::new((folder, lock), args.keep, options, self.checkpoint(), begin)
     }
 }
 
@@ -159,19 +162,20 @@ pub fn settle_model(config: &mut Config) -> Result<()> {
     Ok(())
 }
 
-/// The first of these files, the newest first, that is not damaged, with a warning for each one before it.
-///
-/// # Errors
-/// No file; of the last one, if all are damaged.
-pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
-    let (last, others) = places.split_last().context("there is no checkpoint")?;
-    for path in others {
-        match load::read(path) {
-            Ok(checkpoint) => return Ok((path.clone(), checkpoint)),
-            Err(error) => run::say(&format!("warning: {error:#}\n  The one before is tried.")),
-        }
-    }
-    Ok((last.clone(), load::read(last)?))
+/// Makes sure that the settings in the folder are those of the checkpoint: whoever has edited them would be ignored.
+fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
+    let Some((path, text)) = folder.config()? else { return Ok(()) };
+    let advice =
+        format!("put {} back as it was, or delete it; --fork begins a run with other settings", path.display());
+    let found = Config::from_text(&path, &text, &[]).with_context(|| advice.clone())?;
+    let differing = config.differences(&found);
+    ensure!(
+        differing.is_empty(),
+        "{} says something else than the checkpoint: {}\n{advice}",
+        path.display(),
+        differing.join("; ")
+    );
+    Ok(())
 }
 
 /// The policy of a checkpoint or run, for a training with this configuration to begin with.

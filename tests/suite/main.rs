@@ -14,6 +14,7 @@ mod pictures;
 mod point_mass;
 mod pool;
 mod ranks;
+mod resume;
 mod run_folder;
 mod scene;
 mod support;

@@ -47,23 +47,6 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
 }
 
 #[test]
-fn whoever_goes_back_to_an_older_checkpoint_goes_on_from_there_even_if_killed_at_once() {
-    let folder = tempfile::tempdir().unwrap();
-    let args = ["--total-steps", "1280", "--run-dir", "run", "--keep", "9", "--set", "run.checkpoint_every=2"];
-    succeeded(program(folder.path(), &train(&args)));
-    let expected = result(folder.path(), "run");
-    let older = "run/checkpoints/iteration-00000004.safetensors";
-    // No time for a single iteration.
-    succeeded(program(folder.path(), &["train", "--resume", older, "--keep", "9", "--stop-after", "1ms"]));
-    assert_eq!(iterations(folder.path()), 4);
-    let found = names(&folder.path().join("run/checkpoints"));
-    assert!(found.contains(&"iteration-00000010.later".to_owned()), "nothing is thrown away: {found:?}");
-    let output = succeeded(resume(folder.path(), &["--total-steps", "1280"]));
-    assert!(!stderr(&output).contains("dropped"), "{}", stderr(&output));
-    assert!(result(folder.path(), "run") == expected);
-}
-
-#[test]
 fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
     let folder = tempfile::tempdir().unwrap();
     fs::create_dir(folder.path().join("tmp")).unwrap();

@@ -122,5 +122,5 @@ pub fn write_png(path: &Path, [width, height]: [u32; 2], rgb: &[u8]) -> Result<(
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_compression(png::Compression::High);
     encoder.write_header()?.write_image_data(rgb)?;
-    super::write_whole(path, &bytes)
+    OutputFile::create(path)?.finish(&bytes)
 }

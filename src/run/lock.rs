@@ -1,0 +1,104 @@
+//! Who may write into a run folder: one training at a time.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::Read;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+
+use super::file::expect_named;
+use super::output::Unfinished;
+
+/// The name of the file that is locked.
+pub const LOCK: &str = "run.lock";
+
+/// A run folder that no other training uses. The system gives it free when the program ends, however it ends.
+#[derive(Debug)]
+pub struct Locked {
+    path: PathBuf,
+    file: File,
+}
+
+impl Locked {
+    /// Keeps every other training out of a folder for as long as the result lives; changes nothing in it.
+    ///
+    /// # Errors
+    /// Another training uses it, or it cannot be written to.
+    pub fn take(folder: &Path) -> Result<Self> {
+        let path = folder.join(LOCK);
+        let context = || format!("cannot write {}", path.display());
+        fs::create_dir_all(folder).with_context(context)?;
+        let file =
+            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).with_context(context)?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let _ = file.take(100).read_to_string(&mut holder);
+                bail!("{} is being trained in by another program{holder}", folder.display());
+            }
+            // Some network file systems have no locks: then there is nothing to keep anyone out with.
+            Err(TryLockError::Error(_)) => {}
+        }
+        Ok(Self { path, file })
+    }
+
+    /// Says in it whose it is. A lock that another folder shares, by a second name of its file, becomes one of its own.
+    ///
+    /// # Errors
+    /// A folder that cannot be written to.
+    pub fn sign(mut self) -> Result<Self> {
+        if self.file.metadata().is_ok_and(|facts| facts.nlink() > 1) {
+            let context = || format!("cannot write {}", self.path.display());
+            let own = Unfinished::beside(&self.path);
+            let file =
+                OpenOptions::new().read(true).write(true).create_new(true).open(own.path()).with_context(context)?;
+            let _ = file.try_lock();
+            fs::rename(own.path(), &self.path).with_context(context)?;
+            self.file = file;
+        }
+        // Whom it may concern; on a full disk it stays unsaid.
+        let said = format!(": process {}", std::process::id());
+        let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
+        Ok(self)
+    }
+
+    /// Whether the folder still has this lock: it may have been deleted and made anew.
+    pub fn holds(&self) -> bool {
+        expect_named(&self.path, &self.file).is_ok()
+    }
+
+    /// What tells the same later, as long as the lock lives.
+    pub fn watch(&self) -> impl Fn() -> bool + Send + use<> {
+        let (path, file) = (self.path.clone(), self.file.try_clone());
+        move || file.as_ref().is_ok_and(|file| expect_named(&path, file).is_ok())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_second_training_in_a_folder_is_refused_until_the_first_ends() {
+        let place = tempfile::tempdir().unwrap();
+        let first = Locked::take(place.path()).unwrap().sign().unwrap();
+        let refusal = Locked::take(place.path()).unwrap_err().to_string();
+        assert!(refusal.ends_with(&format!("another program: process {}", std::process::id())), "{refusal}");
+        drop(first.sign().unwrap());
+        Locked::take(place.path()).unwrap();
+    }
+
+    #[test]
+    fn a_lock_that_was_copied_by_a_second_name_is_not_shared() {
+        let place = tempfile::tempdir().unwrap();
+        let [run, copy] = ["run", "copy"].map(|name| place.path().join(name));
+        drop(Locked::take(&run).unwrap());
+        fs::create_dir(&copy).unwrap();
+        fs::hard_link(run.join(LOCK), copy.join(LOCK)).unwrap();
+        let lock = Locked::take(&copy).unwrap().sign().unwrap();
+        Locked::take(&run).unwrap();
+        assert!(Locked::take(&copy).is_err() && lock.holds());
+    }
+}

@@ -1,0 +1,425 @@
+//! Files that are written whole or not at all: they have another name until they are complete.
+//!
+//! No two programs share such a name, and what is unfinished when the program ends is removed.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use anyhow::{Context, Result, bail, ensure};
+
+use super::file::read_bytes;
+use super::quoted;
+
+/// How the name of a file ends that is not complete yet.
+pub const PARTIAL: &str = "partial";
+
+/// How it begins; then the number of the process follows.
+pub const OUR_PARTIAL: &str = ".shadow-repose-";
+
+/// The most links that are followed from one to the next.
+const MOST_LINKS: usize = 40;
+
+/// The number of the next unfinished file.
+static NEXT: AtomicU64 = AtomicU64::new(0);
+
+/// What this process has not finished.
+static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+/// A file or folder that is removed when this is dropped, or when the program is ended by a signal; unless it has another name
+/// by then.
+#[derive(Debug)]
+pub struct Unfinished {
+    path: PathBuf,
+}
+
+impl Unfinished {
+    /// Something to be made there.
+    pub fn new(path: PathBuf) -> Self {
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
+        Self { path }
+    }
+
+    /// Something in the folder of a file that it is to become, under a name that nothing else has.
+    pub fn beside(path: &Path) -> Self {
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{number}.{PARTIAL}", std::process::id())))
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        let mut unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+        remove(&self.path);
+        unfinished.remove(&self.path);
+    }
+}
+
+/// Removes all that this process has not finished, before it ends without more ado; nothing can be begun after it.
+pub fn remove_unfinished() {
+    let unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    unfinished.iter().for_each(|path| remove(path));
+    std::mem::forget(unfinished);
+}
+
+fn remove(path: &Path) {
+    let _ = fs::remove_file(path);
+    let _ = fs::remove_dir_all(path);
+}
+
+/// Whether a name is one of an unfinished file whose process has ended.
+pub fn is_abandoned(name: &str) -> bool {
+    let rest = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
+    rest.is_some_and(|(process, _)| !Path::new("/proc").join(process).exists())
+}
+
+/// A file to be written, in a place that is known to be writable. Devices and pipes are written to directly.
+#[derive(Debug)]
+pub struct OutputFile {
+    /// As the user has named it.
+    path: PathBuf,
+    file: File,
+    /// The name that it has until it is complete, and the one that it gets.
+    names: Option<(Unfinished, PathBuf)>,
+}
+
+impl OutputFile {
+    /// Opens a place that the user has named; what is there stays until the file is complete. A link stays a link: what it leads
+    /// to is written.
+    ///
+    /// # Errors
+    /// A place that cannot be written to; a folder that is not there, with how to make it.
+    pub fn create(path: &Path) -> Result<Self> {
+        let context = || format!("cannot write {}", path.display());
+        let direct = |file: File| Self { path: path.to_owned(), file, names: None };
+        match fs::metadata(path) {
+            Ok(facts) if facts.is_dir() => bail!("cannot write {}: it is a folder", path.display()),
+            Ok(facts) if !facts.is_file() => {
+                return OpenOptions::new().write(true).open(path).map(direct).with_context(context);
+            }
+            // A name of what the program writes into anyway, such as /dev/stdout: one goes on where the other is.
+            Ok(facts) if path.is_symlink() => {
+                let (out, err) = (io::stdout(), io::stderr());
+                for stream in [out.as_fd(), err.as_fd()] {
+                    if is_open(stream, &facts) {
+                        return stream.try_clone_to_owned().map(|file| direct(file.into())).with_context(context);
+                    }
+                }
+            }
+            _ => {}
+        }
+        Self::named(path, end_of_links(path).with_context(context)?)
+    }
+
+    /// Opens a place of the program's own: what has this name is replaced, even if it is a link.
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn replacing(path: &Path) -> Result<Self> {
+        Self::named(path, path.to_owned())
+    }
+
+    fn named(path: &Path, target: PathBuf) -> Result<Self> {
+        expect_folder(&target)?;
+        loop {
+            let unfinished = Unfinished::beside(&target);
+            match File::create_new(unfinished.path()) {
+                // Of a process of before, or of another machine, with the same number.
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => std::mem::forget(unfinished),
+                file => {
+                    let file = file.with_context(|| format!("cannot write {}", path.display()))?;
+                    return Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) });
+                }
+            }
+        }
+    }
+
+    /// Writes the content and gives the file its name.
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn finish(mut self, bytes: &[u8]) -> Result<()> {
+        let written = self.file.write_all(bytes);
+        written.with_context(|| format!("cannot write {}", self.path.display()))?;
+        self.complete()
+    }
+
+    /// Gives the file its name, with what was written to it through [`std::io::Write`].
+    ///
+    /// # Errors
+    /// A place that cannot be written to.
+    pub fn complete(self) -> Result<()> {
+        let complete = || {
+            if let Some((unfinished, target)) = &self.names {
+                self.file.sync_all()?;
+                fs::rename(unfinished.path(), target)?;
+                sync_folder(target)?;
+            }
+            Ok::<(), io::Error>(())
+        };
+        complete().with_context(|| format!("cannot write {}", self.path.display()))
+    }
+
+    /// As the user has named it.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Whether another one would be the same file.
+    pub fn is_of(&self, other: &Path) -> bool {
+        let target = |path: &Path| {
+            end_of_links(path)
+                .ok()
+                .and_then(|end| Some((folder_of(&end).canonicalize().ok()?, end.file_name()?.to_owned())))
+        };
+        target(&self.path).is_some() && target(&self.path) == target(other)
+    }
+}
+
+/// Writes a file of the program's own so that whoever looks finds the whole old one or the whole new one.
+///
+/// # Errors
+/// A place that cannot be written to.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    OutputFile::replacing(path)?.finish(bytes)
+}
+
+/// Gives a file another name as well, in place of whatever has it. Where the file system knows no second names, it is a copy.
+///
+/// # Errors
+/// A place that cannot be written to.
+pub fn name_also(path: &Path, name: &Path) -> Result<()> {
+    let unfinished = Unfinished::beside(name);
+    if fs::hard_link(path, unfinished.path()).is_err() {
+        return write_whole(name, &read_bytes(path)?);
+    }
+    let named = fs::rename(unfinished.path(), name).and_then(|()| sync_folder(name));
+    named.with_context(|| format!("cannot write {}", name.display()))
+}
+
+/// Brings the name of a new file onto the disk: it is there once its folder is.
+///
+/// # Errors
+/// A folder that cannot be read, or a disk that fails.
+pub fn sync_folder(path: &Path) -> io::Result<()> {
+    match File::open(folder_of(path))?.sync_all() {
+        // Some network file systems cannot do this to folders, and do not need it.
+        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        result => result,
+    }
+}
+
+/// A name like this one that nothing has yet.
+pub fn unused_name(path: &Path) -> PathBuf {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
+    let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
+    let free = |path: &PathBuf| fs::symlink_metadata(path).is_err();
+    std::iter::once(path.to_owned()).chain(names).find(free).expect("numbers do not end")
+}
+
+/// Gives a file that has other names too a content of its own: what is written into it from now on is seen nowhere else.
+///
+/// # Errors
+/// A place that cannot be written to.
+pub fn make_own(path: &Path) -> io::Result<()> {
+    if fs::metadata(path).is_ok_and(|facts| facts.nlink() > 1) {
+        let copy = Unfinished::beside(path);
+        fs::copy(path, copy.path())?;
+        File::open(copy.path())?.sync_all()?;
+        fs::rename(copy.path(), path)?;
+    }
+    Ok(())
+}
+
+/// Makes sure that there is a folder for a file that is to be written later.
+///
+/// # Errors
+/// There is none; how to make it.
+pub fn expect_folder(path: &Path) -> Result<()> {
+    let folder = folder_of(path);
+    let make = quoted(&folder.display().to_string());
+    ensure!(
+        folder.is_dir(),
+        "cannot write {}: there is no folder {}; make it with\n  mkdir -p {make}",
+        path.display(),
+        folder.display()
+    );
+    Ok(())
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// The place that a name leads to, link after link; nothing need be there.
+fn end_of_links(path: &Path) -> io::Result<PathBuf> {
+    let mut end = path.to_owned();
+    for _ in 0..MOST_LINKS {
+        match fs::read_link(&end) {
+            Ok(next) => end = folder_of(&end).join(next),
+            Err(_) => return Ok(end),
+        }
+    }
+    Err(io::Error::other("links that lead in a circle"))
+}
+
+/// Whether a stream of this process writes into the file with these facts.
+fn is_open(stream: BorrowedFd, facts: &fs::Metadata) -> bool {
+    let open = stream.try_clone_to_owned().and_then(|own| File::from(own).metadata());
+    open.is_ok_and(|open| (open.dev(), open.ino()) == (facts.dev(), facts.ino()))
+}
+
+impl Write for OutputFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+impl Seek for OutputFile {
+    fn seek(&mut self, place: SeekFrom) -> io::Result<u64> {
+        self.file.seek(place)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn content(path: &Path) -> String {
+        fs::read_to_string(path).unwrap()
+    }
+
+    fn names(folder: &Path) -> usize {
+        fs::read_dir(folder).unwrap().count()
+    }
+
+    #[test]
+    fn a_file_that_is_written_leaves_nothing_else_behind() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("x.safetensors");
+        write_whole(&path, b"one").unwrap();
+        write_whole(&path, b"two").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"two");
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_that_is_not_finished_leaves_the_old_one_as_it_was() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("trace");
+        OutputFile::create(&path).unwrap().finish(b"old").unwrap();
+        drop(OutputFile::create(&path).unwrap());
+        assert_eq!((content(&path).as_str(), names(place.path())), ("old", 1));
+    }
+
+    #[test]
+    fn two_that_write_one_file_do_not_meet_and_nothing_of_the_users_is_taken_for_unfinished() {
+        let place = tempfile::tempdir().unwrap();
+        let (path, own) = (place.path().join("film.gif"), place.path().join("film.gif.partial"));
+        fs::write(&own, "mine").unwrap();
+        let [one, other] = [(); 2].map(|()| OutputFile::create(&path).unwrap());
+        one.finish(b"one").unwrap();
+        assert_eq!(content(&path), "one");
+        other.finish(b"other").unwrap();
+        assert_eq!((content(&path).as_str(), content(&own).as_str(), names(place.path())), ("other", "mine", 2));
+    }
+
+    #[test]
+    fn a_link_stays_a_link_and_what_it_leads_to_is_written() {
+        let place = tempfile::tempdir().unwrap();
+        let [link, other, target] = ["link", "other", "target"].map(|name| place.path().join(name));
+        std::os::unix::fs::symlink("target", &other).unwrap();
+        std::os::unix::fs::symlink(&other, &link).unwrap();
+        // Also where nothing is yet.
+        for text in ["first", "second"] {
+            OutputFile::create(&link).unwrap().finish(text.as_bytes()).unwrap();
+            assert!(link.is_symlink() && other.is_symlink() && !target.is_symlink());
+            assert_eq!(content(&target), text);
+        }
+        OutputFile::replacing(&link).unwrap().finish(b"third").unwrap();
+        assert!(
+            !link.is_symlink() && content(&target) == "second",
+            "a place of the program's own is not written through"
+        );
+        std::os::unix::fs::symlink("circle", place.path().join("circle")).unwrap();
+        assert!(OutputFile::create(&place.path().join("circle")).is_err());
+    }
+
+    #[test]
+    fn devices_are_written_to_and_stay_devices() {
+        OutputFile::create(Path::new("/dev/null")).unwrap().finish(b"gone").unwrap();
+        assert!(!fs::metadata("/dev/null").unwrap().is_file());
+        assert!(OutputFile::create(Path::new("/dev/full")).unwrap().finish(b"no room").is_err());
+    }
+
+    #[test]
+    fn a_folder_that_is_not_there_is_named_with_how_to_make_it() {
+        let place = tempfile::tempdir().unwrap();
+        let refusal = OutputFile::create(&place.path().join("my films/a/b.mp4")).unwrap_err().to_string();
+        assert!(refusal.contains(&format!("mkdir -p '{}/my films/a'", place.path().display())), "{refusal}");
+    }
+
+    #[test]
+    fn a_file_with_two_names_becomes_two_files_before_it_is_written_into() {
+        let place = tempfile::tempdir().unwrap();
+        let [one, other] = ["one", "other"].map(|name| place.path().join(name));
+        fs::write(&one, "both").unwrap();
+        fs::hard_link(&one, &other).unwrap();
+        make_own(&one).unwrap();
+        fs::write(&one, "changed").unwrap();
+        assert_eq!((content(&one).as_str(), content(&other).as_str(), names(place.path())), ("changed", "both", 2));
+    }
+
+    #[test]
+    fn a_name_that_is_taken_gets_a_number() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("metrics.before-3.csv");
+        assert_eq!(unused_name(&path), path);
+        fs::write(&path, "").unwrap();
+        std::os::unix::fs::symlink("nowhere", place.path().join("metrics.before-3-2.csv")).unwrap();
+        assert_eq!(unused_name(&path), place.path().join("metrics.before-3-3.csv"));
+    }
+
+    #[test]
+    fn two_names_of_one_file_are_known() {
+        let place = tempfile::tempdir().unwrap();
+        let file = OutputFile::create(&place.path().join("trace")).unwrap();
+        assert!(file.is_of(&place.path().join("../").join(place.path().file_name().unwrap()).join("trace")));
+        assert!(!file.is_of(&place.path().join("other")));
+    }
+
+    #[test]
+    fn what_a_process_left_unfinished_is_known_once_it_has_ended() {
+        assert!(is_abandoned(".shadow-repose-999999999-0.partial"));
+        assert!(!is_abandoned(&format!(".shadow-repose-{}-0.partial", std::process::id())));
+        assert!(!is_abandoned("film.gif.partial"));
+    }
+
+    #[test]
+    fn a_second_name_replaces_what_had_it() {
+        let place = tempfile::tempdir().unwrap();
+        let [one, two, latest] = ["one", "two", "latest"].map(|name| place.path().join(name));
+        for path in [&one, &two] {
+            write_whole(path, path.file_name().unwrap().as_encoded_bytes()).unwrap();
+            name_also(path, &latest).unwrap();
+            assert_eq!(fs::read(&latest).unwrap(), fs::read(path).unwrap());
+        }
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 3);
+        assert_eq!(fs::read(&one).unwrap(), b"one");
+    }
+}
