@@ -11,7 +11,7 @@ use serde_json::json;
 
 use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part};
-use crate::config::Config;
+use crate::config::{Config, expect_used};
 use crate::env::{
     ACTION_SIZE, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
 };
@@ -46,6 +46,7 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 /// # Errors
 /// Settings or a scene that cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
+    expect_used(&args.settings.set, "bench")?;
     let mut config = Config::resolve(user_file(&args.settings)?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::error::ErrorKind;
+use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 
 use crate::config::Override;
 use crate::sim::{Camera, Quality};
@@ -65,7 +66,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", value_parser = threads())]
     pub threads: Option<usize>,
     /// Control steps over all hands, counted from the start of the run [default: run.total_steps]
-    #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..=LARGEST))]
+    #[arg(long, value_name = "STEPS", value_parser = steps)]
     pub total_steps: Option<u64>,
     /// Added to the name of the run folder
     #[arg(long)]
@@ -90,6 +91,9 @@ pub struct TrainArgs {
     /// Save and exit with 0 after this time, as 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
     pub stop_after: Option<Duration>,
+    /// No progress and no hints; warnings, evaluations and the last line are still said
+    #[arg(long)]
+    pub quiet: bool,
     /// Write the last steps of every episode whose physics diverged, for replay
     #[arg(long)]
     pub dump_diverged: bool,
@@ -183,6 +187,26 @@ pub struct Shot {
     pub plain: bool,
 }
 
+impl Shot {
+    /// The first of the options that were given.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            ("--size", self.size.is_some()),
+            ("--camera", self.camera.is_some()),
+            ("--quality", self.quality.is_some()),
+            ("--plain", self.plain),
+        ];
+        given.into_iter().find(|(_, given)| *given).map(|(option, _)| option)
+    }
+}
+
+/// A line for the command of this name that cannot be meant, though each of its parts can.
+pub fn usage_error(name: &str, text: &str) -> clap::Error {
+    let mut command = Cli::command();
+    command.build();
+    command.find_subcommand_mut(name).expect("a command").error(ErrorKind::ArgumentConflict, text)
+}
+
 /// What moves the hand in `view`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Motion {
@@ -214,6 +238,13 @@ fn camera(text: &str) -> Result<Camera, String> {
         }
         _ => Err("must be three numbers, as 150,-27,0.66".into()),
     }
+}
+
+fn steps(text: &str) -> Result<u64, String> {
+    // 1e8 is how people write a large number of steps.
+    let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
+    let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
+    steps.ok_or_else(|| "must be a whole number from 1, as 30000000 or 3e7".into())
 }
 
 fn time(text: &str) -> Result<Duration, String> {

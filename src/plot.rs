@@ -19,6 +19,7 @@ const SIZE: [u32; 2] = [800, 260];
 /// # Errors
 /// No run with metrics that can be read, have the columns and a row; a picture that cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
+    run::expect_folder(&args.out)?;
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
     let mut panels: Vec<Panel> =
@@ -35,18 +36,15 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
             }
         };
         drawn += 1;
-        let mut seconds = 0.0;
-        let mut along = Vec::with_capacity(table.len());
-        for row in &table {
-            seconds += row[1] + row[2];
-            along.push(match args.along {
-                Along::Steps => row[0] / 1e6,
-                Along::Hours => seconds / 3600.0,
-            });
-        }
-        for (i, panel) in panels.iter_mut().enumerate() {
-            let values: Vec<f64> = table.iter().map(|row| row[3 + i]).collect();
-            panel.curves.push(Curve { name: name_of(place), points: smooth(&along, &values, args.smooth) });
+        let [steps, collect_s, update_s, values @ ..] = &table[..] else {
+            unreachable!("as many columns as were asked for")
+        };
+        let along = match args.along {
+            Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
+            Along::Hours => hours(collect_s, update_s),
+        };
+        for (panel, values) in panels.iter_mut().zip(values) {
+            panel.curves.push(Curve { name: name_of(place), points: smooth(&along, values, args.smooth) });
         }
     }
     let along = match args.along {
@@ -59,28 +57,42 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     Ok(())
 }
 
-/// Of each iteration of a run: the control steps at its end, the seconds of its two parts, and these metrics.
+/// Of each iteration of a run the hours until its end.
+fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
+    let mut seconds = 0.0;
+    let until = |(collect, update): (&f64, &f64)| {
+        seconds += collect + update;
+        seconds / 3600.0
+    };
+    collect_s.iter().zip(update_s).map(until).collect()
+}
+
+/// Of each iteration of a run the control steps at its end, the seconds of its two parts, and these metrics: column by column.
 fn rows(place: &Path, metrics: &[&str]) -> Result<Vec<Vec<f64>>> {
     let columns = [&["env_steps", "time/collect_s", "time/update_s"], metrics].concat();
     let table = run::read_metrics(place, &columns)?;
-    ensure!(!table.is_empty(), "{}: there are no rows yet", place.display());
+    ensure!(!table[0].is_empty(), "{}: there are no rows yet", place.display());
     Ok(table)
 }
 
-/// The name of a run: that of its folder.
+/// The name of a run: that of its folder, without what no picture can hold.
 fn name_of(place: &Path) -> String {
     let whole = place.canonicalize().unwrap_or_else(|_| place.to_owned());
     let folder = if whole.is_dir() { Some(whole.as_path()) } else { whole.parent() };
-    folder.and_then(Path::file_name).map_or_else(|| place.display().to_string(), |name| name.to_string_lossy().into())
+    let name =
+        folder.and_then(Path::file_name).map_or_else(|| place.display().to_string(), |n| n.to_string_lossy().into());
+    name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()
 }
 
 /// Means over windows of `width` rows, one after the other; rows without a value are passed over, and so are windows of them.
 fn smooth(along: &[f64], values: &[f64], width: usize) -> Vec<[f64; 2]> {
     let windows = along.chunks(width).zip(values.chunks(width));
     let means = windows.filter_map(|(along, values)| {
-        let known: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
-        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        (!known.is_empty()).then(|| [mean(along), mean(&known)])
+        let mean = |values: &[f64]| {
+            let known: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+            (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+        };
+        Some([mean(along)?, mean(values)?])
     });
     means.collect()
 }

@@ -3,7 +3,7 @@
 use anyhow::Result;
 
 use crate::cli::{Motion, ViewArgs};
-use crate::config::Config;
+use crate::config::{Config, expect_used};
 use crate::evaluate::{Actor, Episodes};
 use crate::film;
 use crate::run;
@@ -17,6 +17,8 @@ use crate::window::Window;
 /// # Errors
 /// A setting or scene that cannot be used; no window, with what is missing; a picture that cannot be written.
 pub fn view(args: &ViewArgs) -> Result<()> {
+    expect_used(&args.settings.set, "view")?;
+    args.screenshot.as_deref().map_or(Ok(()), run::expect_folder)?;
     let config = Config::resolve(user_file(&args.settings)?.as_ref(), &args.settings.set)?;
     let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
     let actors = [Actor::Zero, Actor::Random, Actor::Wave];

@@ -12,7 +12,7 @@ use shadow_repose::config::Config;
 use shadow_repose::env::Task;
 use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Report, Status};
+use shadow_repose::run::{Progress, Report, Status};
 
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -138,12 +138,16 @@ fn growth(rows: u64) -> i64 {
     let place = tempfile::tempdir().unwrap();
     let names: Vec<String> = (0..30).map(|i| format!("group/value_{i}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut report = Report::new(place.path(), &names, 0, rows);
+    let mut report = Report::new(place.path(), &names, Progress::new(0, rows, true));
     report.open_logs(0..0, 0);
     let mut early = 0;
     for row in 1..=rows {
         let values: Vec<(&str, f64)> = names.iter().map(|name| (*name, (row as f64).sqrt())).collect();
-        report.iteration(row, &values, &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN });
+        report.iteration(
+            row,
+            &values,
+            &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN, evaluation: f64::NAN },
+        );
         if row % 500 == 0 {
             report.sync();
         }
@@ -154,7 +158,7 @@ fn growth(rows: u64) -> i64 {
     report.finish();
     drop(report);
     // A resumed session goes through all of it.
-    let mut resumed = Report::new(place.path(), &names, rows - 1, rows);
+    let mut resumed = Report::new(place.path(), &names, Progress::new(rows - 1, rows, true));
     resumed.open_logs(0..rows - 1, rows - 1);
     resumed.finish();
     let text = fs::metadata(place.path().join("metrics.csv")).unwrap().len();

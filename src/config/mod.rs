@@ -11,6 +11,7 @@ mod ramp;
 mod removed;
 mod rules;
 mod settings;
+mod used;
 
 /// The default configuration, commented.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
@@ -21,3 +22,4 @@ pub use settings::{
     Activation, BUILTIN_MODEL, Backend, Config, EnvConfig, NetConfig, PpoConfig, Precision, RunConfig, SuccessHold,
     Symmetry, TrainingConfig,
 };
+pub use used::expect_used;

@@ -122,7 +122,9 @@ fn unknown(name: &str) -> String {
         // The right key in the wrong section is as near as one wrong letter.
         whole.min(1 + strsim::damerau_levenshtein(&last(name), &last(candidate)))
     };
-    let nearest = known.iter().min_by_key(|candidate| distance(candidate));
+    // A setting is not answered with a section.
+    let alike = |candidate: &&String| candidate.contains('.') || !name.contains('.');
+    let nearest = known.iter().filter(alike).min_by_key(|candidate| distance(candidate));
     match nearest {
         Some(nearest) if distance(nearest) <= 2 + name.len() / 4 => {
             format!("{name}: unknown key; did you mean {nearest}?")

@@ -1,5 +1,7 @@
 //! Which values are allowed.
 
+use std::f64::consts::PI;
+
 use toml::{Table, Value};
 
 use super::settings::{Backend, Config, Precision};
@@ -23,8 +25,20 @@ const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.ho
 const SHARES: &str = "env.act_moving_average ppo.gamma ppo.lambda";
 
 /// The largest value of a setting.
-const AT_MOST: &[(&str, f64)] =
-    &[("env.num_envs", 65536.0), ("training.hold", 1e9), ("run.eval_episodes", 1048576.0), ("run.threads", 4096.0)];
+const AT_MOST: &[(&str, f64)] = &[
+    ("env.num_envs", 65536.0),
+    ("training.hold", 1e9),
+    ("run.eval_episodes", 1048576.0),
+    ("run.threads", 4096.0),
+    // A rotation error is never larger.
+    ("env.success_tolerance", PI),
+];
+
+/// The largest size of a number of the task or the training that is no count: beyond it sums of squares in floats end.
+const LARGEST: f64 = 1e6;
+
+/// The largest coordinate of the goal, m: everything near it is measured in floats.
+const FARTHEST: f64 = 100.0;
 
 /// Settings that are what the task is laid out for.
 const FIXED: &[(&str, f64)] = &[("env.num_hand_dofs", 24.0), ("env.num_actuators", 20.0)];
@@ -46,6 +60,14 @@ pub fn violations(config: &Config) -> Vec<String> {
     for (key, only) in FIXED {
         rules.number(&table, key, |x| x == *only, &format!("be {only}, the task is laid out for it"));
     }
+    for (section, keys) in table.iter().filter(|(section, _)| ["env", "training"].contains(&section.as_str())) {
+        for (key, value) in keys.as_table().into_iter().flatten() {
+            let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
+            if let Some(x) = too_large.filter(|_| key != "hold") {
+                rules.check(false, &format!("{section}.{key}"), x, &format!("be at most {LARGEST} in size"));
+            }
+        }
+    }
     env(config, &mut rules);
     nets(config, &mut rules);
     learning(config, &mut rules);
@@ -53,8 +75,21 @@ pub fn violations(config: &Config) -> Vec<String> {
     rules.broken
 }
 
+/// The numbers of a setting that are no counts.
+fn floats(value: &Value) -> Vec<f64> {
+    match value {
+        Value::Float(x) => vec![*x],
+        Value::Array(values) => values.iter().flat_map(floats).collect(),
+        Value::Table(ramp) => ramp.values().flat_map(floats).collect(),
+        _ => Vec::new(),
+    }
+}
+
 fn env(config: &Config, rules: &mut Rules) {
     let env = &config.env;
+    let near = env.goal_position.iter().all(|x| x.abs() <= FARTHEST);
+    let rule = format!("have coordinates of at most {FARTHEST} m");
+    rules.check(near, "env.goal_position", format!("{:?}", env.goal_position), &rule);
     rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;

@@ -98,7 +98,22 @@ pub struct Score {
     pub diverged: usize,
 }
 
+/// What to say where more than a hundredth of these steps diverged: what is learnt or scored then is not the task.
+pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
+    (diverged * 100 > steps).then(|| {
+        format!(
+            "in {diverged} of {steps} steps the physics diverged and the episode ended: masses, friction, env.sim_dt or the scene \
+             are nothing that can be simulated"
+        )
+    })
+}
+
 impl Score {
+    /// What to say where many of the steps diverged; each ended an episode.
+    pub fn divergence(&self) -> Option<String> {
+        divergence(self.diverged as u64, self.env_steps)
+    }
+
     /// The score of these episodes.
     pub fn of(episodes: &[EpisodeStats]) -> Self {
         let n = episodes.len() as f64;

@@ -13,7 +13,7 @@ mod state;
 mod tail;
 mod task;
 
-pub use episode::{EpisodeStats, Recent, Score};
+pub use episode::{EpisodeStats, Recent, Score, divergence};
 pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::{Lesson, Shaping};
 pub use observation::{OBSERVATION, OBSERVATION_SIZE, Part, SPACES};

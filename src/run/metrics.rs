@@ -7,7 +7,7 @@ use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 
 use super::file::expect_named;
 use super::folder::METRICS;
@@ -18,6 +18,15 @@ const LARGEST_TABLE: u64 = 1 << 30;
 
 /// No row of ours is longer; the rest of a longer one is not a row either.
 const LONGEST_ROW: u64 = 1 << 20;
+
+/// Rows that are read to be drawn; ten times the default training has fewer.
+const MOST_ROWS: usize = 2_000_000;
+
+/// Nothing of ours comes near it, and a chart cannot be laid out far beyond.
+const LARGEST_VALUE: f64 = 1e30;
+
+/// Characters of a file that a message quotes.
+const LONGEST_QUOTE: usize = 100;
 
 /// The table while it is written.
 pub struct Metrics {
@@ -100,36 +109,53 @@ impl Metrics {
     }
 }
 
-/// The values in these columns of a table, row by row; `NaN` where a cell is empty. `place` is the file, or its run's folder.
+/// The values in these columns of a table, column by column; `NaN` where a cell is empty, or holds what cannot be drawn: a number
+/// that is infinite or beyond [`LARGEST_VALUE`]. `place` is the file, or its run's folder.
 ///
 /// # Errors
-/// A file that cannot be read, has no such column, or holds something else than numbers.
+/// A file that cannot be read, has no such column, too many rows, or holds something else than numbers.
 pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
     let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
     let context = || format!("cannot read {}", path.display());
-    let mut lines = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE)).lines();
-    let header = lines.next().transpose().with_context(context)?.unwrap_or_default();
+    let mut reader = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE));
+    let mut line = Vec::new();
+    let mut next = |line: &mut Vec<u8>| {
+        line.clear();
+        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
+    };
+    next(&mut line).with_context(context)?;
+    let header = String::from_utf8_lossy(&line).trim_end().to_owned();
     let names: Vec<&str> = header.split(',').collect();
     let place = |column: &&str| {
         let found = names.iter().position(|name| name == column);
-        found.with_context(|| format!("{} has no column {column}; it has {}", path.display(), names.join(" ")))
+        found.with_context(|| format!("{} has no column {column}; it has {}", path.display(), beginning(&header)))
     };
     let places: Vec<usize> = columns.iter().map(place).collect::<Result<_>>()?;
-    let mut table = Vec::new();
-    for (i, line) in lines.enumerate() {
-        let line = line.with_context(context)?;
-        let cells: Vec<&str> = line.split(',').collect();
-        if cells.len() != names.len() {
-            // The last row of a run that is under way.
-            continue;
+    let mut table = vec![Vec::new(); columns.len()];
+    let mut row = 0;
+    while next(&mut line).with_context(context)? > 0 {
+        row += 1;
+        ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
+        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
+        // The last row of a run that is under way, where it is shorter.
+        if cells.len() == names.len() {
+            for (&place, column) in places.iter().zip(&mut table) {
+                let cell = String::from_utf8_lossy(cells[place]);
+                let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
+                let number: f64 = number
+                    .with_context(|| format!("{}, row {row}: `{}` is no number", path.display(), beginning(&cell)))?;
+                column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
+            }
         }
-        let number = |&place: &usize| match cells[place] {
-            "" => Ok(f64::NAN),
-            cell => cell.parse().with_context(|| format!("{}, row {}: `{cell}` is no number", path.display(), i + 1)),
-        };
-        table.push(places.iter().map(number).collect::<Result<_>>()?);
     }
     Ok(table)
+}
+
+/// What of a text fits into a message.
+fn beginning(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
+    if text.chars().count() > LONGEST_QUOTE { format!("{start}…") } else { start }
 }
 
 /// What a table holds.
@@ -186,10 +212,24 @@ mod tests {
     fn columns_are_read_by_name_with_gaps_and_without_the_row_under_way() {
         let (place, path) = table("1,0.5\n2,\n3");
         let read = read_metrics(&path, &["loss", "iteration"]).unwrap();
-        assert!(read.len() == 2 && read[0] == [0.5, 1.0] && read[1][0].is_nan() && read[1][1] == 2.0, "{read:?}");
-        assert_eq!(read_metrics(place.path(), &["loss"]).unwrap().len(), 2);
+        assert!(read[0][0] == 0.5 && read[0][1].is_nan() && read[1] == [1.0, 2.0], "{read:?}");
+        assert_eq!(read_metrics(place.path(), &["loss"]).unwrap()[0].len(), 2);
         let refusal = read_metrics(&path, &["goals"]).unwrap_err().to_string();
-        assert!(refusal.contains("no column goals; it has iteration loss"), "{refusal}");
+        assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_drawn_are_gaps_and_what_is_quoted_is_short() {
+        let (_place, path) = table("1,1.7e308\r\n2,-inf\n3,7\n");
+        let read = read_metrics(&path, &["loss"]).unwrap();
+        assert!(read[0][0].is_nan() && read[0][1].is_nan() && read[0][2] == 7.0, "{read:?}");
+        for text in
+            [format!("{{{}\n", "\"a\": 1,".repeat(100_000)), format!("iteration,loss\n1,{}\n", "x".repeat(99_999))]
+        {
+            fs::write(&path, text).unwrap();
+            let refusal = format!("{:#}", read_metrics(&path, &["loss"]).unwrap_err());
+            assert!(refusal.len() < 500 + path.as_os_str().len(), "{refusal}");
+        }
     }
 
     fn table(rows: &str) -> (tempfile::TempDir, PathBuf) {

@@ -13,6 +13,7 @@ mod meshes;
 mod metrics;
 mod output;
 mod pip;
+mod progress;
 mod report;
 
 pub use chart::{Chart, Curve, Panel};
@@ -26,9 +27,11 @@ pub use lock::Locked;
 pub use meshes::hand_meshes;
 pub use metrics::read_metrics;
 pub use output::{OutputFile, expect_folder, write_whole};
-pub use report::{Bar, Report, Status};
+pub use progress::{Bar, Progress, Status};
+pub use report::Report;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, ensure};
 
@@ -67,6 +70,18 @@ pub fn quoted(text: &str) -> String {
     }
 }
 
+/// A path as one word for a shell, also where its name is no text.
+pub fn quoted_path(path: &Path) -> String {
+    path.to_str().map_or_else(
+        || {
+            let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
+            // Of the escapes only this one means something else there.
+            format!("$'{}'", escaped.replace("\\\"", "\""))
+        },
+        quoted,
+    )
+}
+
 /// Whether there is a display that a window could open on.
 pub fn has_display() -> bool {
     ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
@@ -90,6 +105,8 @@ pub fn start_threads(threads: usize) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::ffi::OsStrExt;
+
     use super::*;
 
     #[test]
@@ -97,5 +114,8 @@ mod tests {
         assert_eq!(quoted("runs/a-1"), "runs/a-1");
         assert_eq!(quoted("my run"), "'my run'");
         assert_eq!(quoted("$(it's)"), "'$(it'\\''s)'");
+        assert_eq!(quoted_path(Path::new("my run")), "'my run'");
+        let odd = std::ffi::OsStr::from_bytes(b"a \xff'\"\\");
+        assert_eq!(quoted_path(Path::new(odd)), r#"$'a \xff\'"\\'"#);
     }
 }

@@ -14,7 +14,7 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::{Context, Result, bail, ensure};
 
 use super::file::read_bytes;
-use super::quoted;
+use super::quoted_path;
 
 /// How the name of a file ends that is not complete yet.
 pub const PARTIAL: &str = "partial";
@@ -248,7 +248,7 @@ pub fn make_own(path: &Path) -> io::Result<()> {
 /// There is none; how to make it.
 pub fn expect_folder(path: &Path) -> Result<()> {
     let folder = folder_of(path);
-    let make = quoted(&folder.display().to_string());
+    let make = quoted_path(folder);
     ensure!(
         folder.is_dir(),
         "cannot write {}: there is no folder {}; make it with\n  mkdir -p {make}",

@@ -1,27 +1,18 @@
-//! What a training tells: event file, `metrics.csv`, and a progress bar, or plain lines where there is no terminal.
+//! What a training tells: event file, `metrics.csv`, and a progress line.
 //!
 //! A log that cannot be written is a warning, never the end of a training: what is lost is counted, and at the next checkpoint
 //! it is tried again.
 
 use std::fs;
-use std::io::IsTerminal;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
-use super::say;
-
-/// Time between two plain lines.
-const LINE_EVERY: Duration = Duration::from_secs(10);
-
-/// Share of the newest value in the moving averages that are shown (not in what is logged).
-const SHOWN_SHARE: f64 = 0.1;
+use super::progress::{Progress, Status};
 
 /// Where a training tells how it goes.
 pub struct Report {
@@ -34,13 +25,7 @@ pub struct Report {
     /// Of the last iteration that was logged.
     iteration: u64,
     env_steps: u64,
-    bar: Option<ProgressBar>,
-    last_line: Option<Instant>,
-    /// Moving averages.
-    shown: Status,
-    total_steps: u64,
-    /// When this session began, and the steps made before it.
-    begun: (Instant, u64),
+    progress: Progress,
 }
 
 /// A log, or none while it cannot be written.
@@ -91,24 +76,10 @@ impl<W> Log<W> {
     }
 }
 
-/// What is shown of an iteration; `NaN` where nothing is known.
-#[derive(Clone, Copy, Debug)]
-pub struct Status {
-    /// Control steps made.
-    pub env_steps: u64,
-    /// Control steps per second.
-    pub steps_per_s: f64,
-    /// Goals per episode that ended.
-    pub goals: f64,
-    /// Fraction of the episodes that ended with a drop.
-    pub drop_rate: f64,
-}
-
 impl Report {
-    /// Of a run in `folder` that has made so many steps, for metrics with these names; nothing is written yet.
-    pub fn new(folder: &Path, tags: &[impl AsRef<str>], env_steps: u64, total_steps: u64) -> Self {
+    /// Of a run in `folder`, for metrics with these names; nothing is written yet.
+    pub fn new(folder: &Path, tags: &[impl AsRef<str>], progress: Progress) -> Self {
         let columns: Vec<&str> = ["iteration", "env_steps"].into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
-        let terminal = std::io::stderr().is_terminal();
         Self {
             folder: folder.to_owned(),
             header: columns.join(","),
@@ -116,12 +87,8 @@ impl Report {
             metrics: Log::new(METRICS),
             first: 0,
             iteration: 0,
-            env_steps,
-            bar: terminal.then(|| progress_bar(env_steps, total_steps)),
-            last_line: None,
-            shown: Status { env_steps, steps_per_s: f64::NAN, goals: f64::NAN, drop_rate: f64::NAN },
-            total_steps,
-            begun: (Instant::now(), env_steps),
+            env_steps: 0,
+            progress,
         }
     }
 
@@ -161,16 +128,7 @@ impl Report {
             self.metrics.write(|metrics| metrics.row(&row)),
         ];
         warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
-        self.shown.take(status);
-        let text = self.shown.text(self.time_left(status.env_steps));
-        if let Some(bar) = &self.bar {
-            bar.set_position(status.env_steps);
-            bar.set_message(text);
-        } else if self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY) || status.env_steps >= self.total_steps
-        {
-            self.last_line = Some(Instant::now());
-            say(&format!("{} of {} steps  {text}", status.env_steps, self.total_steps));
-        }
+        self.progress.show(status);
     }
 
     /// Brings all that was logged onto the disk, before a checkpoint says that it is there; opens again what could not be
@@ -190,106 +148,25 @@ impl Report {
 
     /// Says what the logs lack, and ends the progress bar as it is.
     pub fn finish(&self) {
-        if let Some(bar) = &self.bar {
-            bar.abandon();
-        }
+        self.progress.end();
         for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
             if lost > 0 {
-                say(&format!("warning: {name} lacks {lost} iterations of this session, which could not be written"));
+                self.say(&format!(
+                    "warning: {name} lacks {lost} iterations of this session, which could not be written"
+                ));
             }
         }
     }
 
-    /// At the pace of this session, evaluations included.
-    fn time_left(&self, env_steps: u64) -> Duration {
-        let (start, before) = self.begun;
-        let pace = start.elapsed().as_secs_f64() / env_steps.saturating_sub(before).max(1) as f64;
-        let left = pace * self.total_steps.saturating_sub(env_steps) as f64;
-        Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
-    }
-
-    /// Prints a line above the progress bar.
+    /// Prints a line above the progress line.
     pub fn say(&self, line: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| say(line)),
-            None => say(line),
-        }
+        self.progress.say(line);
     }
 
-    /// Prints a warning above the progress bar.
+    /// Prints a warning above the progress line.
     pub fn warn(&self, text: &str) {
         self.say(&format!("warning: {text}"));
     }
-}
-
-impl Status {
-    fn take(&mut self, status: &Status) {
-        for (shown, new) in [
-            (&mut self.steps_per_s, status.steps_per_s),
-            (&mut self.goals, status.goals),
-            (&mut self.drop_rate, status.drop_rate),
-        ] {
-            if shown.is_nan() {
-                *shown = new;
-            } else if !new.is_nan() {
-                *shown += SHOWN_SHARE * (new - *shown);
-            }
-        }
-    }
-
-    fn text(&self, left: Duration) -> String {
-        let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
-        format!(
-            "{:.0} steps/s  ETA {}  goals {}/episode  drops {}",
-            self.steps_per_s,
-            indicatif::FormattedDuration(left),
-            known(self.goals, format!("{:.2}", self.goals)),
-            known(self.drop_rate, format!("{:.0} %", 100.0 * self.drop_rate)),
-        )
-    }
-}
-
-/// How far a job has come; on a terminal only.
-pub struct Bar {
-    bar: ProgressBar,
-}
-
-impl Bar {
-    /// A bar at zero of `total` things of this name.
-    pub fn new(total: u64, name: &str) -> Self {
-        let style = format!("{{elapsed_precise}} [{{bar:24}}] {{human_pos}}/{{human_len}} {name}  {{msg}}");
-        let style = ProgressStyle::with_template(&style).expect("a template that indicatif knows");
-        Self { bar: ProgressBar::new(total).with_style(style.progress_chars("=> ")) }
-    }
-
-    /// Counts one.
-    pub fn count(&self) {
-        self.bar.inc(1);
-    }
-
-    /// So many of them will not come.
-    pub fn shorten(&self, by: u64) {
-        self.bar.dec_length(by);
-    }
-
-    /// Says something beside it.
-    pub fn say(&self, message: String) {
-        self.bar.set_message(message);
-    }
-}
-
-impl Drop for Bar {
-    fn drop(&mut self) {
-        self.bar.finish_and_clear();
-    }
-}
-
-fn progress_bar(done: u64, total: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {human_pos}/{human_len} steps  {msg}");
-    let bar = ProgressBar::new(total).with_style(style.expect("a template that indicatif knows").progress_chars("=> "));
-    bar.set_position(done);
-    bar.enable_steady_tick(Duration::from_secs(1));
-    bar
 }
 
 #[cfg(test)]
@@ -297,11 +174,11 @@ mod tests {
     use super::*;
 
     fn status(env_steps: u64) -> Status {
-        Status { env_steps, steps_per_s: 10.0, goals: f64::NAN, drop_rate: 0.5 }
+        Status { env_steps, steps_per_s: 10.0, goals: f64::NAN, drop_rate: 0.5, evaluation: f64::NAN }
     }
 
     fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64) -> Report {
-        let mut report = Report::new(folder, tags, env_steps, 100);
+        let mut report = Report::new(folder, tags, Progress::new(env_steps, 100, true));
         report.open_logs(0..iteration, env_steps);
         report
     }

@@ -3,6 +3,7 @@
 //! Nothing outside this folder names `mujoco_rs`; nothing inside knows the task. Angles rad, lengths m, world frame.
 
 mod fatal;
+mod finite;
 #[cfg(any(feature = "video", feature = "viewer"))]
 mod graphics;
 mod look;

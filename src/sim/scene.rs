@@ -10,6 +10,7 @@ use mujoco_rs::prelude::{
 
 use super::Look;
 use super::fatal::quieten_mujoco;
+use super::finite::not_finite;
 
 /// The scene that is built into the program.
 const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -137,6 +138,9 @@ impl Scene {
     }
 
     fn of(mut model: MjModel, origin: String, variation: Variation) -> Result<Self> {
+        if let Some(culprit) = not_finite(&model) {
+            bail!("{origin}: {culprit} is not a finite number");
+        }
         variation.apply(&mut model);
         let scene = Self { model: Arc::new(model), origin };
         if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {

@@ -1,6 +1,7 @@
 //! Training, from top to bottom: collect, learn, evaluate, report, save.
 
 mod fork;
+mod hints;
 mod log;
 mod saver;
 mod session;
@@ -12,11 +13,13 @@ use anyhow::{Context, Error, Result, anyhow};
 
 use crate::agent::Iteration;
 use crate::cli::TrainArgs;
+use crate::config::Config;
 use crate::dump;
-use crate::env::{Lesson, Recent, Score};
+use crate::env::{Lesson, Recent, Score, divergence};
 use crate::evaluate::{Actor, Episodes, evaluate};
-use crate::run::{self, Report, Requests, RunFolder, Status};
+use crate::run::{self, Progress, Report, Requests, RunFolder, Status};
 use crate::schedule::panic_message;
+use hints::hints;
 use log::{row, tags};
 use saver::Saver;
 use session::Session;
@@ -53,7 +56,10 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     }
     requests.wait_for_end();
     run::say(&format!("run folder: {place}"));
-    let mut report = new_report(&session, &saver);
+    if !args.quiet {
+        hints(&session.config, &Config::resolve(None, &[])?).iter().for_each(|hint| run::say(&format!("note: {hint}")));
+    }
+    let mut report = new_report(&session, &saver, args.quiet);
     if !saver.resumes() {
         saver.begin(&mut report)?;
     }
@@ -67,7 +73,10 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
                 }
                 session.report(&mut report, &made);
             }
-            Ok(None) => return stop(saver, &mut report, requests),
+            Ok(None) => {
+                session.count_divergence();
+                return stop(saver, &mut report, requests);
+            }
             Err(error) => return Err(give_up(error, saver, &mut report)),
         }
         let due = session.agent.iteration.is_multiple_of(session.config.run.checkpoint_every);
@@ -79,6 +88,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
         }
     }
     let _ = saver.save_at_last(&mut report)?;
+    session.count_divergence();
     run::say(&format!("finished: {}; {place}", saver.steps_made()));
     Ok(Outcome::Finished)
 }
@@ -135,8 +145,23 @@ impl Session {
             recent += env.take_recent();
         }
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
-        let status = Status { env_steps, steps_per_s, goals: episodes.goals, drop_rate: episodes.drop_rate };
+        let (goals, drop_rate) = (episodes.goals, episodes.drop_rate);
+        let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
+        self.diverged += recent.diverged;
+        let warning = divergence(recent.diverged, recent.steps).or_else(|| evaluation.divergence());
+        if let Some(warning) = warning.filter(|_| !self.warned) {
+            // Once; how often it came to it stands at the end.
+            self.warned = true;
+            report.warn(&warning);
+        }
         report.iteration(self.agent.iteration, &row(iteration, &episodes, &recent, evaluation), &status);
+    }
+
+    /// Says at the end how many steps diverged, if they were warned of.
+    fn count_divergence(&self) {
+        if self.warned {
+            run::say(&format!("warning: {} steps of this session diverged", self.diverged));
+        }
     }
 
     /// Writes what led to each episode that diverged.
@@ -152,9 +177,10 @@ impl Session {
     }
 }
 
-fn new_report(session: &Session, saver: &Saver) -> Report {
+fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(Lesson::task(&session.config.env));
-    Report::new(saver.folder().path(), &tags, session.agent.env_steps, session.config.run.total_steps)
+    let progress = Progress::new(session.agent.env_steps, session.config.run.total_steps, quiet);
+    Report::new(saver.folder().path(), &tags, progress)
 }
 
 /// Saves the end of the last iteration, when it was asked to stop.
@@ -184,7 +210,7 @@ fn is_better(found: [f64; 2], best: Option<[f64; 2]>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Override};
+    use crate::config::Override;
     use crate::ppo::Checkpoint;
     use crate::train::saver::Begin;
 
@@ -196,7 +222,7 @@ mod tests {
         let mut session = Session::new(Config::resolve(None, &sets).unwrap()).unwrap();
         let (folder, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let mut saver = session.saver(folder, lock, &TrainArgs::default(), Begin::New);
-        let (mut report, never) = (new_report(&session, &saver), AtomicBool::new(false));
+        let (mut report, never) = (new_report(&session, &saver, true), AtomicBool::new(false));
         saver.begin(&mut report).unwrap();
         assert!(session.iterate(&never, &report).unwrap().is_some(), "nothing stops it");
         saver.take(session.checkpoint());

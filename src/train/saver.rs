@@ -248,7 +248,7 @@ fn elsewhere(reason: Error, best: Option<&Checkpoint>, end: &Checkpoint, options
 
 /// The command that goes on with a run in this folder, as this training does.
 fn how_to_resume(run: &Path, options: &str) -> String {
-    format!("shadow-repose train --resume {}{options}", run::quoted(&run.display().to_string()))
+    format!("shadow-repose train --resume {}{options}", run::quoted_path(run))
 }
 
 /// What a run folder says about the program that made it.

@@ -27,6 +27,10 @@ pub struct Session {
     pub agent: Agent<Repose>,
     /// Goals per episode and rotation error (rad) of the best evaluation.
     pub best: Option<[f64; 2]>,
+    /// Steps of this session on which the physics diverged.
+    pub diverged: u64,
+    /// That they are many was said.
+    pub warned: bool,
     /// The fingerprint of the scene.
     scene: u64,
 }
@@ -105,7 +109,7 @@ impl Session {
         config.run.shards = config.shards();
         let task = Task::new(&config.env)?;
         let (agent, scene) = (Agent::of_task(&task, &config)?, task.scene().fingerprint()?);
-        Ok(Self { config, task, agent, best: None, scene })
+        Ok(Self { config, task, agent, best: None, diverged: 0, warned: false, scene })
     }
 
     /// The end of the last iteration, whole.

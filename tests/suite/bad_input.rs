@@ -233,7 +233,20 @@ fn usage_errors_exit_with_2() {
     ] {
         refused(folder.path(), args, 2, &["--help"]);
     }
-    refused(folder.path(), &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"], 1, &["only the task"]);
+    // Nothing would be seen of it.
+    refused(
+        folder.path(),
+        &["play", "--policy", "zero", "--headless", "--size", "64x64"],
+        2,
+        &["--size is for a film"],
+    );
+    refused(folder.path(), &["play", "--policy", "zero", "--json", "--plain"], 2, &["--plain is for a film"]);
+    refused(
+        folder.path(),
+        &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"],
+        1,
+        &["`play` does not use ppo.gamma"],
+    );
     refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["only env.model"]);
     refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);

@@ -8,6 +8,7 @@ mod bad_input;
 mod binary;
 mod experiment;
 mod fork;
+mod outputs;
 mod pace;
 #[cfg(feature = "video")]
 mod pictures;

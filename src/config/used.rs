@@ -1,0 +1,70 @@
+//! Which commands a setting does something for.
+
+use anyhow::{Result, bail};
+use toml::Table;
+
+use super::BASE;
+use super::layers::Override;
+
+/// The commands that take settings.
+const COMMANDS: [&str; 4] = ["train", "bench", "play", "view"];
+
+/// Settings of `[env]` and `[run]` that fewer commands use than the others of their section.
+const FEWER: [(&str, &[&str]); 5] = [
+    ("env.num_envs", &["train", "bench"]),
+    ("run.total_steps", &["train"]),
+    ("run.checkpoint_every", &["train"]),
+    ("run.eval_every", &["train"]),
+    ("run.eval_episodes", &["train"]),
+];
+
+/// Makes sure that a command uses all of these settings. A file of settings may hold any: it is one for all commands.
+///
+/// # Errors
+/// The first that it does not use, with the commands that do.
+pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
+    let base: Table = BASE.parse().expect("our own settings are TOML");
+    for Override { key, value } in overrides {
+        let mut parts = key.splitn(3, '.');
+        let (section, name) = (parts.next().unwrap_or_default(), parts.next().unwrap_or_default());
+        // What is unknown is answered with what is known, elsewhere.
+        let known = base.get(section).and_then(|keys| keys.get(name)).is_some();
+        let users = users(section, name);
+        if known && !users.contains(&command) {
+            let does = if users.len() == 1 { "does" } else { "do" };
+            let users = users.join("` and `");
+            bail!("--set {key}={value}: `{command}` does not use {section}.{name}; `{users}` {does}");
+        }
+    }
+    Ok(())
+}
+
+fn users(section: &str, name: &str) -> &'static [&'static str] {
+    let key = format!("{section}.{name}");
+    let fewer = FEWER.iter().find(|(of, _)| *of == key).map(|(_, users)| *users);
+    fewer.unwrap_or(if section == "env" { &COMMANDS } else { &COMMANDS[..2] })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_setting_that_a_command_does_not_use_is_refused_with_those_that_do() {
+        let answer =
+            |set: &str, command| expect_used(&[set.parse().unwrap()], command).map_err(|error| error.to_string());
+        for (set, command, users) in [
+            ("env.num_envs=99", "play", "`train` and `bench` do"),
+            ("ppo.gamma=0.5", "view", "`train` and `bench` do"),
+            ("run.threads=3", "view", "`train` and `bench` do"),
+            ("training.tolerance.to=1", "play", "`train` and `bench` do"),
+            ("run.total_steps=3", "bench", "`train` does"),
+        ] {
+            let refusal = answer(set, command).unwrap_err();
+            assert!(refusal.contains(&format!("`{command}` does not use")) && refusal.contains(users), "{refusal}");
+            assert!(answer(set, "train").is_ok());
+        }
+        assert!(answer("env.sim_dt=0.002", "view").is_ok() && answer("run.seed=3", "bench").is_ok());
+        assert!(answer("env.foo=1", "view").is_ok(), "answered elsewhere");
+    }
+}

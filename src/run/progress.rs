@@ -1,0 +1,213 @@
+//! How far a job has come, on the terminal: a line that is drawn again and again, or where that cannot be, plain lines.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use console::Term;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::say;
+
+/// Time between two plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Share of the newest value in the moving averages that are shown (not in what is logged).
+const SHOWN_SHARE: f64 = 0.1;
+
+/// Columns of a terminal that a line needs to be drawn again and again.
+const NARROWEST: usize = 60;
+
+/// What is shown of an iteration; `NaN` where nothing is known.
+#[derive(Clone, Copy, Debug)]
+pub struct Status {
+    /// Control steps made.
+    pub env_steps: u64,
+    /// Control steps per second.
+    pub steps_per_s: f64,
+    /// Goals of the lesson per episode that ended: those that training asks for.
+    pub goals: f64,
+    /// Fraction of the episodes that ended with a drop.
+    pub drop_rate: f64,
+    /// Goals per episode of an evaluation.
+    pub evaluation: f64,
+}
+
+/// How far a training has come.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    last_line: Option<Instant>,
+    /// Moving averages, and the last evaluation.
+    shown: Status,
+    total_steps: u64,
+    /// When this session began, and the steps made before it.
+    begun: (Instant, u64),
+}
+
+impl Progress {
+    /// Of a training that has made so many of its steps. One that is to be `quiet` shows nothing of it.
+    pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
+        let bar = (!quiet && is_drawn_on()).then(|| {
+            // What does not fit is cut off, however the terminal is resized.
+            let style = ProgressStyle::with_template("{wide_msg}").expect("a template that indicatif knows");
+            let bar = ProgressBar::no_length().with_style(style);
+            bar.enable_steady_tick(Duration::from_secs(1));
+            bar
+        });
+        let unknown = f64::NAN;
+        let shown = Status { env_steps, steps_per_s: unknown, goals: unknown, drop_rate: unknown, evaluation: unknown };
+        Self { bar, quiet, last_line: None, shown, total_steps, begun: (Instant::now(), env_steps) }
+    }
+
+    /// Shows what an iteration came to.
+    pub fn show(&mut self, status: &Status) {
+        self.shown.take(status);
+        let left = self.time_left();
+        if let Some(bar) = &self.bar {
+            let width = usize::from(Term::stderr().size().1).saturating_sub(1);
+            bar.set_message(self.shown.line(self.total_steps, left, width));
+        } else if !self.quiet
+            && (self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY) || status.env_steps >= self.total_steps)
+        {
+            self.last_line = Some(Instant::now());
+            let parts = self.shown.parts(left).join("  ");
+            say(&format!("{} of {} steps  {parts}", status.env_steps, self.total_steps));
+        }
+    }
+
+    /// At the pace of this session, evaluations included.
+    fn time_left(&self) -> Duration {
+        let (start, before) = self.begun;
+        let pace = start.elapsed().as_secs_f64() / self.shown.env_steps.saturating_sub(before).max(1) as f64;
+        let left = pace * self.total_steps.saturating_sub(self.shown.env_steps) as f64;
+        Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
+    }
+
+    /// Prints a line above it.
+    pub fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| say(line)),
+            None => say(line),
+        }
+    }
+
+    /// Leaves it as it is.
+    pub fn end(&self) {
+        if let Some(bar) = &self.bar {
+            bar.abandon();
+            // It is left at its end.
+            say("");
+        }
+    }
+}
+
+/// Whether stderr is a terminal on which a line can be drawn again in its place.
+fn is_drawn_on() -> bool {
+    let dumb = std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb");
+    let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
+    std::io::stderr().is_terminal() && !dumb && wide
+}
+
+impl Status {
+    fn take(&mut self, status: &Status) {
+        self.env_steps = status.env_steps;
+        for (shown, new) in [
+            (&mut self.steps_per_s, status.steps_per_s),
+            (&mut self.goals, status.goals),
+            (&mut self.drop_rate, status.drop_rate),
+        ] {
+            if shown.is_nan() {
+                *shown = new;
+            } else if !new.is_nan() {
+                *shown += SHOWN_SHARE * (new - *shown);
+            }
+        }
+        if !status.evaluation.is_nan() {
+            self.evaluation = status.evaluation;
+        }
+    }
+
+    /// What there is to show, the most important first.
+    fn parts(&self, left: Duration) -> Vec<String> {
+        let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
+        let mut parts = vec![
+            format!("{:.0} steps/s", self.steps_per_s),
+            format!("ETA {}:{:02}:{:02}", left.as_secs() / 3600, left.as_secs() / 60 % 60, left.as_secs() % 60),
+            format!("lesson goals {}", known(self.goals, format!("{:.2}", self.goals))),
+            format!("drops {}", known(self.drop_rate, format!("{:.0}%", 100.0 * self.drop_rate))),
+        ];
+        parts.extend((!self.evaluation.is_nan()).then(|| format!("eval {:.2}", self.evaluation)));
+        parts
+    }
+
+    /// As many parts as fit into so many columns.
+    fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
+        let mut line = match total_steps {
+            0..10_000 => format!("{}/{total_steps}", self.env_steps),
+            0..1_000_000 => format!("{:.1}/{:.0}k", self.env_steps as f64 / 1e3, total_steps as f64 / 1e3),
+            _ => format!("{:.1}/{:.0}M", self.env_steps as f64 / 1e6, total_steps as f64 / 1e6),
+        };
+        for part in self.parts(left) {
+            if line.len() + 2 + part.len() > width {
+                break;
+            }
+            line += &format!("  {part}");
+        }
+        line
+    }
+}
+
+/// How far a job of many things has come; on a terminal only.
+pub struct Bar {
+    bar: ProgressBar,
+}
+
+impl Bar {
+    /// A bar at zero of `total` things of this name.
+    pub fn new(total: u64, name: &str) -> Self {
+        let style = format!("{{elapsed_precise}} [{{bar:12}}] {{human_pos}}/{{human_len}} {name}  {{wide_msg}}");
+        let style = ProgressStyle::with_template(&style).expect("a template that indicatif knows");
+        Self { bar: ProgressBar::new(total).with_style(style.progress_chars("=> ")) }
+    }
+
+    /// Counts one.
+    pub fn count(&self) {
+        self.bar.inc(1);
+    }
+
+    /// So many of them will not come.
+    pub fn shorten(&self, by: u64) {
+        self.bar.dec_length(by);
+    }
+
+    /// Says something beside it.
+    pub fn say(&self, message: String) {
+        self.bar.set_message(message);
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_line_has_what_fits_into_60_and_80_columns() {
+        let status =
+            Status { env_steps: 10_012_345, steps_per_s: 12_345.6, goals: 0.24, drop_rate: 0.335, evaluation: 5.75 };
+        let line = |width| status.line(100_000_000, Duration::from_secs(7533), width);
+        let short = "10.0/100M  12346 steps/s  ETA 2:05:33  lesson goals 0.24";
+        assert_eq!(line(59), short);
+        assert_eq!(line(79), format!("{short}  drops 34%  eval 5.75"));
+        let k = Status { env_steps: 12_544, goals: 0.0, drop_rate: 1.0, evaluation: 0.0, ..status };
+        let expected = "12.5/26k  12346 steps/s  ETA 0:00:00  lesson goals 0.00  drops 100%  eval 0.00";
+        assert_eq!(k.line(25_600, Duration::ZERO, 79), expected);
+        let few = Status { env_steps: 256, evaluation: f64::NAN, goals: f64::NAN, ..status };
+        assert!(few.line(1280, Duration::ZERO, 79).starts_with("256/1280  12346 steps/s  ETA 0:00:00  lesson goals -"));
+    }
+}

@@ -1,0 +1,89 @@
+//! Settings that are allowed but rarely meant: a line for each, before a training begins.
+
+use crate::config::Config;
+
+/// Samples under which a minibatch makes a noisy gradient, and its step a short one for what it costs.
+const SMALL_MINIBATCH: usize = 1024;
+
+/// The least weight of the task's reward at which its scales matter.
+const LITTLE: f64 = 0.1;
+
+/// What there is to say of these settings, beside the `default`.
+pub fn hints(config: &Config, default: &Config) -> Vec<String> {
+    let mut hints = Vec::new();
+    let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
+    let ramps = [
+        ("training.task_reward", training.task_reward),
+        ("training.tolerance", training.tolerance),
+        ("training.hold", training.hold),
+        ("ppo.max_std", ppo.max_std),
+        ("ppo.min_std", ppo.min_std),
+    ];
+    let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.steps > total).collect();
+    if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.steps).max() {
+        let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
+        hints.push(format!(
+            "run.total_steps = {total} ends inside the ramps of {}, up to {longest} steps",
+            names.join(", ")
+        ));
+    }
+    let samples = config.samples_per_minibatch();
+    if samples < SMALL_MINIBATCH {
+        hints.push(format!("minibatches of {samples} samples: under {SMALL_MINIBATCH} gradients are noisy"));
+    }
+    let scales = |of: &Config| {
+        let env = &of.env;
+        [
+            ("env.rot_reward_scale", env.rot_reward_scale),
+            ("env.dist_reward_scale", env.dist_reward_scale),
+            ("env.action_penalty_scale", env.action_penalty_scale),
+        ]
+    };
+    let weight = training.task_reward.to;
+    for ((key, value), (_, usual)) in scales(config).into_iter().zip(scales(default)) {
+        if value != usual && weight < LITTLE {
+            hints.push(format!("{key} = {value}: training.task_reward lets it count only {weight} times in the end"));
+        }
+    }
+    hints
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::config::Override;
+
+    fn of(sets: &[&str]) -> Vec<String> {
+        let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
+        let default = Config::resolve(None, &[]).unwrap();
+        hints(&Config::resolve(None, &sets).unwrap(), &default)
+    }
+
+    #[test]
+    fn what_is_rarely_meant_gets_a_line_each() {
+        let [line] = &of(&["run.total_steps=20000000"])[..] else { panic!("one line") };
+        assert!(line.contains("training.tolerance, training.hold, ppo.max_std, up to 25000000 steps"), "{line}");
+        assert!(!line.contains("task_reward"), "its ramp ends in time: {line}");
+        let [line] = &of(&["ppo.minibatches=32"])[..] else { panic!("one line") };
+        assert!(line.starts_with("minibatches of 512 samples"), "{line}");
+        let [line] = &of(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
+        assert!(
+            line.starts_with("env.dist_reward_scale = -20: training.task_reward lets it count only 0.03"),
+            "{line}"
+        );
+        assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
+    }
+
+    #[test]
+    fn no_settings_that_come_with_the_program_cause_a_line() {
+        let files =
+            ["", include_str!("../../configs/repose-large.toml"), include_str!("../../configs/repose-continue.toml")];
+        let default = Config::resolve(None, &[]).unwrap();
+        for text in files {
+            let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
+            assert_eq!(hints(&config, &default), [""; 0]);
+        }
+    }
+}

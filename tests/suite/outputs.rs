@@ -1,0 +1,275 @@
+//! What the program writes where the user says, and what it says on the terminal.
+
+use std::fs;
+use std::io::Read;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::support::{SCENE, command, names, program, stderr, succeeded, train};
+
+/// Episodes of a moment.
+const SHORT: [&str; 6] = ["play", "--policy", "zero", "--set", "env.max_episode_seconds=0.1", "--headless"];
+
+/// The program's command line behind a shell's words.
+fn shell(folder: &Path, before: &str, args: &[&str], after: &str) -> Output {
+    let program = env!("CARGO_BIN_EXE_shadow-repose");
+    let args: Vec<String> = args.iter().map(|arg| format!("'{arg}'")).collect();
+    let text = format!("{before} '{program}' {} {after}", args.join(" "));
+    Command::new("sh").args(["-c", &text]).current_dir(folder).env_remove("DISPLAY").output().unwrap()
+}
+
+#[test]
+fn m3_what_a_link_leads_to_is_written_and_the_link_stays() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    fs::write(folder.join("target"), "old").unwrap();
+    std::os::unix::fs::symlink("target", folder.join("link")).unwrap();
+    succeeded(program(folder, &[&SHORT[..], &["--episodes", "1", "--trace", "link"]].concat()));
+    assert!(folder.join("link").is_symlink());
+    assert!(fs::read_to_string(folder.join("target")).unwrap().starts_with("{\"sim_dt\""));
+    // A link to what is written into anyway, as /dev/stdout is: the trace, then the table.
+    let to_stdout = folder.join("stdout");
+    std::os::unix::fs::symlink("/proc/self/fd/1", &to_stdout).unwrap();
+    let args = [&SHORT[..], &["--episodes", "1", "--trace", "stdout"]].concat();
+    succeeded(shell(folder, "", &args, "> both"));
+    let both = fs::read_to_string(folder.join("both")).unwrap();
+    assert!(both.starts_with("{\"sim_dt\"") && both.contains("goals per episode"), "{both}");
+    assert!(to_stdout.is_symlink());
+}
+
+#[test]
+fn m6_a_result_that_cannot_be_printed_is_an_error() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let bench = ["bench", "--json", "--only", "learner", "--set", "env.num_envs=16", "--set", "ppo.hidden=[8]"];
+    for args in
+        [&[&SHORT[..], &["--episodes", "1", "--json"]].concat()[..], &SHORT, &bench, &["--help"], &["--version"]]
+    {
+        let output = shell(folder, "", args, "> /dev/full");
+        assert_eq!(output.status.code(), Some(1), "{args:?}");
+        assert!(stderr(&output).contains("cannot write to stdout"), "{args:?}: {}", stderr(&output));
+        // A reader that has seen enough is none.
+        let output = shell(folder, "", args, "| true");
+        assert!(output.status.success() && stderr(&output).is_empty(), "{args:?}: {}", stderr(&output));
+    }
+}
+
+#[test]
+fn l13_a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let args = [&SHORT[..], &["--episodes", "30", "--trace", "trace"]].concat();
+    let output = shell(folder, "ulimit -f 1;", &args, "");
+    assert_eq!(output.status.code(), Some(1), "{:?}", output.status);
+    assert!(stderr(&output).contains("File too large"), "{}", stderr(&output));
+    assert_eq!(names(folder), [""; 0]);
+}
+
+#[test]
+fn l16_one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let refused = |args: &[&str], reason: &str| {
+        let output = program(folder, args);
+        assert_eq!(output.status.code(), Some(1), "{args:?}");
+        assert!(stderr(&output).contains(reason), "{args:?}: {}", stderr(&output));
+        assert_eq!(names(folder), [""; 0], "{args:?}");
+    };
+    let play = ["play", "--policy", "zero", "--plain"];
+    #[cfg(feature = "video")]
+    refused(&[&play[..], &["--trace", "a.gif", "--video", "./a.gif"]].concat(), "one file cannot be both");
+    refused(&["play", "--policy", "zero", "--trace", "not there/a"], "mkdir -p 'not there'");
+    #[cfg(feature = "video")]
+    refused(&[&play[..], &["--video", "films/a.gif"]].concat(), "mkdir -p films");
+    let _ = play;
+    refused(&["view", "--screenshot", "pictures/a.png"], "mkdir -p pictures");
+    refused(&["plot", "runs/*", "--out", "charts/a.svg"], "mkdir -p charts");
+}
+
+#[test]
+fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    for (signal, code) in [("TERM", 143), ("INT", 130), ("HUP", 129)] {
+        let args = ["play", "--policy", "random", "--headless", "--episodes", "100000", "--trace", "trace"];
+        let mut child = command(folder, &args).stderr(Stdio::null()).spawn().unwrap();
+        let begun = Instant::now();
+        while names(folder).is_empty() && begun.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert!(
+            Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
+        );
+        assert_eq!(child.wait().unwrap().code(), Some(code));
+        assert_eq!(names(folder), [""; 0], "{signal}");
+    }
+}
+
+#[test]
+fn l24_more_threads_than_make_sense_are_refused() {
+    let place = tempfile::tempdir().unwrap();
+    for args in [&["train", "--threads", "3000"][..], &["play", "--threads", "3000", "--headless"]] {
+        let output = program(place.path(), args);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(stderr(&output).contains("3000 worker threads: at most"), "{}", stderr(&output));
+    }
+    assert_eq!(names(place.path()), [""; 0]);
+}
+
+#[test]
+fn l25_signals_that_are_ignored_at_the_start_stay_ignored_and_steps_may_be_written_as_powers() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let args = train(&["--total-steps", "9e3", "--run-dir", "run"]);
+    let program = env!("CARGO_BIN_EXE_shadow-repose");
+    let text = format!("trap '' INT TERM; exec '{program}' \"$@\"");
+    let mut child = Command::new("sh").args(["-c", &text, "sh"]).args(&args).current_dir(folder).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(100));
+    for signal in ["-INT", "-TERM"] {
+        let _ = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
+    }
+    assert!(child.wait().unwrap().success(), "it ends by itself");
+    assert!(fs::read_to_string(folder.join("run/config.toml")).unwrap().contains("total_steps = 9000"));
+    let refused = crate::support::program(folder, &["train", "--total-steps", "9.5"]);
+    assert_eq!(refused.status.code(), Some(2));
+}
+
+#[test]
+fn l25_a_name_that_is_no_text_is_resumed_as_the_program_says() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let odd = std::ffi::OsStr::from_bytes(b"a \xff\n'x");
+    let mut command = command(folder, &train(&["--total-steps", "100000000", "--stop-after", "50ms", "--run-dir"]));
+    let output = succeeded(command.arg(odd).output().unwrap());
+    let said = stderr(&output);
+    let advice = said.lines().last().unwrap().trim().strip_prefix("shadow-repose ").unwrap();
+    let program = env!("CARGO_BIN_EXE_shadow-repose");
+    // $'…' is bash's.
+    let text = format!("'{program}' {advice} --stop-after 50ms");
+    succeeded(Command::new("bash").args(["-c", &text]).current_dir(folder).output().unwrap());
+    // Its curve is a picture that readers take.
+    let plot = crate::support::command(folder, &["plot"]).arg(odd).output().unwrap();
+    succeeded(plot);
+    let svg = fs::read_to_string(folder.join("learning.svg")).unwrap();
+    assert!(svg.contains("a \u{fffd}\u{fffd}") && !svg.chars().any(|c| c.is_control() && c != '\n'));
+}
+
+/// What a program says on a terminal of this kind and width; `None` where there is no Python to make one.
+fn on_a_terminal(folder: &Path, kind: &str, columns: u32, args: &[&str]) -> Option<String> {
+    let script = "import fcntl, os, pty, struct, sys, termios\n\
+        pid, fd = pty.fork()\n\
+        if pid == 0:\n    \
+            fcntl.ioctl(2, termios.TIOCSWINSZ, struct.pack('HHHH', 24, int(sys.argv[1]), 0, 0))\n    \
+            os.execv(sys.argv[2], sys.argv[2:])\n\
+        while True:\n    \
+            try:\n        data = os.read(fd, 65536)\n    \
+            except OSError:\n        break\n    \
+            if not data:\n        break\n    \
+            os.write(1, data)\n\
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))\n";
+    let mut python = Command::new("python3");
+    python.args(["-c", script, &columns.to_string(), env!("CARGO_BIN_EXE_shadow-repose")]).args(args);
+    python.current_dir(folder).env("TERM", kind).env_remove("DISPLAY").stderr(Stdio::null());
+    let output = python.output().ok()?;
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
+    Some(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+#[test]
+fn m10_plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it_can() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    for (run, (kind, columns, drawn)) in
+        [("dumb", 80, false), ("xterm", 5, false), ("", 80, false), ("xterm", 80, true), ("xterm", 60, true)]
+            .iter()
+            .enumerate()
+    {
+        let run = format!("run-{run}");
+        let args = train(&["--total-steps", "25600", "--run-dir", &run, "--set", "run.eval_every=20"]);
+        let Some(said) = on_a_terminal(folder, kind, *columns, &args) else { return };
+        assert!(said.contains("steps/s") && said.contains("lesson goals"), "{kind} {columns}: {said}");
+        assert_eq!(said.contains("25600 of 25600 steps"), !drawn, "{kind} {columns}: {said}");
+        if *drawn {
+            // Between what moves the cursor.
+            let lines =
+                said.split(['\r', '\n', '\u{1b}']).map(|line| line.split_once('K').map_or(line, |(_, rest)| rest));
+            let lines: Vec<&str> = lines.filter(|line| line.contains("steps/s")).collect();
+            assert!(
+                !lines.is_empty() && lines.iter().all(|line| line.trim_end().len() < *columns as usize),
+                "{lines:?}"
+            );
+            assert_eq!(
+                lines.iter().any(|line| line.contains("drops") && line.contains("eval ")),
+                *columns == 80,
+                "{lines:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_quiet_training_says_its_folder_its_evaluations_and_its_end() {
+    let place = tempfile::tempdir().unwrap();
+    let args = train(&["--total-steps", "256", "--run-dir", "run", "--quiet"]);
+    let said = stderr(&succeeded(program(place.path(), &args)));
+    assert!(said.contains("evaluation of 2 episodes") && said.contains("finished: 2 iterations"), "{said}");
+    assert!(!said.contains("note:") && !said.contains("steps/s"), "{said}");
+    let args = train(&["--total-steps", "256", "--run-dir", "loud"]);
+    let said = stderr(&succeeded(program(place.path(), &args)));
+    assert!(said.contains("note: minibatches of 64 samples") && said.contains("note: run.total_steps = 256"), "{said}");
+}
+
+#[test]
+fn m11_a_training_or_a_score_that_mostly_diverges_says_so() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let sets = ["--set", "env.cube_mass_scale=1e6", "--set", "env.sim_dt=0.01", "--set", "env.friction_scale=1e6"];
+    let heavy = SCENE.replacen("<option", "<option gravity=\"0 0 -1e12\"", 1).replacen("gravity=\"0 0 -9.81\"", "", 1);
+    fs::write(folder.join("heavy.xml"), heavy).unwrap();
+    let args =
+        train(&[&["--total-steps", "384", "--run-dir", "run", "--set", "env.model=heavy.xml"], &sets[..]].concat());
+    let said = stderr(&succeeded(program(folder, &args)));
+    assert_eq!(said.matches("the physics diverged and the episode ended").count(), 1, "{said}");
+    assert!(said.contains("steps of this session diverged"), "{said}");
+    let args = [&SHORT[..], &["--episodes", "4", "--json", "--set", "env.model=heavy.xml"], &sets[..]].concat();
+    let output = succeeded(program(folder, &args));
+    assert!(stderr(&output).contains("warning: in 4 of 4 steps the physics diverged"), "{}", stderr(&output));
+    let score: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(score["diverged"], 4);
+}
+
+#[test]
+fn l14_l15_plot_ends_on_any_file_soon_and_says_little() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let header = "iteration,env_steps,time/collect_s,time/update_s,eval/goals,episode/goals,episode/rot_dist,episode/drop_rate\n";
+    let write = |name: &str, rows: &str| fs::write(folder.join(name), format!("{header}{rows}")).unwrap();
+    write("huge.csv", "1,1,1,1,1.7e308,1,1,1\n2,2,1,1,-1.7e308,1,1,1\n");
+    write("inf.csv", "1,inf,inf,1,1,1,1,1\n2,2,1,1,1,1e30,-1e30,1\n3,1e30,1e30,1,1,1,1,1\n");
+    fs::write(folder.join("one-line.csv"), "{\"a\": 1, ".repeat(400_000)).unwrap();
+    let plot = |more: &[&str]| {
+        let mut command = command(folder, &[&["plot"], more].concat());
+        let mut child = command.stderr(Stdio::piped()).process_group(0).spawn().unwrap();
+        let begun = Instant::now();
+        while child.try_wait().unwrap().is_none() {
+            assert!(begun.elapsed() < Duration::from_secs(20), "{more:?} does not end");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let mut said = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+        (child.wait().unwrap().code(), said)
+    };
+    for file in ["huge.csv", "inf.csv"] {
+        for along in ["steps", "hours"] {
+            let (code, said) = plot(&[file, "--along", along, "--smooth", "1"]);
+            assert!(code == Some(0) && said.len() < 500, "{file}: {said}");
+        }
+    }
+    for file in ["one-line.csv", "/dev/zero"] {
+        let (code, said) = plot(&[file]);
+        assert!(code == Some(1) && said.len() < 500, "{file}: {} characters", said.len());
+    }
+}
