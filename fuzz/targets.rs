@@ -10,14 +10,21 @@ use shadow_repose::config::{Config, Override, Source};
 use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::load;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
+use shadow_repose::run::{self, Progress, Report};
 
 /// Tells whether it accepts what it is given, and whether it does so once the checksum fits, where there is one.
 pub type Target = fn(&[u8]) -> [bool; 2];
 
 /// The targets by their names.
 #[allow(dead_code)]
-pub const TARGETS: [(&str, Target); 4] =
-    [("config", config), ("set", set), ("checkpoint", checkpoint), ("policy", policy)];
+pub const TARGETS: [(&str, Target); 6] = [
+    ("config", config),
+    ("set", set),
+    ("checkpoint", checkpoint),
+    ("policy", policy),
+    ("events", events),
+    ("metrics", metrics),
+];
 
 /// A file of settings.
 pub fn config(data: &[u8]) -> [bool; 2] {
@@ -45,6 +52,7 @@ pub fn checkpoint(data: &[u8]) -> [bool; 2] {
         let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
         // What a training needs besides grows with these, and is the user's to allow.
         (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches, config.ppo.epochs) = (1, 3, 1, 1);
+        config.run.shards = 1;
         let mut agent = Agent::of_task(task, &config)?;
         agent.restore(&mut checkpoint)?;
         checkpoint.take_counters("scene")?;
@@ -70,4 +78,38 @@ pub fn policy(data: &[u8]) -> [bool; 2] {
         Ok(())
     };
     [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]
+}
+
+/// An event file in the folder of a run that is resumed after 1000 steps: is it left whole, or cut?
+pub fn events(data: &[u8]) -> [bool; 2] {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("events.out.tfevents.1700000000.0000001.shadow-repose");
+    std::fs::write(&file, data).unwrap();
+    resume_logs(folder.path());
+    let left = std::fs::read(&file).unwrap();
+    assert!(data.starts_with(&left), "what is left is the beginning of what was there");
+    [left.len() == data.len(); 2]
+}
+
+/// A table of metrics, to be drawn, and to be resumed: can it be drawn?
+pub fn metrics(data: &[u8]) -> [bool; 2] {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("metrics.csv");
+    std::fs::write(&file, data).unwrap();
+    let drawn = run::read_metrics(folder.path(), &["env_steps", "eval/goals"]);
+    if let Err(error) = &drawn {
+        assert!(format!("{error:#}").len() < 500 + folder.path().as_os_str().len(), "{error:#}");
+    }
+    resume_logs(folder.path());
+    // Rows are kept whatever stands in their other columns.
+    if let Ok(kept) = run::read_metrics(folder.path(), &["iteration"]) {
+        assert!(kept[0].iter().all(|&iteration| iteration <= 10.0));
+    }
+    [drawn.is_ok(); 2]
+}
+
+fn resume_logs(folder: &Path) {
+    let mut report = Report::new(folder, &["eval/goals"], Progress::new(1000, 2000, true));
+    report.open_logs(0..10, 1000);
+    report.sync();
 }

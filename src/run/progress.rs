@@ -144,7 +144,7 @@ impl Status {
     fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
         let mut line = match total_steps {
             0..10_000 => format!("{}/{total_steps}", self.env_steps),
-            0..1_000_000 => format!("{:.1}/{:.0}k", self.env_steps as f64 / 1e3, total_steps as f64 / 1e3),
+            10_000..1_000_000 => format!("{:.1}/{:.0}k", self.env_steps as f64 / 1e3, total_steps as f64 / 1e3),
             _ => format!("{:.1}/{:.0}M", self.env_steps as f64 / 1e6, total_steps as f64 / 1e6),
         };
         for part in self.parts(left) {
