@@ -4,11 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 
 use crate::env::{Env, Repose, Task};
 use crate::evaluate::{Actor, Episodes, Moment, Player};
-use crate::run::{self, Bar, FilmFormat, FilmWriter};
+use crate::run::{self, Bar, FilmFormat, FilmWriter, OutputFile};
 use crate::sim::Renderer;
 
 /// A film of episodes that are played one after the other.
@@ -106,6 +106,7 @@ fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
 /// # Errors
 /// No EGL, another name than .png, a place that cannot be written to.
 pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episodes, seconds: f64) -> Result<()> {
+    let output = OutputFile::create(path)?;
     let mut renderer = Renderer::new(task.scene())?;
     let mut player = Player::new(task, episodes);
     for _ in 0..(seconds / task.config().ctrl_dt).round() as u64 {
@@ -115,5 +116,5 @@ pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episod
     }
     let size = renderer.size();
     let picture = renderer.draw(player.env().simulation())?;
-    run::write_png(path, size, picture).with_context(|| format!("no picture in {}", path.display()))
+    run::write_png(output, size, picture)
 }

@@ -59,10 +59,6 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
     if let (Some(output), Some(video)) = (&output, &args.video) {
         ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
     }
-    if args.video.is_some() {
-        // Only a film is worth having if it is interrupted.
-        requests.wait_for_end();
-    }
     let mut observe = |moment: &Moment| {
         pace.observe(moment);
         if let Some(trace) = &mut trace {
@@ -149,6 +145,8 @@ fn film(
     let task = task_to_see(config, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
+    // It is worth having if it is interrupted, as nothing else is that is played.
+    requests.wait_for_end();
     let mut played = Vec::new();
     for first in all.first..all.first + all.count {
         let one = Episodes { first, count: 1, ..all };

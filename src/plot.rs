@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Result, ensure};
 
 use crate::cli::{Along, PlotArgs};
-use crate::run::{self, Chart, Curve, Panel};
+use crate::run::{self, Chart, Curve, OutputFile, Panel};
 
 /// What is drawn when nothing else is asked for: the headline, and what explains it.
 const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];
@@ -19,7 +19,8 @@ const SIZE: [u32; 2] = [800, 260];
 /// # Errors
 /// No run with metrics that can be read, have the columns and a row; a picture that cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
-    run::expect_folder(&args.out)?;
+    // Opened before anything is read: a place that cannot be written to is known at once.
+    let output = OutputFile::create(&args.out)?;
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
     let mut panels: Vec<Panel> =
@@ -52,7 +53,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         Along::Hours => "hours of collecting and learning",
     };
     let size = args.size.unwrap_or([SIZE[0], SIZE[1] * panels.len() as u32]);
-    Chart { along: along.to_owned(), panels, size }.write(&args.out)?;
+    Chart { along: along.to_owned(), panels, size }.write(output)?;
     run::say(&format!("{}: {drawn} runs", args.out.display()));
     Ok(())
 }

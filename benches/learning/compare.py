@@ -24,7 +24,6 @@ class Log:
         with (path / "metrics.csv").open(newline="") as file:
             self.rows = list(csv.DictReader(file))
         self.steps = [int(row["env_steps"]) for row in self.rows]
-        self.seed = path.name
         text = path / "config.toml"
         self.progress_reward = tomllib.loads(text.read_text())["training"]["progress_reward"]
         seconds = [float(row["time/collect_s"]) + float(row["time/update_s"]) for row in self.rows]
@@ -41,7 +40,9 @@ class Log:
             return math.nan
         # rad in a hundred steps: training/progress is what is paid for it.
         column, scale = ("training/progress", 100) if metric == "turned" else (metric, 1)
-        scale = scale / self.progress_reward if metric == "turned" and self.progress_reward else scale
+        if metric == "turned" and self.progress_reward == 0:
+            return math.nan
+        scale = scale / self.progress_reward if metric == "turned" else scale
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
         rows = zip(self.steps[:end], self.rows)
         known = [(steps, float(row[column])) for steps, row in rows if row.get(column) not in ("", "NaN", None)]
@@ -59,8 +60,12 @@ class Log:
 
 def fails(rule, base, variant, window):
     """Why a rule stops a variant, or None: its metric is below (or above) that share of the base's in all seeds."""
-    pairs = [[log.value(rule["metric"], rule["at"], window) for log in both] for both in zip(base, variant)]
-    ratios = [ours / theirs if theirs else math.nan for theirs, ours in pairs]
+    shared = sorted(set(base) & set(variant))
+    pairs = [[log.value(rule["metric"], rule["at"], window) for log in (base[seed], variant[seed])] for seed in shared]
+    # Of what is not above zero there are no shares.
+    ratios = [ours / theirs if theirs > 0 else math.nan for theirs, ours in pairs]
+    if not ratios:
+        return None
     below = "below" in rule and all(ratio < rule["below"] for ratio in ratios)
     above = "above" in rule and all(ratio > rule["above"] for ratio in ratios)
     if not (below or above):
@@ -88,7 +93,7 @@ def cell(pairs, digits, is_base):
 
 def tables(experiment):
     """Markdown: a table for each milestone that the base has reached, at equal steps; and the same at equal time."""
-    logs = {name: {log.seed: log for log in experiment.logs(name)} for name in experiment.runs_of}
+    logs = {name: experiment.logs(name) for name in experiment.runs_of}
     text = ""
     for at in experiment.milestones:
         base = {seed: log for seed, log in logs["base"].items() if log.steps and log.steps[-1] >= at}
@@ -134,7 +139,9 @@ def publish(experiment, folder):
             found.append(folder / f"{run.variant}-{run.seed}")
             subprocess.run([sys.executable, THIN, run.path, found[-1] / "metrics.csv"], check=True)
     shutil.copyfile(experiment.file, folder / "experiment.toml")
-    draw(experiment.program, found, folder / "picture.svg", smooth=1)
+    if experiment.config:
+        shutil.copyfile(experiment.config, folder / pathlib.Path(experiment.config).name)
+    draw(experiment.drawer(), found, folder / "picture.svg", smooth=1)
     version = (experiment.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
     machine = f"{datetime.date.today()}, {processor()}, {experiment.runs} runs at a time, threads of each: {experiment.threads}"
     facts = f"{machine}.\nProgram: {version}."

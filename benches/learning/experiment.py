@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,7 +30,10 @@ class Experiment:
     """What the file says, with the runs of it in a folder."""
 
     def __init__(self, file, folder, program):
-        self.file, self.folder, self.program = file, folder, program
+        self.file, self.folder = file, folder
+        # Of its own, so that one that is built meanwhile does not take over in the middle.
+        self.program = folder / "program"
+        self.copied_from = program
         given = tomllib.loads(file.read_text())
         unknown = set(given) - set(DEFAULTS) - {"steps"}
         if unknown or "steps" not in given:
@@ -51,6 +55,9 @@ class Experiment:
         for seed in self.seeds if self.fork else []:
             if not pathlib.Path(self.fork.format(seed=seed)).is_file():
                 sys.exit(f"{self.fork.format(seed=seed)}: there is no such checkpoint")
+        begun = max((steps_of(pathlib.Path(self.fork.format(seed=seed))) for seed in self.seeds), default=0) if self.fork else 0
+        if early := [rule for rule in self.stop if rule["at"] <= begun]:
+            sys.exit(f"{file}: trainings begin at {begun:,} steps; there is nothing to judge by before: {early[0]}")
         # Where trainings pause: to be judged, or for a copy of their checkpoint.
         self.pauses = {rule["at"] for rule in self.stop} | set(self.keep)
         self.runs_of = {name: [Run(self, name, seed) for seed in self.seeds] for name in ["base", *self.variants]}
@@ -73,7 +80,16 @@ class Experiment:
         return None
 
     def logs(self, name):
-        return [compare.Log(run.path) for run in self.runs_of[name] if (run.path / "metrics.csv").exists()]
+        return {run.seed: compare.Log(run.path) for run in self.runs_of[name] if (run.path / "metrics.csv").exists()}
+
+    def drawer(self):
+        """What draws the picture: the program of the experiment, or before there is one, that of the user."""
+        return self.program if self.program.exists() else self.copied_from
+
+    def copy_program(self):
+        if not self.program.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(self.copied_from, self.program)
 
 
 class Run:
@@ -102,6 +118,11 @@ class Run:
             return steps_of(found[-1])
         return steps_of(pathlib.Path(self.fork)) if self.fork else 0
 
+    def steps_per_iteration(self):
+        progress = progress_of(self.checkpoints()[-1])
+        begun = progress.get("fork", {"iteration": 0, "env_steps": 0})
+        return (progress["env_steps"] - begun["env_steps"]) // max(progress["iteration"] - begun["iteration"], 1)
+
     def pause(self):
         """Where it pauses next; None at its end."""
         position = self.position()
@@ -119,8 +140,10 @@ class Run:
 
     def keep_copy(self):
         """Copies the checkpoint of a pause that it is at, if the copy is wanted and not there."""
+        if not self.checkpoints():
+            return
         position = self.position()
-        passed = [at for at in self.pauses if at <= position]
+        passed = [at for at in self.pauses if at <= position < at + self.steps_per_iteration()]
         if not passed or passed[-1] not in self.experiment.keep:
             return
         copy = self.experiment.folder / "kept" / f"{self.variant}-{self.seed}-{passed[-1]}.safetensors"
@@ -144,13 +167,16 @@ class Run:
         config = pathlib.Path(of.config).read_text() if of.config else None
         settings = {"fork": self.fork, "config": config, "set": self.set}
         record = self.path.with_suffix(".json")
-        if not record.exists():
-            record.parent.mkdir(parents=True, exist_ok=True)
-            record.write_text(json.dumps(settings, indent=1))
-        elif json.loads(record.read_text()) != settings:
+        if not record.exists() and self.path.exists():
+            sys.exit(f"{self.path}: there is a run, and nothing says with which settings it was begun; name another folder")
+        if record.exists() and json.loads(record.read_text()) != settings:
             sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; name another folder")
+        return record, settings
 
     def start(self):
+        record, settings = self.expect_settings()
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.write_text(json.dumps(settings, indent=1))
         self.wait_until_free()
         if self.path.exists() and not self.checkpoints():
             # Killed before it had saved anything.
@@ -165,9 +191,13 @@ class Run:
 
 def steps_of(checkpoint):
     """The control steps that a training had made when it wrote this file."""
+    return progress_of(checkpoint)["env_steps"]
+
+
+def progress_of(checkpoint):
     with checkpoint.open("rb") as file:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-    return json.loads(header["__metadata__"]["progress"])["env_steps"]
+    return json.loads(header["__metadata__"]["progress"])
 
 
 def at_low_priority():
@@ -188,6 +218,9 @@ def train(experiment):
     """Trains all runs as far as they are to go. True if none failed."""
     for run in experiment.all_runs():
         run.expect_settings()
+        # One that came to a pause when this program was killed.
+        run.keep_copy()
+    experiment.copy_program()
     said, at_work = set(), {}
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
@@ -211,7 +244,7 @@ def train(experiment):
                 elif verdict != "waits" and run.variant not in said:
                     said.add(run.variant)
                     say(f"{run.variant} is stopped: {verdict}")
-            # The base first, since the others are judged by it; then who is least far, so that all can be compared early.
+            # The one that has come least far first, so that all can be compared early; the base before those that it judges.
             ready.sort(key=lambda run: (run.pause(), run.variant != "base"))
             for run in ready[:experiment.runs - len(at_work)]:
                 run.keep_copy()
@@ -244,13 +277,17 @@ def main():
     if not args.file.is_file() or not args.program.is_file():
         sys.exit(f"{args.program if args.file.is_file() else args.file}: there is no such file")
     experiment = Experiment(args.file, args.folder.resolve(), args.program.resolve())
-    whole = args.table or args.publish is not None or train(experiment)
+    only_looks = args.table or args.publish is not None
+    if only_looks:
+        for run in experiment.all_runs():
+            run.expect_settings()
+    whole = only_looks or train(experiment)
     print(compare.tables(experiment))
     runs = [run.path for run in experiment.all_runs() if (run.path / "metrics.csv").exists()]
     if args.publish:
         compare.publish(experiment, args.publish)
     elif runs:
-        compare.draw(experiment.program, runs, experiment.folder / "picture.svg", smooth=25)
+        compare.draw(experiment.drawer(), runs, experiment.folder / "picture.svg", smooth=25)
     return 0 if whole else 1
 
 

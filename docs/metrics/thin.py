@@ -21,7 +21,7 @@ def numbers(rows, column):
 def main(run, table):
     rows = list(csv.DictReader(open(Path(run) / "metrics.csv")))
     # A fork begins later than at nothing.
-    length = int(rows[1]["env_steps"]) - int(rows[0]["env_steps"])
+    length = int(rows[1]["env_steps"]) - int(rows[0]["env_steps"]) if len(rows) > 1 else 0
     groups, begun = [[]], int(rows[0]["env_steps"]) - length
     for row in rows:
         groups[-1].append(row)

@@ -345,8 +345,11 @@ mod tests {
                 "env.goal_position=[1e3,0,0]",
                 "env.goal_position = [1000.0, 0.0, 0.0]: must have coordinates of at most 100 m",
             ),
-            ("env.vel_obs_scale=1e300", "must be at most 1000000 in size"),
-            ("training.drop_reward.to=-1e7", "training.drop_reward = -10000000: must be at most 1000000 in size"),
+            ("env.vel_obs_scale=1e300", "must be at most 1000000"),
+            (
+                "training.drop_reward.to=-1e10",
+                "training.drop_reward = -10000000000: must be at most 1000000000 in size",
+            ),
             ("env.act_moving_average=0", "must be above 0"),
             ("env.num_hand_dofs=23", "must be 24, the task is laid out for it"),
             ("env.num_actuators=24", "must be 20, the task is laid out for it"),

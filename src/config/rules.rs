@@ -32,10 +32,12 @@ const AT_MOST: &[(&str, f64)] = &[
     ("run.threads", 4096.0),
     // A rotation error is never larger.
     ("env.success_tolerance", PI),
+    // Of what is observed, squares are taken in floats.
+    ("env.vel_obs_scale", 1e6),
 ];
 
-/// The largest size of a number of the task or the training that is no count: beyond it sums of squares in floats end.
-const LARGEST: f64 = 1e6;
+/// The largest size of a number of the task or the training that is no count: what comes near it was not meant.
+const LARGEST: f64 = 1e9;
 
 /// The largest coordinate of the goal, m: everything near it is measured in floats.
 const FARTHEST: f64 = 100.0;

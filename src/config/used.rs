@@ -5,6 +5,7 @@ use toml::Table;
 
 use super::BASE;
 use super::layers::Override;
+use super::overlay::table_of;
 
 /// The commands that take settings.
 const COMMANDS: [&str; 4] = ["train", "bench", "play", "view"];
@@ -25,15 +26,17 @@ const FEWER: [(&str, &[&str]); 5] = [
 pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
     let base: Table = BASE.parse().expect("our own settings are TOML");
     for Override { key, value } in overrides {
-        let mut parts = key.splitn(3, '.');
-        let (section, name) = (parts.next().unwrap_or_default(), parts.next().unwrap_or_default());
-        // What is unknown is answered with what is known, elsewhere.
-        let known = base.get(section).and_then(|keys| keys.get(name)).is_some();
-        let users = users(section, name);
-        if known && !users.contains(&command) {
-            let does = if users.len() == 1 { "does" } else { "do" };
-            let users = users.join("` and `");
-            bail!("--set {key}={value}: `{command}` does not use {section}.{name}; `{users}` {does}");
+        let table = table_of(key, value, &base);
+        let in_sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
+        for (section, name) in in_sections.flat_map(|(section, keys)| keys.keys().map(move |name| (section, name))) {
+            // What is unknown is answered with what is known, elsewhere.
+            let known = base.get(section).and_then(|keys| keys.get(name)).is_some();
+            let users = users(section, name);
+            if known && !users.contains(&command) {
+                let does = if users.len() == 1 { "does" } else { "do" };
+                let users = users.join("` and `");
+                bail!("--set {key}={value}: `{command}` does not use {section}.{name}; `{users}` {does}");
+            }
         }
     }
     Ok(())
@@ -59,6 +62,8 @@ mod tests {
             ("run.threads=3", "view", "`train` and `bench` do"),
             ("training.tolerance.to=1", "play", "`train` and `bench` do"),
             ("run.total_steps=3", "bench", "`train` does"),
+            ("ppo={gamma=0.5}", "play", "`train` and `bench` do"),
+            ("env={num_envs=9}", "view", "`train` and `bench` do"),
         ] {
             let refusal = answer(set, command).unwrap_err();
             assert!(refusal.contains(&format!("`{command}` does not use")) && refusal.contains(users), "{refusal}");

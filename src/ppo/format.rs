@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 
-use anyhow::{Context, Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 /// The metadata key of the checksum.
@@ -68,17 +68,13 @@ impl Content {
     /// Reads the bytes of a file.
     ///
     /// # Errors
-    /// [`Damaged`]: bytes that were not written by [`Content::to_bytes`] or have been changed since.
+    /// Bytes that were not written by [`Content::to_bytes`]; [`Damaged`] where they have been changed since.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
-        Self::read(bytes).map_err(|error| Damaged(format!("{error:#}")).into())
-    }
-
-    fn read(bytes: &[u8]) -> Result<Self> {
         let (mut texts, views) = read(bytes)?;
         let stored =
             texts.remove(CHECKSUM).context("no checksum: not a file of this program, or of an older version")?;
         let found = checksum(&texts, &views);
-        ensure!(stored == found, "damaged: its checksum is {found}, it should be {stored}");
+        ensure!(stored == found, Damaged(format!("damaged: its checksum is {found}, it should be {stored}")));
         let mut arrays = BTreeMap::new();
         for (name, view) in views {
             let array = Array::read(&view).with_context(|| format!("tensor `{name}`"))?;
@@ -108,12 +104,12 @@ fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) ->
 type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
 
 fn read(bytes: &[u8]) -> Result<Raw<'_>> {
-    let whole = |error| anyhow!("not a whole safetensors file ({error}); it may be cut off");
+    let whole = |error| Damaged(format!("not a whole safetensors file ({error}); it may be cut off"));
     if let Some(length) = bytes.first_chunk() {
         let length = u64::from_le_bytes(*length);
         ensure!(
             length <= LARGEST_HEADER,
-            "not a file of this program: its header would have {length} bytes, at most {LARGEST_HEADER} are read"
+            Damaged(format!("its header would have {length} bytes, at most {LARGEST_HEADER} are read"))
         );
     }
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;

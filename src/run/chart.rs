@@ -1,7 +1,5 @@
 //! A picture with curves in panels, one above the other: SVG, or PNG where pictures are built in.
 
-use std::path::Path;
-
 use anyhow::{Result, anyhow, bail};
 use plotters::coord::Shift;
 use plotters::element::DashedPathElement;
@@ -63,28 +61,29 @@ impl Chart {
     ///
     /// # Errors
     /// Another format, a place that cannot be written to, a picture too small for its panels.
-    pub fn write(&self, path: &Path) -> Result<()> {
+    pub fn write(&self, output: OutputFile) -> Result<()> {
         let [width, height] = self.size;
         #[cfg(feature = "video")]
         {
             // Where pictures are built in, letters are measured also for SVG. A second time has no effect.
             let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
         }
-        match path.extension().and_then(|extension| extension.to_str()) {
+        let extension = output.path().extension().and_then(|extension| extension.to_str()).map(str::to_owned);
+        match extension.as_deref() {
             Some("svg") => {
                 let mut text = String::new();
                 self.draw(SVGBackend::with_string(&mut text, (width, height)).into_drawing_area())?;
-                OutputFile::create(path)?.finish(text.as_bytes())
+                output.finish(text.as_bytes())
             }
             #[cfg(feature = "video")]
             Some("png") => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
                 self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
-                super::write_png(path, self.size, &rgb)
+                super::write_png(output, self.size, &rgb)
             }
             #[cfg(not(feature = "video"))]
-            Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", path.display()),
-            _ => bail!("{}: the name of a chart must end in .svg or .png", path.display()),
+            Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display()),
+            _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
         }
     }
 
@@ -150,7 +149,7 @@ mod tests {
         let chart = Chart { along: "steps".into(), panels: vec![panel], size: [600, 500] };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
-        chart.write(&path).unwrap();
+        chart.write(OutputFile::create(&path).unwrap()).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
         // The first and the eighth have one colour: two solid lines, one of them in the legend, and the eighth's dashes.
         let lines = |colour: RGBColor| {
@@ -170,7 +169,7 @@ mod tests {
         let chart = Chart { along: "steps".into(), panels: vec![panel("a", 5.0), panel("b", 20.0)], size: [600, 500] };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
-        chart.write(&path).unwrap();
+        chart.write(OutputFile::create(&path).unwrap()).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
         assert_eq!(svg.lines().filter(|line| line.trim() == "20.0").count(), 2, "{svg}");
     }

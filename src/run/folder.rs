@@ -1,5 +1,6 @@
 //! The folder of a run and what lies in it.
 
+use std::ffi::OsString;
 use std::fs::{self, DirEntry};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -20,12 +21,13 @@ const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
 const DIVERGED: &str = "diverged";
 /// How the names of a run's files begin.
-const OURS: [&[u8]; 8] = [
+const OURS: [&[u8]; 9] = [
     b"config.toml",
     b"version.txt",
     b"policy.safetensors",
     b"run.lock",
-    b"metrics.",
+    b"metrics.csv",
+    b"metrics.before-",
     b"events.out.",
     b"checkpoints",
     b"diverged",
@@ -65,17 +67,19 @@ impl RunFolder {
 
     /// Makes sure that nothing of a run is in the folder, `but` for this, and that it is not a folder of one.
     fn expect_free(&self, but: Option<&str>) -> Result<()> {
-        let taken =
-            self.entries()?.into_iter().map(|entry| entry.file_name()).find(|name| but.is_none_or(|but| name != but));
-        if let Some(name) = taken {
+        let mut names = self.entries()?.into_iter().map(|entry| entry.file_name());
+        // A trace that was never finished is not of a run.
+        let of_a_run = |name: &OsString| !name.as_encoded_bytes().starts_with(OUR_PARTIAL.as_bytes());
+        if let Some(name) = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but)) {
             bail!(
                 "{} already holds a run, or a part of one ({}); resume it with --resume, or name another folder",
                 self.path.display(),
                 name.to_string_lossy()
             );
         }
-        let there = self.path.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
-        let above = there.ancestors().skip(usize::from(self.path.exists()));
+        let whole = std::path::absolute(&self.path).with_context(|| format!("cannot find {}", self.path.display()))?;
+        let there = whole.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
+        let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self { path: path.to_owned() }) {
             let holds_a_run = folder.checkpoints().begun() || folder.path.join(LOCK).exists();
             ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
@@ -91,6 +95,16 @@ impl RunFolder {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
         let context = || format!("cannot create a folder in {}", std::env::temp_dir().display());
         Ok(Self { path: folder.with_context(context)?.keep() })
+    }
+
+    /// Removes what a run that could not begin has made in its folder, and the folder if nothing else is in it.
+    pub fn clear(&self) {
+        for entry in self.entries().into_iter().flatten() {
+            let _ = fs::remove_file(entry.path());
+        }
+        for folder in [self.checkpoints().folder(), &self.path] {
+            let _ = fs::remove_dir(folder);
+        }
     }
 
     /// Removes a folder in which nothing could be saved.
@@ -363,6 +377,10 @@ mod tests {
             assert!(RunFolder::create(Some(&folder), None).is_err());
         }
         let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
+        let here = std::env::current_dir().unwrap();
+        let up: PathBuf = here.ancestors().skip(1).map(|_| "..").collect();
+        let relative = up.join(run.path.strip_prefix("/").unwrap()).join("new");
+        assert!(RunFolder::create(Some(&relative), None).is_err() && !relative.exists());
         for inside in ["checkpoints", "new/deeper"] {
             let refusal = RunFolder::create(Some(&run.path.join(inside)), None).unwrap_err().to_string();
             assert!(refusal.contains("lies inside the run") && !run.path.join("new").exists(), "{refusal}");

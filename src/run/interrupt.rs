@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGXFSZ};
 use signal_hook::iterator::Signals;
-use signal_hook::low_level::exit;
+use signal_hook::low_level::{emulate_default_handler, exit};
 
 use super::output::remove_unfinished;
 
@@ -54,7 +54,7 @@ impl Requests {
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
         let listener = thread::Builder::new().name("signals".into());
-        listener.spawn(move || shared.take(&mut signals)).context("cannot start a thread for signals")?;
+        listener.spawn(move || shared.take(&mut signals, saves)).context("cannot start a thread for signals")?;
         Ok(requests)
     }
 
@@ -63,7 +63,7 @@ impl Requests {
         self.patient.store(true, Ordering::Relaxed);
     }
 
-    fn take(&self, signals: &mut Signals) {
+    fn take(&self, signals: &mut Signals, saves: bool) {
         let mut first: Option<Instant> = None;
         for signal in signals.forever() {
             if signal == SIGUSR1 {
@@ -74,6 +74,10 @@ impl Requests {
             let again = first.is_some_and(|first| first.elapsed() > together);
             if again || !self.patient.load(Ordering::Relaxed) {
                 remove_unfinished();
+                if !saves {
+                    // As a program that never caught it: who started it sees what ended it.
+                    let _ = emulate_default_handler(signal);
+                }
                 exit(128 + signal);
             }
             if first.is_none() {

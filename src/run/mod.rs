@@ -97,7 +97,10 @@ const MOST_THREADS: usize = 16;
 pub fn start_threads(threads: usize) -> Result<()> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let most = MOST_THREADS * cores;
-    ensure!(threads <= most, "{threads} worker threads: at most {most} on the {cores} cores of this machine");
+    ensure!(
+        threads <= most,
+        "{threads} worker threads: at most {most} here, {MOST_THREADS} for each core; --threads sets them"
+    );
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
     // Its text has the one of its source in it.
     pool.build_global().map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))

@@ -3,12 +3,13 @@
 //! No two programs share such a name, and what is unfinished when the program ends is removed.
 
 use std::collections::BTreeSet;
+use std::collections::hash_map::RandomState;
 use std::fs::{self, File, OpenOptions};
+use std::hash::{BuildHasher, Hasher};
 use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -24,9 +25,6 @@ pub const OUR_PARTIAL: &str = ".shadow-repose-";
 
 /// The most links that are followed from one to the next.
 const MOST_LINKS: usize = 40;
-
-/// The number of the next unfinished file.
-static NEXT: AtomicU64 = AtomicU64::new(0);
 
 /// What this process has not finished.
 static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
@@ -47,8 +45,9 @@ impl Unfinished {
 
     /// Something in the folder of a file that it is to become, under a name that nothing else has.
     pub fn beside(path: &Path) -> Self {
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{number}.{PARTIAL}", std::process::id())))
+        // Processes on several machines may have one number.
+        let chance = RandomState::new().build_hasher().finish();
+        Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.{PARTIAL}", std::process::id())))
     }
 
     /// Where it is.
@@ -131,17 +130,9 @@ impl OutputFile {
 
     fn named(path: &Path, target: PathBuf) -> Result<Self> {
         expect_folder(&target)?;
-        loop {
-            let unfinished = Unfinished::beside(&target);
-            match File::create_new(unfinished.path()) {
-                // Of a process of before, or of another machine, with the same number.
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => std::mem::forget(unfinished),
-                file => {
-                    let file = file.with_context(|| format!("cannot write {}", path.display()))?;
-                    return Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) });
-                }
-            }
-        }
+        let unfinished = Unfinished::beside(&target);
+        let file = File::create_new(unfinished.path()).with_context(|| format!("cannot write {}", path.display()))?;
+        Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) })
     }
 
     /// Writes the content and gives the file its name.

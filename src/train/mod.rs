@@ -60,14 +60,20 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
         hints(&session.config, &Config::resolve(None, &[])?).iter().for_each(|hint| run::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
-    if !saver.resumes() {
-        saver.begin(&mut report)?;
+    if !saver.resumes()
+        && let Err(error) = saver.begin(&mut report)
+    {
+        saver.folder().clear();
+        return Err(error);
     }
     while !session.finished() {
         match session.iterate(requests.stop(), &report) {
             Ok(Some(made)) => {
                 saver.take(session.checkpoint());
-                saver.begin(&mut report)?;
+                if let Err(error) = saver.begin(&mut report) {
+                    report.finish();
+                    return Err(saver.elsewhere(error));
+                }
                 if args.dump_diverged {
                     session.dump_diverged(saver.folder(), &report);
                 }
@@ -77,7 +83,10 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
                 session.count_divergence();
                 return stop(saver, &mut report, requests);
             }
-            Err(error) => return Err(give_up(error, saver, &mut report)),
+            Err(error) => {
+                session.count_divergence();
+                return Err(give_up(error, saver, &mut report));
+            }
         }
         let due = session.agent.iteration.is_multiple_of(session.config.run.checkpoint_every);
         if (requests.take_save() || due)
@@ -87,7 +96,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
             report.warn(&format!("{error:#}; it is tried again at the next checkpoint"));
         }
     }
-    let _ = saver.save_at_last(&mut report)?;
+    saver.save_at_last(&mut report)?;
     session.count_divergence();
     run::say(&format!("finished: {}; {place}", saver.steps_made()));
     Ok(Outcome::Finished)
@@ -185,16 +194,21 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
 
 /// Saves the end of the last iteration, when it was asked to stop.
 fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<Outcome> {
-    let _ = saver.save_at_last(report)?;
-    run::say(&format!("stopped after {}; go on with", saver.steps_made()));
-    run::say(&format!("  {}", saver.how_to_resume()));
+    saver.save_at_last(report)?;
+    if saver.has_begun() {
+        run::say(&format!("stopped after {}; go on with", saver.steps_made()));
+        run::say(&format!("  {}", saver.how_to_resume()));
+    } else {
+        run::say("stopped before its first iteration: the run is as it was; the same command goes on");
+    }
     Ok(Outcome::Stopped(requests.exit_code()))
 }
 
 /// Saves the end of the last iteration before the one that failed.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
     match saver.save_at_last(report) {
-        Ok(saved) => run::say(&saved),
+        Ok(()) if saver.has_begun() => run::say(&format!("saved the state after {}", saver.steps_made())),
+        Ok(()) => run::say("nothing was changed in the folder of the run"),
         Err(error) => run::say(&format!("error: {error:#}")),
     }
     error

@@ -33,8 +33,8 @@ pub struct Saver {
     options: String,
     end: Arc<Checkpoint>,
     begin: Begin,
-    /// Where it was taken up.
-    begun_at: Progress,
+    /// What it was taken up with.
+    start: Arc<Checkpoint>,
     /// The folder is this training's to write into.
     begun: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
@@ -53,9 +53,9 @@ impl Saver {
     ) -> Self {
         // The newest, and one in case it is damaged.
         let keep = keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
-        let (lock, begun_at) = (Some(lock), end.progress.clone());
-        let (end, begun, best) = (Arc::new(end), false, None);
-        let saver = Self { folder, lock, keep, options, end, begin, begun_at, begun, best, best_is_saved: true };
+        let (lock, end) = (Some(lock), Arc::new(end));
+        let (start, begun, best) = (end.clone(), false, None);
+        let saver = Self { folder, lock, keep, options, end, begin, start, begun, best, best_is_saved: true };
         saver.save_before_fatal_errors();
         saver
     }
@@ -68,6 +68,11 @@ impl Saver {
     /// Whether it goes on in the folder of a run.
     pub fn resumes(&self) -> bool {
         self.begin != Begin::New
+    }
+
+    /// Whether it has written into the folder.
+    pub fn has_begun(&self) -> bool {
+        self.begun
     }
 
     /// How far the training has come.
@@ -85,8 +90,8 @@ impl Saver {
         self.save_before_fatal_errors();
     }
 
-    /// Makes the folder that of this training, if it is not yet: a checkpoint that can be resumed whatever happens then, logs that
-    /// hold nothing newer, the settings. In this order, so that a run that is killed between them is one that can be resumed.
+    /// Writes into the folder for the first time, if it was not done yet: the checkpoint that the training starts from, as the newest;
+    /// logs that hold nothing after it; the settings. In this order, so that a run that is killed between them can be resumed.
     ///
     /// # Errors
     /// A folder that cannot be written to.
@@ -94,17 +99,22 @@ impl Saver {
         if self.begun {
             return Ok(());
         }
-        self.lock = self.lock.take().map(|lock| self.folder.claim(lock)).transpose()?;
+        let lock = match self.lock.take().filter(Locked::holds) {
+            Some(lock) => lock,
+            // The folder was deleted during the first iteration.
+            None => self.folder.lock()?,
+        };
+        self.lock = Some(self.folder.claim(lock)?);
         let best = self.folder.checkpoints().best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
             let aside = self.folder.checkpoints().put_best_aside()?;
             report.warn(&format!("{} is damaged; it is now {}", best.display(), aside.display()));
         }
-        if self.begin != Begin::FromNewest {
-            self.write()?;
+        if self.begin != Begin::FromNewest || self.folder.checkpoints().newest_first().is_empty() {
+            write(&self.folder, None, &self.start, self.keep)?;
         }
-        let first = self.begun_at.fork.as_ref().map_or(0, |fork| fork.iteration);
-        report.open_logs(first..self.begun_at.iteration, self.begun_at.env_steps);
+        let Progress { iteration, env_steps, fork, .. } = &self.start.progress;
+        report.open_logs(fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration, *env_steps);
         self.describe()?;
         self.begun = true;
         self.save_before_fatal_errors();
@@ -140,19 +150,20 @@ impl Saver {
         write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.end, self.keep)
     }
 
-    /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report; tells what is saved.
+    /// The same when there is no next time: where it cannot be, it is tried elsewhere. Ends the report. Before the first iteration
+    /// of a run that is resumed there is nothing to save.
     ///
     /// # Errors
     /// A folder that cannot be written to; the message says where the state is instead.
-    pub fn save_at_last(&mut self, report: &mut Report) -> Result<String> {
-        if !self.begun {
-            report.finish();
-            return Ok(format!("{} is as it was, after {}", self.folder.path().display(), self.steps_made()));
-        }
-        let saved = self.save(report);
+    pub fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
+        let saved = if self.begun { self.save(report) } else { Ok(()) };
         report.finish();
-        saved.map_err(|error| elsewhere(error, self.best.as_deref(), &self.end, &self.options))?;
-        Ok(format!("saved the state after {}", self.steps_made()))
+        saved.map_err(|error| self.elsewhere(error))
+    }
+
+    /// Saves a state that could not be saved in its place for this reason elsewhere; what there is to say of both.
+    pub fn elsewhere(&self, reason: Error) -> Error {
+        elsewhere(reason, self.best.as_deref(), &self.end, &self.options)
     }
 
     /// The command that goes on with this training.
@@ -171,8 +182,10 @@ impl Saver {
             run::say(&format!("error: {whose}MuJoCo cannot go on: {said}"));
             let replaced = || anyhow!("{} has been replaced", folder.path().display());
             let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
-            let saved = held.and_then(|()| if begun { write(&folder, best.as_deref(), &end, keep) } else { Ok(()) });
-            match saved {
+            if !begun {
+                return run::say("nothing was changed in the folder of the run");
+            }
+            match held.and_then(|()| write(&folder, best.as_deref(), &end, keep)) {
                 Ok(()) => {
                     let iteration = end.progress.iteration;
                     let command = how_to_resume(folder.path(), &options);

@@ -1,9 +1,9 @@
 //! What the program writes where the user says, and what it says on the terminal.
 
 use std::fs;
-use std::io::Read;
+use std::io::{BufRead, BufReader, Read};
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::process::CommandExt;
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -52,8 +52,9 @@ fn m6_a_result_that_cannot_be_printed_is_an_error() {
         assert_eq!(output.status.code(), Some(1), "{args:?}");
         assert!(stderr(&output).contains("cannot write to stdout"), "{args:?}: {}", stderr(&output));
         // A reader that has seen enough is none.
-        let output = shell(folder, "", args, "| true");
-        assert!(output.status.success() && stderr(&output).is_empty(), "{args:?}: {}", stderr(&output));
+        let output = shell(folder, "{ ", args, "; echo $? > code; } | true");
+        assert!(stderr(&output).is_empty(), "{args:?}: {}", stderr(&output));
+        assert_eq!(fs::read_to_string(folder.join("code")).unwrap(), "0\n", "{args:?}");
     }
 }
 
@@ -93,7 +94,7 @@ fn l16_one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
 fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
-    for (signal, code) in [("TERM", 143), ("INT", 130), ("HUP", 129)] {
+    for (signal, number) in [("TERM", 15), ("INT", 2), ("HUP", 1)] {
         let args = ["play", "--policy", "random", "--headless", "--episodes", "100000", "--trace", "trace"];
         let mut child = command(folder, &args).stderr(Stdio::null()).spawn().unwrap();
         let begun = Instant::now();
@@ -103,7 +104,8 @@ fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
         assert!(
             Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
         );
-        assert_eq!(child.wait().unwrap().code(), Some(code));
+        // As a program that catches nothing; a shell calls it 128 and the signal's number.
+        assert_eq!(child.wait().unwrap().signal(), Some(number));
         assert_eq!(names(folder), [""; 0], "{signal}");
     }
 }
@@ -126,12 +128,17 @@ fn l25_signals_that_are_ignored_at_the_start_stay_ignored_and_steps_may_be_writt
     let args = train(&["--total-steps", "9e3", "--run-dir", "run"]);
     let program = env!("CARGO_BIN_EXE_shadow-repose");
     let text = format!("trap '' INT TERM; exec '{program}' \"$@\"");
-    let mut child = Command::new("sh").args(["-c", &text, "sh"]).args(&args).current_dir(folder).spawn().unwrap();
-    std::thread::sleep(Duration::from_millis(100));
+    let mut shell = Command::new("sh");
+    let mut child =
+        shell.args(["-c", &text, "sh"]).args(&args).current_dir(folder).stderr(Stdio::piped()).spawn().unwrap();
+    let mut said = BufReader::new(child.stderr.take().unwrap()).lines();
+    while !said.next().unwrap().unwrap().contains("run folder") {}
+    let rest = std::thread::spawn(move || said.for_each(drop));
     for signal in ["-INT", "-TERM"] {
         let _ = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
     }
     assert!(child.wait().unwrap().success(), "it ends by itself");
+    rest.join().unwrap();
     assert!(fs::read_to_string(folder.join("run/config.toml")).unwrap().contains("total_steps = 9000"));
     let refused = crate::support::program(folder, &["train", "--total-steps", "9.5"]);
     assert_eq!(refused.status.code(), Some(2));
@@ -189,7 +196,10 @@ fn m10_plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it
     {
         let run = format!("run-{run}");
         let args = train(&["--total-steps", "25600", "--run-dir", &run, "--set", "run.eval_every=20"]);
-        let Some(said) = on_a_terminal(folder, kind, *columns, &args) else { return };
+        let Some(said) = on_a_terminal(folder, kind, *columns, &args) else {
+            eprintln!("not tested: there is no Python to make a terminal");
+            return;
+        };
         assert!(said.contains("steps/s") && said.contains("lesson goals"), "{kind} {columns}: {said}");
         assert_eq!(said.contains("25600 of 25600 steps"), !drawn, "{kind} {columns}: {said}");
         if *drawn {
@@ -252,10 +262,16 @@ fn l14_l15_plot_ends_on_any_file_soon_and_says_little() {
     fs::write(folder.join("one-line.csv"), "{\"a\": 1, ".repeat(400_000)).unwrap();
     let plot = |more: &[&str]| {
         let mut command = command(folder, &[&["plot"], more].concat());
-        let mut child = command.stderr(Stdio::piped()).process_group(0).spawn().unwrap();
-        let begun = Instant::now();
+        let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
+        let (begun, mut most) = (Instant::now(), 0);
         while child.try_wait().unwrap().is_none() {
-            assert!(begun.elapsed() < Duration::from_secs(20), "{more:?} does not end");
+            let status = fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
+            let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap_or("0 kB");
+            most = most.max(line.trim().trim_end_matches(" kB").parse::<u64>().unwrap());
+            if begun.elapsed() > Duration::from_secs(10) || most > 512 << 10 {
+                let _ = child.kill();
+                panic!("{more:?}: {most} KiB after {:?}", begun.elapsed());
+            }
             std::thread::sleep(Duration::from_millis(10));
         }
         let mut said = String::new();

@@ -78,6 +78,24 @@ fn a_run_that_is_resumed_is_left_as_it_was_until_an_iteration_is_done() {
 }
 
 #[test]
+fn a_run_whose_folder_is_deleted_before_its_first_iteration_is_done_is_made_anew() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let mut args = train(&["--total-steps", "16384", "--run-dir", "run", "--keep", "9"]);
+    ["env.num_envs=256", "ppo.horizon=64"].iter().for_each(|set| args.extend(["--set", set]));
+    succeeded(program(folder, &args));
+    let args = ["train", "--resume", "run", "--total-steps", "32768"];
+    let mut child = command(folder, &args).stderr(Stdio::piped()).spawn().unwrap();
+    let mut said = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(said.next().unwrap().unwrap().contains("run folder"));
+    fs::remove_dir_all(folder.join("run")).unwrap();
+    said.for_each(drop);
+    assert!(child.wait().unwrap().success());
+    let latest = Checkpoint::parse(&fs::read(folder.join("run/checkpoints/latest.safetensors")).unwrap()).unwrap();
+    assert_eq!(latest.progress.iteration, 2);
+}
+
+#[test]
 fn m1_a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();

@@ -114,13 +114,13 @@ impl FilmWriter {
 ///
 /// # Errors
 /// A name that does not end in .png, a place that cannot be written to.
-pub fn write_png(path: &Path, [width, height]: [u32; 2], rgb: &[u8]) -> Result<()> {
-    let named = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
-    ensure!(named, "{}: the name of a picture must end in .png", path.display());
+pub fn write_png(output: OutputFile, [width, height]: [u32; 2], rgb: &[u8]) -> Result<()> {
+    let named = output.path().extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
+    ensure!(named, "{}: the name of a picture must end in .png", output.path().display());
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_compression(png::Compression::High);
     encoder.write_header()?.write_image_data(rgb)?;
-    OutputFile::create(path)?.finish(&bytes)
+    output.finish(&bytes)
 }
