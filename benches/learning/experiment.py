@@ -97,7 +97,8 @@ class Run:
 
     def __init__(self, experiment, variant, seed):
         self.experiment, self.variant, self.seed = experiment, variant, seed
-        self.path = experiment.folder / variant / f"seed-{seed}"
+        # So they are called in the legend of the picture.
+        self.path = experiment.folder / f"{variant}-{seed}"
         own = experiment.variants.get(variant, {})
         self.set = experiment.set + own.get("set", [])
         self.fork = experiment.fork and experiment.fork.format(seed=seed)
@@ -107,6 +108,9 @@ class Run:
 
     def name(self):
         return f"{self.variant}, seed {self.seed}"
+
+    def beside(self, kind):
+        return self.path.with_name(f"{self.path.name}.{kind}")
 
     def checkpoints(self):
         return sorted((self.path / "checkpoints").glob("iteration-*.safetensors"))
@@ -166,7 +170,7 @@ class Run:
         of = self.experiment
         config = pathlib.Path(of.config).read_text() if of.config else None
         settings = {"fork": self.fork, "config": config, "set": self.set}
-        record = self.path.with_suffix(".json")
+        record = self.beside("json")
         if not record.exists() and self.path.exists():
             sys.exit(f"{self.path}: there is a run, and nothing says with which settings it was begun; name another folder")
         if record.exists() and json.loads(record.read_text()) != settings:
@@ -181,12 +185,12 @@ class Run:
         if self.path.exists() and not self.checkpoints():
             # Killed before it had saved anything.
             subprocess.run(["rm", "-r", self.path], check=True)
-        with self.path.with_suffix(".log").open("ab") as log:
+        with self.beside("log").open("ab") as log:
             return subprocess.Popen([str(word) for word in self.command()], stdout=log, stderr=log, start_new_session=True,
                                     preexec_fn=at_low_priority)
 
     def last_words(self):
-        return "\n".join(self.path.with_suffix(".log").read_text(errors="replace").splitlines()[-5:])
+        return "\n".join(self.beside("log").read_text(errors="replace").splitlines()[-5:])
 
 
 def steps_of(checkpoint):

@@ -102,8 +102,8 @@ pub struct Score {
 pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
     (diverged * 100 > steps).then(|| {
         format!(
-            "in {diverged} of {steps} steps the physics diverged and the episode ended: masses, friction, env.sim_dt or the scene \
-             are nothing that can be simulated"
+            "in {diverged} of {steps} steps the physics diverged and the episode ended: the masses, friction, \
+             env.sim_dt or scene cannot be simulated"
         )
     })
 }

@@ -1,8 +1,8 @@
 //! Nets made wider without changing what they compute.
 //!
 //! A new unit gets the weights that it would have in a new net, and those behind it that listen to it begin at zero: nothing changes
-//! until they learn to. (Copies of old units, as in T. Chen, I. Goodfellow, J. Shlens, "Net2Net" (2016), would need noise to part
-//! from each other, and that changes the function.)
+//! until they learn to. (Copies of old units, as in T. Chen, I. Goodfellow, J. Shlens, "Net2Net" (2016), would need noise to
+//! become different, and that changes the function.)
 
 use anyhow::{Result, ensure};
 

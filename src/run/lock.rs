@@ -58,7 +58,7 @@ impl Locked {
             fs::rename(own.path(), &self.path).with_context(context)?;
             self.file = file;
         }
-        // Whom it may concern; on a full disk it stays unsaid.
+        // Only for a message to others: on a full disk it is left out.
         let said = format!(": process {}", std::process::id());
         let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)

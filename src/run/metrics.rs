@@ -53,7 +53,7 @@ impl Metrics {
                     let aside = unused_name(&path.with_extension(format!("before-{}.csv", iterations.end)));
                     fs::rename(path, &aside).with_context(context)?;
                     notes.push(format!(
-                        "{METRICS} has other columns than this program writes: it is now {}",
+                        "{METRICS} has another header than this program writes: it is now {}",
                         aside.display()
                     ));
                     expected = 0;
@@ -263,7 +263,7 @@ mod tests {
         let (place, path) = table("1,0.5\n");
         for columns in ["iteration,return", "iteration,loss"] {
             let (_, notes) = Metrics::open(&path, columns, 0..1).unwrap();
-            assert!(notes.len() == 1 && notes[0].contains("other columns"), "{notes:?}");
+            assert!(notes.len() == 1 && notes[0].contains("another header"), "{notes:?}");
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("{columns}\n"));
         }
         // Both, though of the same iteration.

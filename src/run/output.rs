@@ -64,7 +64,7 @@ impl Drop for Unfinished {
     }
 }
 
-/// Removes all that this process has not finished, before it ends without more ado; nothing can be begun after it.
+/// Removes all that this process has not finished, before it ends at once; nothing can be begun after it.
 pub fn remove_unfinished() {
     let unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
     unfinished.iter().for_each(|path| remove(path));
@@ -106,7 +106,7 @@ impl OutputFile {
             Ok(facts) if !facts.is_file() => {
                 return OpenOptions::new().write(true).open(path).map(direct).with_context(context);
             }
-            // A name of what the program writes into anyway, such as /dev/stdout: one goes on where the other is.
+            // A link to a stream of this program, such as /dev/stdout: both write at one place, one after the other.
             Ok(facts) if path.is_symlink() => {
                 let (out, err) = (io::stdout(), io::stderr());
                 for stream in [out.as_fd(), err.as_fd()] {

@@ -15,8 +15,8 @@ use crate::ppo::{Checkpoint, Fork};
 use crate::run::{self, RunFolder};
 
 impl Session {
-    /// A new run that begins with the newest sound checkpoint of another, or with the one that is named. What changes neither the
-    /// sizes of its state nor what its policy is may be set anew; nets may become wider.
+    /// A new run that begins with the newest sound checkpoint of another, or with the one that is named. Settings may
+    /// change unless they size its state or say what its policy is; nets may become wider.
     ///
     /// # Errors
     /// A checkpoint that cannot be gone on from; settings that it cannot take; a folder that cannot be made.

@@ -42,7 +42,7 @@ pub fn hints(config: &Config, default: &Config) -> Vec<String> {
     let weight = training.task_reward.to;
     for ((key, value), (_, usual)) in scales(config).into_iter().zip(scales(default)) {
         if value != usual && weight < LITTLE {
-            hints.push(format!("{key} = {value}: training.task_reward lets it count only {weight} times in the end"));
+            hints.push(format!("{key} = {value}: training.task_reward weighs it with only {weight} in the end"));
         }
     }
     hints
@@ -70,7 +70,7 @@ mod tests {
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
         let [line] = &of(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
         assert!(
-            line.starts_with("env.dist_reward_scale = -20: training.task_reward lets it count only 0.03"),
+            line.starts_with("env.dist_reward_scale = -20: training.task_reward weighs it with only 0.03"),
             "{line}"
         );
         assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());

@@ -61,7 +61,7 @@ impl Session {
     pub fn resume(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
         if let Some(set) = args.settings.set.iter().find(|set| set.key != MODEL) {
             bail!(
-                "--set {}: of a run that is resumed only {MODEL} can be said anew, and --total-steps and --threads",
+                "--set {}: of a run that is resumed only {MODEL} can be given again, and --total-steps and --threads; --fork changes settings",
                 set.key
             );
         }

@@ -36,7 +36,7 @@ fn an_experiment_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     fs::write(folder.join("what.toml"), what).unwrap();
     let mut killed = experiment(folder).stdout(Stdio::null()).spawn().unwrap();
     let begun = Instant::now();
-    while !folder.join("runs/base/seed-0/metrics.csv").exists() && begun.elapsed() < Duration::from_secs(60) {
+    while !folder.join("runs/base-0/metrics.csv").exists() && begun.elapsed() < Duration::from_secs(60) {
         std::thread::sleep(Duration::from_millis(20));
     }
     killed.kill().unwrap();
@@ -44,16 +44,16 @@ fn an_experiment_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     let said = String::from_utf8(succeeded(experiment(folder).output().unwrap()).stdout).unwrap();
 
     let runs = folder.join("runs");
-    for seed in ["seed-0", "seed-1"] {
-        let [base, same] = ["base", "same"].map(|name| runs.join(name).join(seed));
-        assert_eq!(metrics(&base), metrics(&same), "{seed}");
+    for seed in [0, 1] {
+        let [base, same] = ["base", "same"].map(|name| runs.join(format!("{name}-{seed}")));
+        assert_eq!(metrics(&base), metrics(&same), "seed {seed}");
         let [base, same] = [base, same].map(|run| weights(run.join("checkpoints/iteration-00000010.safetensors")));
-        assert_eq!(base, same, "{seed}");
+        assert_eq!(base, same, "seed {seed}");
     }
     let kept = |name: &str| [0, 1].map(|seed| format!("{name}-{seed}-640.safetensors"));
     assert_eq!(names(&runs.join("kept")), [kept("base"), kept("louder"), kept("same")].concat());
     assert!(said.contains("louder is stopped: policy/std at 640 steps is 1.3"), "{said}");
-    assert_eq!(metrics(&runs.join("louder/seed-1")).last().unwrap()[1], "640");
+    assert_eq!(metrics(&runs.join("louder-1")).last().unwrap()[1], "640");
     let row = said.lines().skip_while(|line| *line != "at 1,280 steps:").find(|line| line.starts_with("| same"));
     assert!(row.is_some_and(|row| row.contains("(+0.000 ± 0.000, up in 0 of 2)")), "{said}");
     assert!(runs.join("picture.svg").exists());
