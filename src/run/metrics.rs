@@ -110,7 +110,7 @@ impl Metrics {
 }
 
 /// The values in these columns of a table, column by column; `NaN` where a cell is empty, or holds what cannot be drawn: a number
-/// that is infinite or beyond [`LARGEST_VALUE`]. `place` is the file, or its run's folder.
+/// that is infinite or beyond 1e30. `place` is the file, or its run's folder.
 ///
 /// # Errors
 /// A file that cannot be read, has no such column, too many rows, or holds something else than numbers.
