@@ -12,6 +12,7 @@ use signal_hook::iterator::Signals;
 use signal_hook::low_level::{emulate_default_handler, exit};
 
 use super::output::remove_unfinished;
+use super::pip;
 
 /// A terminal that is closed sends SIGHUP twice, and some schedulers send SIGTERM and SIGHUP: within this time they are one
 /// request.
@@ -73,6 +74,7 @@ impl Requests {
             let together = if signal == SIGINT { ONE_KEY } else { ONE_REQUEST };
             let again = first.is_some_and(|first| first.elapsed() > together);
             if again || !self.patient.load(Ordering::Relaxed) {
+                pip::stop();
                 remove_unfinished();
                 if !saves {
                     // As a program that never caught it: who started it sees what ended it.

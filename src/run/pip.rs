@@ -1,8 +1,10 @@
 //! Fetches wheels with pip, by package name and hash. Apart because the build script uses it too: it knows only the standard
 //! library.
 
+use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::{fs, io};
 
 /// Downloads the wheel `package` (as `name==version`) with this sha256 and unpacks it into `folder`, which is made anew.
@@ -36,8 +38,31 @@ pub fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder: &Path
     python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(folder))
 }
 
+/// The process that is at work, first of a group of its own (python3 may be a script that starts another), or 0.
+static AT_WORK: AtomicU32 = AtomicU32::new(0);
+
+/// Ends the processes that are at work, if there are any: they would go on to write into their folder when this program has ended.
+#[allow(dead_code)]
+pub fn stop() {
+    let id = AT_WORK.load(Ordering::Relaxed);
+    if id != 0 {
+        let _ = Command::new("kill").args(["-KILL", "--", &format!("-{id}")]).status();
+    }
+}
+
 fn python(command: &mut Command) -> Result<(), String> {
-    let output = command.output().map_err(|e| format!("python3 could not be started ({e})"))?;
+    let told = |e: io::Error| format!("python3 could not be started ({e})");
+    let child = command
+        .process_group(0)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(told)?;
+    AT_WORK.store(child.id(), Ordering::Relaxed);
+    let output = child.wait_with_output();
+    AT_WORK.store(0, Ordering::Relaxed);
+    let output = output.map_err(told)?;
     if output.status.success() {
         return Ok(());
     }
