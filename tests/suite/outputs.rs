@@ -155,7 +155,8 @@ fn l25_a_name_that_is_no_text_is_resumed_as_the_program_says() {
     let advice = said.lines().last().unwrap().trim().strip_prefix("shadow-repose ").unwrap();
     let program = env!("CARGO_BIN_EXE_shadow-repose");
     // $'…' is bash's.
-    let text = format!("'{program}' {advice} --stop-after 50ms");
+    let steps: u64 = said.split(" env steps").next().unwrap().rsplit(' ').next().unwrap().parse().unwrap();
+    let text = format!("'{program}' {advice} --total-steps {}", steps + 128);
     succeeded(Command::new("bash").args(["-c", &text]).current_dir(folder).output().unwrap());
     // Its curve is a picture that readers take.
     let plot = crate::support::command(folder, &["plot"]).arg(odd).output().unwrap();
