@@ -6,7 +6,10 @@ use mujoco_rs::prelude::{MjModel, MjtObjBase};
 pub fn not_finite(model: &MjModel) -> Option<String> {
     let (body, joint) = ((MjtObjBase::mjOBJ_BODY, "body"), (MjtObjBase::mjOBJ_JOINT, "joint"));
     let (geom, actuator) = ((MjtObjBase::mjOBJ_GEOM, "geom"), (MjtObjBase::mjOBJ_ACTUATOR, "actuator"));
+    let (site, tendon) = ((MjtObjBase::mjOBJ_SITE, "site"), (MjtObjBase::mjOBJ_TENDON, "tendon"));
     let count = |kind| match kind {
+        MjtObjBase::mjOBJ_SITE => model.nsite() as usize,
+        MjtObjBase::mjOBJ_TENDON => model.ntendon() as usize,
         MjtObjBase::mjOBJ_BODY => model.nbody() as usize,
         MjtObjBase::mjOBJ_JOINT => model.njnt() as usize,
         MjtObjBase::mjOBJ_GEOM => model.ngeom() as usize,
@@ -21,12 +24,22 @@ pub fn not_finite(model: &MjModel) -> Option<String> {
         (joint, "position", model.jnt_pos().as_flattened()),
         (joint, "axis", model.jnt_axis().as_flattened()),
         (joint, "range", model.jnt_range().as_flattened()),
+        (joint, "stiffness", model.jnt_stiffness()),
+        (joint, "margin", model.jnt_margin()),
+        (joint, "solref", model.jnt_solref().as_flattened()),
+        (joint, "solimp", model.jnt_solimp().as_flattened()),
+        (geom, "margin", model.geom_margin()),
+        (geom, "gap", model.geom_gap()),
         (geom, "position", model.geom_pos().as_flattened()),
         (geom, "orientation", model.geom_quat().as_flattened()),
         (geom, "size", model.geom_size().as_flattened()),
         (geom, "friction", model.geom_friction().as_flattened()),
         (geom, "solref", model.geom_solref().as_flattened()),
         (geom, "solimp", model.geom_solimp().as_flattened()),
+        (site, "position", model.site_pos().as_flattened()),
+        (tendon, "range", model.tendon_range().as_flattened()),
+        (tendon, "stiffness", model.tendon_stiffness()),
+        (tendon, "damping", model.tendon_damping()),
         (actuator, "gain", model.actuator_gainprm().as_flattened()),
         (actuator, "bias", model.actuator_biasprm().as_flattened()),
         (actuator, "ctrlrange", model.actuator_ctrlrange().as_flattened()),
