@@ -63,7 +63,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
     if !saver.resumes()
         && let Err(error) = saver.begin(&mut report)
     {
-        saver.folder().clear();
+        saver.give_back();
         return Err(error);
     }
     while !session.finished() {
@@ -248,6 +248,27 @@ mod tests {
         assert!(error.contains("iteration 2: panic: "), "{error}");
         let saved = run::read_bytes(&latest).unwrap();
         assert_eq!(Checkpoint::parse(&saved).unwrap().progress.iteration, 1);
+    }
+
+    #[test]
+    fn a_run_that_cannot_begin_leaves_nothing_but_what_is_anothers() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("run");
+        let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]"].map(|set| set.parse().unwrap());
+        let session = Session::new(Config::resolve(None, &sets).unwrap()).unwrap();
+        let begin = || {
+            let (folder, lock) = RunFolder::create(Some(&path), None).unwrap();
+            let mut saver = session.saver(folder, lock, &TrainArgs::default(), Begin::New);
+            saver.begin(&mut new_report(&session, &saver, true)).unwrap();
+            saver
+        };
+        begin().give_back();
+        assert!(!path.exists());
+        let lost = begin();
+        std::process::Command::new("rm").arg("-r").arg(&path).status().unwrap();
+        let other = begin();
+        lost.give_back();
+        assert!(other.folder().checkpoints().latest().exists());
     }
 
     #[test]

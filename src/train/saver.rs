@@ -121,6 +121,13 @@ impl Saver {
         Ok(())
     }
 
+    /// Leaves the folder of a run that could not begin as it was; unless it is another training's by now.
+    pub fn give_back(&self) {
+        if self.lock.as_ref().is_some_and(Locked::holds) {
+            self.folder.clear();
+        }
+    }
+
     /// Writes what says with what the folder was made.
     fn describe(&self) -> Result<()> {
         let fork = self.end.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
