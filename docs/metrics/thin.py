@@ -1,7 +1,7 @@
-"""Makes the small tables of this folder out of the metrics.csv of runs: python thin.py RUN TABLE
+"""Makes the small tables of this folder from the metrics.csv of a run: python thin.py RUN TABLE
 
-A row is the mean of the iterations of 400 000 control steps, with those at its end, and the sum of their seconds. An iteration
-with an evaluation is the last of its row, so that evaluations stand at the steps they were made at.
+A row holds the means over the iterations of 400 000 control steps, the steps at its end, and the sums of the times in seconds.
+An iteration with an evaluation is the last of its row, so that evaluations appear at the steps at which they were made.
 """
 
 import csv
@@ -20,7 +20,7 @@ def numbers(rows, column):
 
 def main(run, table):
     rows = list(csv.DictReader(open(Path(run) / "metrics.csv")))
-    # A fork begins later than at nothing.
+    # A fork does not begin at 0 steps.
     length = int(rows[1]["env_steps"]) - int(rows[0]["env_steps"]) if len(rows) > 1 else 0
     groups, begun = [[]], int(rows[0]["env_steps"]) - length
     for row in rows:
@@ -32,7 +32,7 @@ def main(run, table):
     with open(table, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["env_steps", *MEANS, *SUMS])
-        # What is left at the end is too little for a mean.
+        # The last group has too few iterations for a mean.
         for group in groups[:-1]:
             found = [numbers(group, column) for column in MEANS]
             means = [f"{sum(values) / len(values):.5g}" if values else "" for values in found]
