@@ -1,4 +1,4 @@
-"""What the runs of an experiment came to: turning, goals and drops at equal steps and at equal time, seed against seed."""
+"""Compares the runs of an experiment seed by seed: turning, goals and drops, at equal steps and at equal time."""
 import csv
 import datetime
 import math
@@ -11,9 +11,9 @@ import sys
 import tomllib
 
 THIN = pathlib.Path(__file__).resolve().parents[2] / "docs/metrics/thin.py"
-# Name in tables, digits.
+# The metrics in tables, with their decimal digits.
 METRICS = {"turned": 3, "eval/goals": 2, "eval/drop_rate": 3}
-# Iterations whose seconds are taken as one, by their median: what stopped a training for a while does not count.
+# The number of iterations whose times are replaced by their median, so that interruptions of a training do not count.
 TIMED = 50
 
 
@@ -35,10 +35,10 @@ class Log:
                 self.seconds.append(spent)
 
     def value(self, metric, at, window):
-        """The mean of the steps up to `at`, or of an evaluation the last one; NaN if it is not there yet."""
+        """Returns the mean over the `window` steps up to `at`, or the latest evaluation; NaN if the run is not that far yet."""
         if not self.steps or self.steps[-1] < at:
             return math.nan
-        # rad in a hundred steps: training/progress is what is paid for it.
+        # rad per hundred steps, computed from training/progress, the reward that is paid for it.
         column, scale = ("training/progress", 100) if metric == "turned" else (metric, 1)
         if metric == "turned" and self.progress_reward == 0:
             return math.nan
@@ -59,10 +59,10 @@ class Log:
 
 
 def fails(rule, base, variant, window):
-    """Why a rule stops a variant, or None: its metric is below (or above) that share of the base's in all seeds."""
+    """Returns why a rule stops a variant, or None: its metric is below (or above) that fraction of the base's in all seeds."""
     shared = sorted(set(base) & set(variant))
     pairs = [[log.value(rule["metric"], rule["at"], window) for log in (base[seed], variant[seed])] for seed in shared]
-    # Of what is not above zero there are no shares.
+    # There is no ratio to a value that is not above zero.
     ratios = [ours / theirs if theirs > 0 else math.nan for theirs, ours in pairs]
     if not ratios:
         return None
@@ -79,7 +79,7 @@ def spread(values):
 
 
 def cell(pairs, digits, is_base):
-    """Mean over the seeds; of a variant also the mean of its differences from the base, their standard deviation, and its signs."""
+    """Formats the mean over the seeds; for a variant also the mean difference from the base, its deviation and its signs."""
     pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
     if not pairs:
         return "-"
@@ -92,7 +92,7 @@ def cell(pairs, digits, is_base):
 
 
 def tables(experiment):
-    """Markdown: a table for each milestone that the base has reached, at equal steps; and the same at equal time."""
+    """Returns Markdown: for each milestone that the base has reached, one table at equal steps and one at equal time."""
     logs = {name: experiment.logs(name) for name in experiment.runs_of}
     text = ""
     for at in experiment.milestones:
@@ -103,7 +103,7 @@ def tables(experiment):
         equal = [(f"at {at:,} steps", lambda log, seed: at)]
         if len(logs) > 1:
             time = lambda log, seed: log.steps_after(base[seed].seconds_at(at))
-            equal.append((f"after the time that the base of that seed took for them, {hours:.2f} hours in the mean", time))
+            equal.append((f"after the time that the base with the same seed took for them, {hours:.2f} hours on average", time))
         for title, where in equal:
             text += f"\n{title}:\n\n| | {' | '.join(METRICS)} | steps |\n|---|{'---|' * (len(METRICS) + 1)}\n"
             for name, of in logs.items():
@@ -119,10 +119,10 @@ def tables(experiment):
     for name, runs in experiment.runs_of.items():
         verdict = experiment.verdict(name, max(run.position() for run in runs))
         text += f"\n{name} is stopped: {verdict}\n" if verdict not in (None, "waits") else ""
-    note = "turned: rad in a hundred steps, in training, mean of the last {:,} steps; eval: the last evaluation until then.\n" \
-           "Mean over the seeds; of the base ± its standard deviation; in brackets the mean of the differences from the base in the\n" \
-           "same seed ± their standard deviation."
-    return note.format(experiment.window) + "\n" + text if text else "the base has not come to the first milestone yet"
+    note = "turned: rad per hundred training steps, mean over the last {:,} steps; eval: the latest evaluation until then.\n" \
+           "Means over the seeds; for the base ± standard deviation; for a variant, in parentheses, the mean difference\n" \
+           "from the base with the same seed ± its standard deviation."
+    return note.format(experiment.window) + "\n" + text if text else "the base has not reached the first milestone yet"
 
 
 def draw(program, runs, picture, smooth):
@@ -131,7 +131,7 @@ def draw(program, runs, picture, smooth):
 
 
 def publish(experiment, folder):
-    """Thinned tables of all runs, the settings, and the tables and the picture of them."""
+    """Writes the thinned metrics of all runs, the settings, the comparison tables and their picture."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for run in experiment.all_runs():
@@ -143,7 +143,7 @@ def publish(experiment, folder):
         shutil.copyfile(experiment.config, folder / pathlib.Path(experiment.config).name)
     draw(experiment.drawer(), found, folder / "picture.svg", smooth=1)
     version = (experiment.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
-    machine = f"{datetime.date.today()}, {processor()}, {experiment.runs} runs at a time, threads of each: {experiment.threads}"
+    machine = f"{datetime.date.today()}, {processor()}, {experiment.runs} runs at a time, threads per run: {experiment.threads}"
     facts = f"{machine}.\nProgram: {version}."
     (folder / "README.md").write_text(f"# {folder.name}\n\n{facts}\n\n{tables(experiment)}\n![curves](picture.svg)\n")
 

@@ -1,7 +1,7 @@
-"""Trains variants of a base, seed by seed, and compares them with it: python experiment.py FILE.toml DIR
+"""Trains a base and variants of it under several seeds and compares them: python experiment.py FILE.toml DIR
 
-FILE.toml says what to train (README.md beside this file), DIR takes the runs. Stopped or killed, the same command goes on where
-it was. Needs Python 3.11 and the program; nothing else.
+FILE.toml defines what to train (see README.md in this folder); the runs go into DIR. After a stop or a kill, the same command
+resumes. Needs only Python 3.11 and the program.
 """
 import argparse
 import ctypes
@@ -27,11 +27,11 @@ DEFAULTS = {"seeds": [0, 1], "threads": 1, "runs": 2, "keep": [], "table": [], "
 
 
 class Experiment:
-    """What the file says, with the runs of it in a folder."""
+    """The experiment that a file defines, with its runs in a folder."""
 
     def __init__(self, file, folder, program):
         self.file, self.folder = file, folder
-        # Of its own, so that one that is built meanwhile does not take over in the middle.
+        # A copy, so that a rebuild does not replace the program in the middle of the experiment.
         self.program = folder / "program"
         self.copied_from = program
         given = tomllib.loads(file.read_text())
@@ -40,16 +40,16 @@ class Experiment:
             sys.exit(f"{file}: " + (f"unknown: {', '.join(sorted(unknown))}" if unknown else "`steps` is missing"))
         self.__dict__.update(DEFAULTS | given)
         if "base" in self.variants:
-            sys.exit(f"{file}: the base is what the variants are compared with, not one of them")
+            sys.exit(f"{file}: `base` is what the variants are compared with and cannot be one of them")
         for name, of in self.variants.items():
             if set(of) - {"set", "steps"}:
-                sys.exit(f"{file}: a variant has `set` and `steps`, and nothing else: {name}")
+                sys.exit(f"{file}: a variant may only have `set` and `steps`: {name}")
         for rule in self.stop:
             if not {"at", "metric"} < set(rule) <= {"at", "metric", "below", "above"}:
-                sys.exit(f"{file}: a rule to stop by needs `at`, `metric`, and `below` or `above`: {rule}")
+                sys.exit(f"{file}: a stop rule needs `at`, `metric`, and `below` or `above`: {rule}")
         if self.fork and "{seed}" not in self.fork and len(self.seeds) > 1:
-            sys.exit(f"{file}: all seeds would go on from the same checkpoint, as the same training; `fork` must have {{seed}} in it")
-        # Checkpoints lie beside the runs, settings beside the file.
+            sys.exit(f"{file}: `fork` must contain {{seed}}, or all seeds would be the same training from one checkpoint")
+        # `fork` is relative to the folder of the runs, `config` to the experiment file.
         self.fork = self.fork and str(folder / self.fork)
         self.config = self.config and str(file.resolve().parent / self.config)
         for seed in self.seeds if self.fork else []:
@@ -57,8 +57,8 @@ class Experiment:
                 sys.exit(f"{self.fork.format(seed=seed)}: there is no such checkpoint")
         begun = max((steps_of(pathlib.Path(self.fork.format(seed=seed))) for seed in self.seeds), default=0) if self.fork else 0
         if early := [rule for rule in self.stop if rule["at"] <= begun]:
-            sys.exit(f"{file}: trainings begin at {begun:,} steps; there is nothing to judge by before: {early[0]}")
-        # Where trainings pause: to be judged, or for a copy of their checkpoint.
+            sys.exit(f"{file}: the trainings begin at {begun:,} steps; this stop rule is not after that: {early[0]}")
+        # The steps at which trainings pause, to apply stop rules or to copy their checkpoint.
         self.pauses = {rule["at"] for rule in self.stop} | set(self.keep)
         self.runs_of = {name: [Run(self, name, seed) for seed in self.seeds] for name in ["base", *self.variants]}
         self.milestones = sorted(at for at in self.pauses | set(self.table) | {self.steps} if at <= self.steps)
@@ -67,7 +67,7 @@ class Experiment:
         return [run for runs in self.runs_of.values() for run in runs]
 
     def verdict(self, name, position):
-        """Whether a variant at this position may go on: None; or why it is stopped; or "waits" for the runs that it is judged by."""
+        """Returns None if a variant may continue from here, why it is stopped, or "waits" while runs to compare are missing."""
         for rule in sorted(self.stop, key=lambda rule: rule["at"]):
             if name == "base" or rule["at"] > position:
                 continue
@@ -83,7 +83,7 @@ class Experiment:
         return {run.seed: compare.Log(run.path) for run in self.runs_of[name] if (run.path / "metrics.csv").exists()}
 
     def drawer(self):
-        """What draws the picture: the program of the experiment, or before there is one, that of the user."""
+        """Returns the program that draws the picture: the experiment's copy, or the user's if there is no copy yet."""
         return self.program if self.program.exists() else self.copied_from
 
     def copy_program(self):
@@ -93,11 +93,11 @@ class Experiment:
 
 
 class Run:
-    """One training: a variant under a seed."""
+    """One training: a variant with one seed."""
 
     def __init__(self, experiment, variant, seed):
         self.experiment, self.variant, self.seed = experiment, variant, seed
-        # So they are called in the legend of the picture.
+        # The legend of the picture shows this name.
         self.path = experiment.folder / f"{variant}-{seed}"
         own = experiment.variants.get(variant, {})
         self.set = experiment.set + own.get("set", [])
@@ -116,7 +116,7 @@ class Run:
         return sorted((self.path / "checkpoints").glob("iteration-*.safetensors"))
 
     def position(self):
-        """Control steps of its newest checkpoint, which is what it goes on from."""
+        """Returns the control steps of the newest checkpoint, from which the training resumes."""
         found = self.checkpoints()
         if found:
             return steps_of(found[-1])
@@ -128,7 +128,7 @@ class Run:
         return (progress["env_steps"] - begun["env_steps"]) // max(progress["iteration"] - begun["iteration"], 1)
 
     def pause(self):
-        """Where it pauses next; None at its end."""
+        """Returns the steps at which it pauses next, or None at its end."""
         position = self.position()
         return next((at for at in self.pauses if at > position), None)
 
@@ -143,7 +143,7 @@ class Run:
         return [of.program, "train", *begin, *config, *sets, *end]
 
     def keep_copy(self):
-        """Copies the checkpoint of a pause that it is at, if the copy is wanted and not there."""
+        """At a pause, copies the checkpoint if the copy is wanted and does not exist yet."""
         if not self.checkpoints():
             return
         position = self.position()
@@ -158,7 +158,7 @@ class Run:
             partial.rename(copy)
 
     def wait_until_free(self):
-        """If this program was killed, its trainings end by themselves, but not at once."""
+        """Waits for a training in this folder to end: those of a killed experiment do so by themselves, but not at once."""
         lock = self.path / "run.lock"
         if not lock.exists():
             return
@@ -166,15 +166,15 @@ class Run:
             fcntl.flock(file, fcntl.LOCK_EX)
 
     def expect_settings(self):
-        """A folder goes on with what it was begun with."""
+        """Exits unless the folder was begun with the same settings; returns the path of their record, and the settings."""
         of = self.experiment
         config = pathlib.Path(of.config).read_text() if of.config else None
         settings = {"fork": self.fork, "config": config, "set": self.set}
         record = self.beside("json")
         if not record.exists() and self.path.exists():
-            sys.exit(f"{self.path}: there is a run, and nothing says with which settings it was begun; name another folder")
+            sys.exit(f"{self.path}: there is a run, but no record of its settings; choose another folder")
         if record.exists() and json.loads(record.read_text()) != settings:
-            sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; name another folder")
+            sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; choose another folder")
         return record, settings
 
     def start(self):
@@ -183,7 +183,7 @@ class Run:
         record.write_text(json.dumps(settings, indent=1))
         self.wait_until_free()
         if self.path.exists() and not self.checkpoints():
-            # Killed before it had saved anything.
+            # It was killed before it had saved anything.
             subprocess.run(["rm", "-r", self.path], check=True)
         with self.beside("log").open("ab") as log:
             return subprocess.Popen([str(word) for word in self.command()], stdout=log, stderr=log, start_new_session=True,
@@ -194,7 +194,7 @@ class Run:
 
 
 def steps_of(checkpoint):
-    """The control steps that a training had made when it wrote this file."""
+    """Returns the control steps that a training had made when it wrote this checkpoint."""
     return progress_of(checkpoint)["env_steps"]
 
 
@@ -205,7 +205,7 @@ def progress_of(checkpoint):
 
 
 def at_low_priority():
-    """In a training that is about to start: it gives way to all else, and saves and ends if this program is killed."""
+    """Called in the process of a training: sets the lowest priority, and lets it save and end if this program is killed."""
     os.nice(19)
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
 
@@ -219,10 +219,10 @@ def stop(number, _):
 
 
 def train(experiment):
-    """Trains all runs as far as they are to go. True if none failed."""
+    """Trains all runs until they end or are stopped. Returns whether none failed."""
     for run in experiment.all_runs():
         run.expect_settings()
-        # One that came to a pause when this program was killed.
+        # It may have reached a pause when this program was killed.
         run.keep_copy()
     experiment.copy_program()
     said, at_work = set(), {}
@@ -248,7 +248,7 @@ def train(experiment):
                 elif verdict != "waits" and run.variant not in said:
                     said.add(run.variant)
                     say(f"{run.variant} is stopped: {verdict}")
-            # The one that has come least far first, so that all can be compared early; the base before those that it judges.
+            # The least advanced run first, so that all can be compared early; the base before the variants.
             ready.sort(key=lambda run: (run.pause(), run.variant != "base"))
             for run in ready[:experiment.runs - len(at_work)]:
                 run.keep_copy()
@@ -261,7 +261,7 @@ def train(experiment):
             child.terminate()
         for child in at_work.values():
             child.wait()
-        say("stopped; the same command goes on")
+        say("stopped; the same command resumes")
         sys.exit(128 + stopped.args[0])
 
 
@@ -274,9 +274,9 @@ def main():
     parser.add_argument("file", type=pathlib.Path)
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--program", type=pathlib.Path, default=ROOT / "target/release/shadow-repose")
-    parser.add_argument("--table", action="store_true", help="print what there is, without training")
+    parser.add_argument("--table", action="store_true", help="print the tables so far, without training")
     parser.add_argument("--publish", type=pathlib.Path, metavar="FOLDER",
-                        help="write thinned tables, settings and results there, without training")
+                        help="write thinned metrics, settings and results to FOLDER, without training")
     args = parser.parse_args()
     if not args.file.is_file() or not args.program.is_file():
         sys.exit(f"{args.program if args.file.is_file() else args.file}: there is no such file")

@@ -1,7 +1,7 @@
 """Runs the program and its Python peers in turn on this machine and prints the medians of the ratios.
 
 Usage: python compare.py [--pairs 5] [--only NAME ...] [--program PATH] [--threads 2]
-Needs: torch, numpy, mujoco==3.17.0 in the Python that runs it, and `cargo build --release` before. Keep the machine idle.
+Needs: torch, numpy, mujoco==3.17.0 in the Python that runs it, and a prior `cargo build --release`. Keep the machine idle.
 """
 import argparse
 import json
@@ -23,7 +23,7 @@ def run(command):
 
 
 class Sides:
-    """What either side makes of each figure."""
+    """Measures each figure on either side."""
 
     def __init__(self, program, threads):
         self.program, self.threads = program, threads
@@ -45,13 +45,13 @@ class Sides:
         return self.bench("training", "end_to_end_steps_per_s")
 
     def peer(self, torch_threads):
-        """Env steps/s between the first and the last line that it prints, one for each ten iterations."""
+        """Returns env steps/s between the first and the last line that the peer prints, one per ten iterations."""
         command = [sys.executable, HERE / "ppo_peer.py", "--model", ROOT / "assets/shadow_hand/scene.xml",
                    "--minutes", "0.9", "--threads", str(self.threads), "--torch-threads", str(torch_threads)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
             seen = [(time.perf_counter(), json.loads(line)["env_steps"]) for line in peer.stdout]
         if len(seen) < 2:
-            sys.exit("ppo_peer.py is too slow on this machine to be timed in this way: give it more --minutes")
+            sys.exit("ppo_peer.py is too slow on this machine to be timed this way: give it more --minutes")
         (start, before), (end, after) = seen[0], seen[-1]
         return (after - before) / (end - start)
 
@@ -61,7 +61,7 @@ class Sides:
                        "--threads", str(self.threads)]
             training = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             _, status, usage = os.wait4(training.pid, 0)
-            assert status == 0, "the training has failed"
+            assert status == 0, "the training failed"
         return usage.ru_maxrss / 1024
 
 
@@ -78,9 +78,9 @@ def main():
                                                                 lambda: sides.torch(LARGE, 8192)),
         "learner samples/s, nets 256 128 64, batch 4096": (lambda: sides.learner(SMALL, 1024, 4),
                                                            lambda: sides.torch(SMALL, 4096)),
-        # Taken in turn within one run, so that neither side meets a faster machine.
+        # Measured in turn within one run, so that the speed of the machine is the same for both sides.
         "environments / bare physics": (lambda: sides.bench("physics", "pool_share"), lambda: 1.0),
-        # The peer as it comes, with PyTorch on one thread, and with PyTorch on all of them.
+        # The peer with its default of one PyTorch thread, and with PyTorch on all threads.
         "end to end steps/s, nets 256 128 64, 1024 x 16, 4 epochs x 4": (sides.training, lambda: sides.peer(1)),
         "the same, PyTorch on all threads": (sides.training, lambda: sides.peer(args.threads)),
     }

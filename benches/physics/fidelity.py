@@ -1,17 +1,17 @@
-"""What physics settings cost and how close they stay to a converged reference with a timestep of 0.002 s.
+"""Measures what physics settings cost and how close they stay to a converged reference with a timestep of 0.002 s.
 
 Usage: python fidelity.py [--rollouts 1000] [--hold 1] [--only NAME ...] [--list]
-Needs: numpy, mujoco==3.17.0. Run it from anywhere on an idle machine; about ten minutes on two cores.
+Needs: numpy, mujoco==3.17.0. Runs from any folder; keep the machine idle. Takes about ten minutes on two cores.
 
 Each variant is the project's scene with one change. All variants play the same rollouts of 1 s from the task's start states,
-with actions drawn as a new policy draws them (Gaussian, standard deviation 0.5, a new one each 0.01 s); with `--hold 30` each
-is held for 0.3 s and drawn with standard deviation 1, so that whole poses are reached. Per variant:
-- speed:  control steps/s over the default's, the median of rounds taken in turn
-- apart:  distance of the cube from where the reference has it after 1 s, median and 90th percentile; contacts are chaotic, so
-          the row `reference, moved 1 nm` shows what remains apart without any difference in the settings
-- lost:   rollouts in which the cube ends 0.24 m or more from the goal position; in brackets those that diverged
-- deep:   depth of the deepest contact, of the cube and within the hand, judged with all contact pairs: mean over states
-- energy: kinetic energy of the hand and of the cube: mean over states
+with actions drawn as a new policy draws them (Gaussian, standard deviation 0.5, a new one every 0.01 s). With `--hold 30` each
+action is held for 0.3 s and drawn with standard deviation 1, so that whole poses are reached. Per variant:
+- speed:  control steps/s relative to the default, median of rounds run in turn
+- apart:  distance between the cube and its position in the reference after 1 s, median and 90th percentile; contacts are chaotic,
+          so the row `reference, moved 1 nm` shows the distance that remains with identical settings
+- lost:   rollouts in which the cube ends 0.24 m or more from the goal position; in parentheses those that diverged
+- deep:   depth of the deepest contact of the cube and within the hand, computed with all contact pairs, mean over states
+- energy: kinetic energy of the hand and of the cube, mean over states
 """
 import argparse
 import os
@@ -112,7 +112,7 @@ VARIANTS = {
 
 
 class Starts:
-    """Start states and actions of all rollouts."""
+    """The start states and actions of all rollouts."""
 
     def __init__(self, model, count, rng, hold):
         hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
@@ -127,7 +127,7 @@ class Starts:
         self.states = np.zeros((count, size))
         self.states[:, 1:1 + model.nq] = qpos
         low, high = model.actuator_ctrlrange.T
-        # Held actions are drawn wider, so that fingers are pressed against one another at the ends of their ranges.
+        # Held actions have a larger deviation, so that fingers press against one another at the ends of their ranges.
         deviation = 0.5 if hold == 1 else 1.0
         action = np.clip(rng.normal(0, deviation, (count, -(-CONTROL_STEPS // hold), model.nu)), -1, 1)
         action = np.repeat(action, hold, axis=1)[:, :CONTROL_STEPS]
@@ -145,7 +145,7 @@ def play(pool, model, datas, starts, states=None):
 
 
 def contacts_and_energy(judge, starts, trajectory):
-    """Mean depth (mm) of the deepest contact of the cube and within the hand, mean kinetic energies (mJ)."""
+    """Returns the mean depth (mm) of the deepest contact of the cube and within the hand, and the mean kinetic energies (mJ)."""
     data, cube = mujoco.MjData(judge), judge.geom("cube").id
     cube_dof = judge.jnt_dofadr[judge.body("cube").jntadr[0]]
     depths, energies = [], []
@@ -170,10 +170,10 @@ def main():
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--hold", type=int, default=1, help="control steps for which an action is held")
-    parser.add_argument("--only", nargs="*", help="variants besides the default")
+    parser.add_argument("--only", nargs="*", help="variants to run in addition to the default")
     parser.add_argument("--list", action="store_true")
     args = parser.parse_args()
-    mujoco.set_mju_user_warning(lambda message: None)  # of states that diverge; they are counted
+    mujoco.set_mju_user_warning(lambda message: None)  # MuJoCo warns of diverging states; these are counted
     if args.list:
         print("\n".join(VARIANTS))
         return
@@ -206,7 +206,7 @@ def main():
         end = trajectory[:, -1, starts.cube]
         apart = 1e3 * np.linalg.norm(end - truth[:, -1, starts.cube], axis=1)
         lost = (np.linalg.norm(end - GOAL, axis=1) >= 0.24).mean()
-        # MuJoCo resets a diverged state, and with it the time.
+        # MuJoCo resets a diverged state, including its time.
         diverged = (trajectory[:, -1, 0] < CONTROL_STEPS * CONTROL_DT - 1e-6).mean()
         depth, energy = contacts_and_energy(reference, starts, trajectory)
         print(f"| {name} | {speed} | {np.median(apart):.1f}, {np.percentile(apart, 90):.1f} | {100 * lost:.1f} ({100 * diverged:.1f}) % "
