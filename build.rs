@@ -1,8 +1,8 @@
-//! Makes MuJoCo available to the linker and, at run time, to the binary: without a step by the user.
+//! Makes MuJoCo available to the linker and, at run time, to the binary, with no manual step.
 //!
-//! `.cargo/config.toml` points mujoco-rs at `third_party/mujoco/link`, where a linker script named `libmujoco.so` asks for
+//! `.cargo/config.toml` points mujoco-rs at `third_party/mujoco/link`, where a linker script named `libmujoco.so` refers to
 //! `libmujoco.so.3.17.0`. This script fetches that file into `third_party/mujoco/lib` with pip, by package name and hash.
-//! With `MUJOCO_DYNAMIC_LINK_DIR` or `MUJOCO_STATIC_LINK_DIR` set by the user, nothing is fetched.
+//! It fetches nothing if the user sets `MUJOCO_DYNAMIC_LINK_DIR` or `MUJOCO_STATIC_LINK_DIR`.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -13,8 +13,8 @@ mod pip;
 
 const VERSION: &str = "3.17.0";
 
-/// Wheels of `mujoco` 3.17.0 by target architecture: (pip platform tag, sha256). The Python tag only selects the wheel;
-/// the library in it does not depend on Python.
+/// Wheels of `mujoco` 3.17.0: (target architecture, pip platform tag, sha256). The Python tag only selects the wheel; the
+/// library in it does not depend on Python.
 const WHEELS: [(&str, &str, &str); 2] = [
     ("x86_64", "manylinux_2_28_x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
     ("aarch64", "manylinux_2_28_aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
@@ -45,13 +45,13 @@ fn main() {
     } else {
         linked
     };
-    // A binary finds the library beside itself, in a `lib` folder beside or above itself, or where it was built.
+    // A binary looks for the library beside itself, in a `lib` folder beside or above itself, and where it was built.
     for place in ["$ORIGIN", "$ORIGIN/lib", "$ORIGIN/../lib", &library_folder.display().to_string()] {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{place}");
     }
 }
 
-/// What `version.txt` of a run records about the build.
+/// Passes to the compiler the facts about the build that `version.txt` of a run records.
 fn version_facts() {
     for path in [".git/HEAD", ".git/logs/HEAD"] {
         if Path::new(path).exists() {
@@ -75,15 +75,15 @@ fn fetch(library: &Path) -> Result<(), String> {
     let (_, platform, hash) = WHEELS
         .iter()
         .find(|(name, ..)| os == "linux" && *name == arch)
-        .ok_or(format!("there is no prepared download for {os} on {arch}"))?;
+        .ok_or(format!("no download is configured for {os} on {arch}"))?;
     let work = PathBuf::from(variable("OUT_DIR")).join("mujoco-wheel");
     let selection = ["--python-version", "311", "--implementation", "cp", "--abi", "cp311", "--platform", platform];
     pip::unpack_wheel(&format!("mujoco=={VERSION}"), hash, &selection, &work)?;
     let told = |error: std::io::Error| error.to_string();
     let unpacked = work.join(format!("mujoco/libmujoco.so.{VERSION}"));
-    let folder = library.parent().expect("the library lies in a folder");
+    let folder = library.parent().expect("the library path has a parent folder");
     fs::create_dir_all(folder).map_err(told)?;
-    // Copied under another name and renamed: an interrupted build leaves no half library behind.
+    // Copies under another name, then renames: an interrupted build leaves no incomplete library behind.
     let partial = folder.join(format!("libmujoco.partial.{}", std::process::id()));
     fs::copy(&unpacked, &partial).map_err(|e| format!("{}: {e}", unpacked.display()))?;
     fs::rename(&partial, library).map_err(told)?;
@@ -94,8 +94,8 @@ fn fetch(library: &Path) -> Result<(), String> {
 fn fail(reason: &str) -> ! {
     eprintln!(
         "\nMuJoCo {VERSION} (libmujoco.so.{VERSION}) is missing and could not be fetched: {reason}\n\
-         Two ways out:\n  \
-         1. make `python3 -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index), then build again;\n  \
+         Two ways to fix this:\n  \
+         1. make `python3 -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index) and rebuild;\n  \
          2. unpack a MuJoCo {VERSION} release yourself and build with MUJOCO_DYNAMIC_LINK_DIR=/absolute/path/to/its/lib\n"
     );
     std::process::exit(1);

@@ -1,5 +1,5 @@
-//! What is fuzzed: everything that reads text or bytes from somebody else. A target may return anything, but must not panic,
-//! abort, or take much memory. The seeds run through the same functions as ordinary tests.
+//! The fuzz targets: everything that reads untrusted text or bytes. A target may return anything, but must not panic, abort, or
+//! use much memory. Ordinary tests run the seeds through the same functions.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -10,14 +10,15 @@ use shadow_repose::config::{Config, Override, Source};
 use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::load;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
-use shadow_repose::run::{self, Progress, Report};
+use shadow_repose::run::{self, Report, StatusLine};
+use tensorboard_rs::masked_crc32c::masked_crc32c;
 
-/// Tells whether it accepts what it is given, and whether it does so once the checksum fits, where there is one.
-pub type Target = fn(&[u8]) -> [bool; 2];
+/// Returns whether the input is accepted, and whether it is accepted once its checksum, if any, has been corrected.
+pub(crate) type Target = fn(&[u8]) -> [bool; 2];
 
-/// The targets by their names.
+/// The targets with their names.
 #[allow(dead_code)]
-pub const TARGETS: [(&str, Target); 6] = [
+pub(crate) const TARGETS: [(&str, Target); 6] = [
     ("config", config),
     ("set", set),
     ("checkpoint", checkpoint),
@@ -26,8 +27,8 @@ pub const TARGETS: [(&str, Target); 6] = [
     ("metrics", metrics),
 ];
 
-/// A file of settings.
-pub fn config(data: &[u8]) -> [bool; 2] {
+/// Reads a file of settings.
+pub(crate) fn config(data: &[u8]) -> [bool; 2] {
     let Ok(text) = str::from_utf8(data) else { return [false; 2] };
     let source = Source { path: "my.toml".into(), text: text.into() };
     let Ok(config) = Config::resolve(Some(&source), &[]) else { return [false; 2] };
@@ -36,28 +37,28 @@ pub fn config(data: &[u8]) -> [bool; 2] {
     [true; 2]
 }
 
-/// Lines of `--set`.
-pub fn set(data: &[u8]) -> [bool; 2] {
+/// Reads lines of `--set`.
+pub(crate) fn set(data: &[u8]) -> [bool; 2] {
     let parse = |text: &str| text.lines().map(str::parse).collect::<Result<Vec<Override>, _>>();
     let sets = str::from_utf8(data).ok().and_then(|text| parse(text).ok());
     [sets.is_some_and(|sets| Config::resolve(None, &sets).is_ok()); 2]
 }
 
-/// The bytes of a checkpoint of one environment, to resume from: learner and environment, which then go through an iteration.
-pub fn checkpoint(data: &[u8]) -> [bool; 2] {
+/// Resumes from the bytes of a checkpoint of one environment: learner and environment, which then run an iteration.
+pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
     static TASK: OnceLock<Arc<Task>> = OnceLock::new();
     let task = TASK.get_or_init(|| Task::new(&Config::resolve(None, &[]).unwrap().env).unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
         let mut checkpoint = Checkpoint::parse(bytes)?;
         let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
-        // What a training needs besides grows with these, and is the user's to allow.
+        // The rest of the memory of a training grows with these, which are the user's choice.
         (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches, config.ppo.epochs) = (1, 3, 1, 1);
         config.run.shards = 1;
         let mut agent = Agent::of_task(task, &config)?;
         agent.restore(&mut checkpoint)?;
         checkpoint.take_counters("scene")?;
         checkpoint.finish()?;
-        // It may fail at learning from numbers that nobody has trained, but not otherwise.
+        // Learning from untrained values may fail, but nothing else may.
         if let Err(error) = agent.iterate(&AtomicBool::new(false)) {
             assert!(format!("{error:#}").contains("the training has failed"), "{error:#}");
         }
@@ -66,33 +67,54 @@ pub fn checkpoint(data: &[u8]) -> [bool; 2] {
     [resume(data).is_ok(), sealed(data).is_ok_and(|data| resume(&data).is_ok())]
 }
 
-/// The bytes of a policy, to play.
-pub fn policy(data: &[u8]) -> [bool; 2] {
+/// Loads a policy from its bytes and plays it.
+pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
         let checkpoint = Checkpoint::parse(bytes)?;
         let config = load::for_playing(&checkpoint, Path::new("x.safetensors"), &[])?;
         let policy = Policy::load(&config.net, SPACES, &checkpoint)?;
         let frozen = policy.freeze();
         let (mut action, mut work) = ([0.0; ACTION_SIZE], frozen.workspace(1));
-        frozen.forward(&[0.5; OBSERVATION_SIZE], Some(&mut action), None, &mut work);
+        frozen.mean_actions(&[0.5; OBSERVATION_SIZE], &mut action, &mut work);
         Ok(())
     };
     [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]
 }
 
-/// An event file in the folder of a run that is resumed after 1000 steps: is it left whole, or cut?
-pub fn events(data: &[u8]) -> [bool; 2] {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("events.out.tfevents.1700000000.0000001.shadow-repose");
-    std::fs::write(&file, data).unwrap();
-    resume_logs(folder.path());
-    let left = std::fs::read(&file).unwrap();
-    assert!(data.starts_with(&left), "what is left is the beginning of what was there");
-    [left.len() == data.len(); 2]
+/// Resumes a run after 1000 steps with this event file in its folder; accepted if the file is left whole, not cut.
+pub(crate) fn events(data: &[u8]) -> [bool; 2] {
+    let left_whole = |data: &[u8]| {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("events.out.tfevents.1700000000.0000001.shadow-repose");
+        std::fs::write(&file, data).unwrap();
+        resume_logs(folder.path());
+        let left = std::fs::read(&file).unwrap();
+        assert!(data.starts_with(&left), "what is left is a prefix of the original");
+        left.len() == data.len()
+    };
+    [left_whole(data), left_whole(&with_checksums(data))]
 }
 
-/// A table of metrics, to be drawn, and to be resumed: can it be drawn?
-pub fn metrics(data: &[u8]) -> [bool; 2] {
+/// Returns the event file with correct checksums.
+fn with_checksums(data: &[u8]) -> Vec<u8> {
+    let mut data = data.to_vec();
+    let mut place = 0;
+    while let Some(length) = data.get(place..place + 8) {
+        let end = u64::from_le_bytes(length.try_into().unwrap()).saturating_add(place as u64 + 12);
+        for (from, to) in [(place, place + 8), (place + 12, end as usize)] {
+            let Some(checksum) = data.get(from..to).map(|bytes| masked_crc32c(bytes).to_le_bytes()) else {
+                return data;
+            };
+            let Some(room) = data.get_mut(to..).and_then(|room| room.get_mut(..4)) else { return data };
+            room.copy_from_slice(&checksum);
+        }
+        place = end as usize + 4;
+    }
+    data
+}
+
+/// Reads a table of metrics for plotting, then for resuming; accepted if it can be plotted.
+pub(crate) fn metrics(data: &[u8]) -> [bool; 2] {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("metrics.csv");
     std::fs::write(&file, data).unwrap();
@@ -101,7 +123,7 @@ pub fn metrics(data: &[u8]) -> [bool; 2] {
         assert!(format!("{error:#}").len() < 500 + folder.path().as_os_str().len(), "{error:#}");
     }
     resume_logs(folder.path());
-    // Rows are kept whatever stands in their other columns.
+    // Rows are kept whatever their other columns contain.
     if let Ok(kept) = run::read_metrics(folder.path(), &["iteration"]) {
         assert!(kept[0].iter().all(|&iteration| iteration <= 10.0));
     }
@@ -109,7 +131,7 @@ pub fn metrics(data: &[u8]) -> [bool; 2] {
 }
 
 fn resume_logs(folder: &Path) {
-    let mut report = Report::new(folder, &["eval/goals"], Progress::new(1000, 2000, true));
+    let mut report = Report::new(folder, &["eval/goals"], StatusLine::new(1000, 2000, true));
     report.open_logs(0..10, 1000);
     report.sync();
 }

@@ -1,6 +1,7 @@
-//! What learns: environments, a learner, and what they leave to each other. One iteration of it is the algorithm.
+//! The agent: environments, a learner, and the rollout between them. One of its iterations is the whole algorithm.
 //!
-//! Apart from the training, which decides how long, scores, reports and saves: benchmarks and tests run the very same iterations.
+//! It is separate from the training, which decides how long to train, scores, reports and saves, so that benchmarks and tests
+//! run exactly the same iterations.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -11,10 +12,10 @@ use anyhow::{Context, Result, ensure};
 use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
 use crate::env::{Env, EnvPool, EnvState, Lesson, Repose, Resumable, Task};
-use crate::ppo::{Array, Checkpoint, Fork, Ppo, Progress, Rollout, UpdateStats};
+use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
 use crate::ranks::Division;
 
-// Where a checkpoint keeps the states of the environments.
+// The names under which a checkpoint stores the states of the environments.
 const NUMBERS: &str = "envs.numbers";
 const COUNTERS: &str = "envs.counters";
 
@@ -24,48 +25,53 @@ pub struct Agent<E: Env> {
     pub pool: EnvPool<E>,
     /// The learner.
     pub ppo: Ppo,
-    /// What was collected last; its first observations are those that are acted on next.
+    /// The last rollout; its first observations are the ones to act on next.
     pub rollout: Rollout,
     scratch: Scratch,
-    /// What is trained after so many control steps.
+    /// The lesson at a given number of control steps.
     lessons: Box<dyn Fn(u64) -> E::Lesson + Send>,
-    /// Control steps of an iteration over the environments of all ranks.
+    /// The number of control steps in an iteration, over the environments of all ranks.
     steps: u64,
-    /// Iterations finished.
+    /// The number of finished iterations.
     pub iteration: u64,
-    /// Control steps over all environments.
+    /// The number of control steps so far, over all environments.
     pub env_steps: u64,
-    /// Where it left another training, if it did.
+    /// The point at which it was forked from another training, if it was.
     pub fork: Option<Fork>,
 }
 
-/// What is known of an iteration.
+/// The record of an iteration.
 #[derive(Clone, Copy, Debug)]
 pub struct Iteration<L> {
-    /// What was trained in it.
+    /// The lesson that was trained in it.
     pub lesson: L,
-    /// What was learnt.
+    /// The statistics of the update.
     pub update: UpdateStats,
-    /// Control steps over all environments.
+    /// The number of control steps, over all environments.
     pub steps: u64,
-    /// Seconds of collecting.
+    /// The time spent collecting, s.
     pub collect_s: f64,
-    /// Seconds of learning.
+    /// The time spent learning, s.
     pub update_s: f64,
 }
 
 impl<L> Iteration<L> {
-    /// Control steps a second.
+    /// Returns the control steps per second.
     pub fn steps_per_s(&self) -> f64 {
         self.steps as f64 / (self.collect_s + self.update_s)
+    }
+
+    /// Returns the times and the speed, by name.
+    pub fn time_named(&self) -> [(&'static str, f64); 3] {
+        [("collect_s", self.collect_s), ("update_s", self.update_s), ("steps_per_s", self.steps_per_s())]
     }
 }
 
 impl Agent<Repose> {
-    /// The agent of a training with these settings, which is at the start of its first episodes.
+    /// Creates the agent of a training with these settings, at the start of its first episodes.
     ///
     /// # Errors
-    /// A precision that this machine does not have.
+    /// Fails if this machine does not support the precision.
     pub fn of_task(task: &Arc<Task>, config: &Config) -> Result<Self> {
         let envs = (0..config.env.num_envs).map(|_| Repose::new(task)).collect();
         let training = config.training.clone();
@@ -75,11 +81,11 @@ impl Agent<Repose> {
 }
 
 impl<E: Env> Agent<E> {
-    /// A learner in these environments, those of this rank's shards, which are at the start of their first episodes; all randomness
-    /// follows from `seed`.
+    /// Creates a learner and starts the first episodes of `envs`, the environments of this rank's shards. All randomness follows
+    /// from `seed`.
     ///
     /// # Errors
-    /// A precision that this machine does not have, or a symmetry that the observations do not have.
+    /// Fails if this machine does not support the precision, or if the observations do not have the symmetry.
     pub fn new(
         envs: Vec<E>,
         config: &PpoConfig,
@@ -107,11 +113,11 @@ impl<E: Env> Agent<E> {
         })
     }
 
-    /// Collects and learns. `None` if `stop` was set meanwhile; then, and after an error, the agent must be restored before it is
-    /// used again.
+    /// Runs one iteration: collects a rollout and learns from it. Returns `None` if `stop` was set meanwhile. After that, and
+    /// after an error, the agent must be restored before it is used again.
     ///
     /// # Errors
-    /// A panic in an environment; a loss, gradient or weight that is not finite.
+    /// Fails if an environment panics, or if a loss, gradient or weight is not finite.
     pub fn iterate(&mut self, stop: &AtomicBool) -> Result<Option<Iteration<E::Lesson>>> {
         let started = Instant::now();
         let Some(lesson) = self.collect(stop)? else { return Ok(None) };
@@ -124,10 +130,10 @@ impl<E: Env> Agent<E> {
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
     }
 
-    /// The first half of [`Agent::iterate`]: fills the rollout; tells what was trained.
+    /// Runs the first half of [`Agent::iterate`]: fills the rollout. Returns the lesson, or `None` if `stop` was set meanwhile.
     ///
     /// # Errors
-    /// A panic in an environment.
+    /// Fails if an environment panics.
     pub fn collect(&mut self, stop: &AtomicBool) -> Result<Option<E::Lesson>> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
@@ -139,8 +145,8 @@ impl<E: Env> Agent<E> {
 }
 
 impl<E: Resumable> Agent<E> {
-    /// The state at the end of an iteration, whole, with the configuration of the run (TOML) and its best evaluation.
-    pub fn checkpoint(&self, config: &str, best: Option<[f64; 2]>) -> Checkpoint {
+    /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation.
+    pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
         let progress = Progress { iteration, env_steps, best, fork };
         let mut checkpoint = self.ppo.checkpoint(config, progress);
@@ -151,10 +157,10 @@ impl<E: Resumable> Agent<E> {
         checkpoint
     }
 
-    /// Goes on from what [`Agent::checkpoint`] has saved, bit for bit, and takes it out of the checkpoint.
+    /// Restores what [`Agent::checkpoint`] has saved, bit for bit, and takes it out of the checkpoint.
     ///
     /// # Errors
-    /// A state that no such agent can have saved.
+    /// Fails if no such agent can have saved this state.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
         let Progress { iteration, env_steps, fork, .. } = &checkpoint.progress;
         (self.iteration, self.env_steps, self.fork) = (*iteration, *env_steps, fork.clone());
@@ -165,21 +171,20 @@ impl<E: Resumable> Agent<E> {
     }
 }
 
-/// Makes sure that a checkpoint holds the states of as many environments as the configuration in it says, and of as many steps:
-/// before anything is allocated by what the configuration says.
+/// Checks that the number of steps and of environment states in a checkpoint match its configuration. This must be done before
+/// anything is allocated according to the configuration.
 ///
 /// # Errors
-/// A policy alone; other numbers.
+/// Fails if the checkpoint holds a policy alone, or if the numbers do not match.
 pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     let Progress { iteration, env_steps, ref fork, .. } = checkpoint.progress;
-    // The run that a fork left may have made others in each.
+    // The parent of a fork may have made a different number of steps in each iteration.
     let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
     let own = iteration.checked_sub(before).and_then(|own| own.checked_mul(config.steps_per_iteration()));
     let possible = own.is_some() && own == env_steps.checked_sub(steps_before);
     ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
     for name in [NUMBERS, COUNTERS] {
-        let shape =
-            checkpoint.shape(name).context("it holds a policy alone, which can be played but not trained on")?;
+        let shape = checkpoint.shape(name).context("it holds a policy alone, which can be played but not resumed")?;
         let (rows, expected) = (shape.first().copied().unwrap_or(0), config.env.num_envs);
         ensure!(rows == expected, "it holds the states of {rows} environments, expected {expected}");
     }

@@ -1,4 +1,4 @@
-//! Measures this machine: what the physics alone can do, the environments around it, the learner, and all together.
+//! Measuring the speed of this machine: the physics alone, the environments around it, the learner, and whole iterations.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -11,7 +11,7 @@ use serde_json::json;
 
 use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part};
-use crate::config::{Config, expect_used};
+use crate::config::{Config, expect_used, user_file};
 use crate::env::{
     ACTION_SIZE, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
 };
@@ -21,33 +21,36 @@ use crate::run;
 use crate::schedule::in_rounds;
 use crate::sim::{BareSimulation, SimulationState};
 use crate::spaces::Spaces;
-use crate::train::user_file;
 
-/// Measurements of physics and pool, taken in turn.
+/// The number of rounds of measuring physics and pool.
 const ROUNDS: usize = 5;
 
-/// Measured control steps of a round over all environments, at least.
+/// The minimum number of measured control steps in a round, over all environments.
 const STEPS: usize = 32_768;
 
-/// Control steps of all environments between two turns of a round: the speed of a machine drifts within a second.
+/// Control steps of each environment in a turn. Pool and physics take short turns because the speed of a machine drifts within a
+/// second.
 const TURN: usize = 4;
 
-/// Gradient steps and matrix products that are measured.
+/// The number of gradient steps and of matrix products that are measured.
 const REPEATS: usize = 11;
 
-/// Seconds after which no further whole iteration is begun, and the most iterations.
-const END_TO_END: (f64, usize) = (8.0, 4);
+/// The time after which no further whole iteration is started, s.
+const END_TO_END_S: f64 = 8.0;
 
-/// Nothing stops what is measured.
+/// The maximum number of whole iterations after the first one.
+const END_TO_END_ITERATIONS: usize = 4;
+
+/// The stop flag of what is measured, which is never set.
 static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// Measures and prints.
+/// Runs the benchmark and prints the results.
 ///
 /// # Errors
-/// Settings or a scene that cannot be used.
+/// Fails if a setting or the scene cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
     expect_used(&args.settings.set, "bench")?;
-    let mut config = Config::resolve(user_file(&args.settings)?.as_ref(), &args.settings.set)?;
+    let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
@@ -75,7 +78,11 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if asked(Part::Training) {
         let end_to_end = end_to_end(&task, &config)?;
         figures.push(("end_to_end_steps_per_s", end_to_end));
-        lines += &format!("end to end                {end_to_end:>10.0} steps/s\n");
+        let hours = config.run.total_steps as f64 / end_to_end / 3600.0;
+        let total = config.run.total_steps as f64 / 1e6;
+        figures.push(("default_training_hours", hours));
+        lines +=
+            &format!("end to end                {end_to_end:>10.0} steps/s   {total:.0} M steps take {hours:.1} h\n");
     }
     if args.json {
         let figures = figures.into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
@@ -89,24 +96,24 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     }
 }
 
-/// What an environment did in a turn.
+/// The record of what an environment did in a turn.
 struct Recording {
     /// Its state at the beginning.
     start: SimulationState,
-    /// Its controls, step after step.
+    /// Its controls, step by step.
     ctrl: Vec<f64>,
-    /// Steps made before an episode began, with its first state.
+    /// The episodes that began: the number of steps before each, and its first state.
     resets: Vec<(usize, SimulationState)>,
     steps: usize,
 }
 
-/// An environment that writes down what its physics is given; that is the only difference to the environment of a training.
-struct Recorder {
+/// An environment that records the input of its physics. This is the only difference from the environment of a training.
+struct RecordingEnv {
     env: Repose,
     recording: Recording,
 }
 
-impl Recorder {
+impl RecordingEnv {
     fn new(task: &Arc<Task>) -> Self {
         let env = Repose::new(task);
         let ctrl = Vec::with_capacity(TURN * ACTION_SIZE);
@@ -122,7 +129,7 @@ impl Recorder {
     }
 }
 
-impl Env for Recorder {
+impl Env for RecordingEnv {
     type Episode = EpisodeStats;
     type Lesson = Lesson;
     const SPACES: Spaces = Repose::SPACES;
@@ -156,9 +163,9 @@ impl Env for Recorder {
     }
 }
 
-/// What a block of environments is given and gives in a turn.
+/// The inputs and outputs of a block of environments in a turn.
 struct BlockRows {
-    /// Of all steps of the turn.
+    /// The actions of all steps of the turn.
     actions: Vec<f32>,
     observations: Vec<f32>,
     final_observations: Vec<f32>,
@@ -178,24 +185,24 @@ impl BlockRows {
     }
 }
 
-/// Env steps per second of bare physics and of the pool, medians of rounds taken in turn, and the median of their ratios.
+/// Returns the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
 fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let envs = config.env.num_envs;
     let turns = STEPS.div_ceil(envs * TURN);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
     let mut draw = || config.ppo.std_bounds(0)[1] as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
-    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| Recorder::new(task)).collect());
+    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task)).collect());
     let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
     pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
-    let mut turn = |pool: &mut EnvPool<Recorder>, steps: usize| {
+    let mut turn = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
         for rows in &mut rows {
             rows.actions = (0..steps * rows.rewards.len() * ACTION_SIZE).map(|_| draw()).collect();
         }
-        pool.envs_mut().for_each(Recorder::begin);
+        pool.envs_mut().for_each(RecordingEnv::begin);
         play(pool, &mut rows, steps)
     };
-    // Before what is measured most cubes should have come to lie in the hand; fewer steps for many environments.
+    // Unmeasured steps first, so that most cubes lie in the hand; fewer of them for many environments.
     turn(&mut pool, (2 * STEPS / envs).clamp(4, 64));
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
@@ -206,9 +213,9 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
             let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
             bare_seconds += replay(&mut bare, &recordings, &sizes, config.env.substeps());
             drop(recordings);
-            // The replay did the same physics only if it ended in the same states.
+            // The replay computed the same physics only if it ended in the same states.
             let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
-            ensure!(same, "the replay of the physics has not ended where the environments did");
+            ensure!(same, "the replay of the physics did not end in the states of the environments");
         }
         let done = (turns * TURN * envs) as f64;
         rates[0].push(done / bare_seconds);
@@ -219,7 +226,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     Ok((physics, pool, share))
 }
 
-/// Steps a pool with these actions, as a training does; the seconds that the steps took.
+/// Steps a pool with these actions, as a training does, and returns the seconds that the steps took.
 fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> f64 {
     let blocks: Vec<_> = pool.blocks_mut().iter_mut().zip(rows).collect();
     let start = Instant::now();
@@ -236,7 +243,7 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
     start.elapsed().as_secs_f64()
 }
 
-/// Replays the recordings in the same blocks; the seconds that it took.
+/// Replays the recordings in the same blocks and returns the seconds that the steps took.
 fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], sizes: &[usize], substeps: usize) -> f64 {
     bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| bare.start(&recording.start));
     let steps = recordings[0].steps;
@@ -254,7 +261,7 @@ fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], sizes: &[usize
     start.elapsed().as_secs_f64()
 }
 
-/// Samples per second and GFLOP/s of gradient steps, and GFLOP/s of their matrix products alone.
+/// Returns the samples per second and GFLOP/s of gradient steps, and the GFLOP/s of their matrix products alone.
 fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let mut agent = Agent::of_task(task, config)?;
     agent.collect(&NEVER)?;
@@ -267,14 +274,15 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     Ok((samples, 1e-9 * flops * samples, matmul))
 }
 
-/// Env steps per second of whole iterations of a training with these settings, the first one aside if there are more.
+/// Returns the env steps per second of whole iterations of a training with these settings, without the first one if there are
+/// more.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
     let mut agent = Agent::of_task(task, config)?;
     let begun = Instant::now();
     let mut rates = Vec::new();
-    for _ in 0..=END_TO_END.1 {
+    for _ in 0..=END_TO_END_ITERATIONS {
         rates.push(agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s());
-        if begun.elapsed().as_secs_f64() > END_TO_END.0 {
+        if begun.elapsed().as_secs_f64() > END_TO_END_S {
             break;
         }
     }

@@ -1,194 +1,279 @@
-//! The command line: its shape and its help, no logic.
+//! The command line: its structure and help texts. What the commands do is elsewhere.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
 use clap::error::ErrorKind;
-use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
-use crate::config::Override;
-use crate::sim::{Camera, Quality};
+use crate::config::{Config, Override};
+use crate::sim::{self, Camera, Quality};
 
-/// The largest whole number of a TOML file.
+/// The largest integer in a TOML file.
 const LARGEST: u64 = i64::MAX as u64;
 
-/// Accepts a number of threads, within the rule of `run.threads`.
+/// Parses a number of threads, within the limits of `run.threads`.
 fn threads() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(0..=4096)
 }
 
-/// Trains a simulated Shadow Hand to turn a cube in its palm to any asked orientation, on a CPU.
+// The groups of options in the help.
+const SETTINGS: &str = "Settings";
+const START: &str = "Start from";
+const RUN_FOLDER: &str = "Run folder";
+const POLICY: &str = "Policy";
+const TASK: &str = "Task";
+const OUTPUT: &str = "Output";
+const PICTURE: &str = "Film, picture and window";
+
+/// Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 #[derive(Debug, Parser)]
-#[command(version, arg_required_else_help = true)]
+#[command(arg_required_else_help = true)]
 pub struct Cli {
-    /// What to do.
+    /// The command to run.
     #[command(subcommand)]
     pub command: Command,
 }
 
-/// The commands.
+/// The commands of the program.
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
     Train(TrainArgs),
-    /// Let a policy play: in a window, as a film, or without either, for its score
+    /// Play a policy in a window, as a film, or for its score alone
     Play(PlayArgs),
-    /// Look at the scene, without a policy
+    /// Show the scene without a policy
     View(ViewArgs),
-    /// Draw the learning curves of runs: SVG, or PNG
+    /// Plot the learning curves of runs as SVG or PNG
     Plot(PlotArgs),
-    /// Measure this machine: physics, environments, learner, and all together
+    /// Measure the speed of this machine: physics, environments, learner and whole iterations
     Bench(BenchArgs),
+    /// Print completions for a shell
+    Completions(CompletionsArgs),
+    /// Print a manual page
+    Man,
 }
 
-/// Settings as every command takes them.
+/// Two examples for the end of the help of each command; the empty name is the program itself.
+const EXAMPLES: [(&str, [&str; 2]); 8] = [
+    ("", ["shadow-repose play --ckpt builtin", "shadow-repose train"]),
+    ("train", ["shadow-repose train --seed 1 --name first", "shadow-repose train --resume"]),
+    ("play", ["shadow-repose play --ckpt builtin --headless", "shadow-repose play --video film.mp4"]),
+    ("view", ["shadow-repose view --actions wave", "shadow-repose view --screenshot hand.png"]),
+    (
+        "plot",
+        ["shadow-repose plot runs/shadow-hand-repose/*", "shadow-repose plot RUN --metric eval/goals --out goals.png"],
+    ),
+    ("bench", ["shadow-repose bench", "shadow-repose bench --only training --threads 4"]),
+    (
+        "completions",
+        [
+            "shadow-repose completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
+            "shadow-repose completions zsh > ~/.zfunc/_shadow-repose",
+        ],
+    ),
+    ("man", ["shadow-repose man | man -l -", "shadow-repose man > ~/.local/share/man/man1/shadow-repose.1"]),
+];
+
+/// Returns the command line with what is only known at run time: version, defaults that are settings, examples.
+pub fn command() -> clap::Command {
+    let run = Config::resolve(None, &[]).expect("the defaults are valid").run;
+    let defaults = [
+        ("{seed}", run.seed.to_string()),
+        ("{threads}", run.threads.to_string()),
+        ("{total_steps}", run.total_steps.to_string()),
+    ];
+    let with_defaults = |arg: clap::Arg| {
+        let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+        let filled = defaults.iter().fold(help.clone(), |help, (key, value)| help.replace(key, value));
+        if filled == help { arg } else { arg.help(filled) }
+    };
+    let (program, commit) = (env!("CARGO_PKG_VERSION"), env!("SHADOW_REPOSE_COMMIT"));
+    let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
+    // `view` makes no films.
+    let picture = |view: clap::Command| {
+        let set = "Change one env.* setting, e.g. env.model=my_scene.xml; repeatable, overrides the file";
+        view.mut_arg("set", |arg| arg.help(set))
+            .mut_arg("size", |arg| arg.help("Size of the picture in pixels [default: 1280x720]"))
+            .mut_arg("quality", |arg| {
+                arg.help("Rendering quality; high adds shadows, reflections and smooth edges [default: high]")
+            })
+    };
+    let mut command = Cli::command().version(version).max_term_width(100).mut_subcommand("view", picture);
+    // The same help for -h and --help, and for all commands.
+    let with_help = |command: clap::Command| {
+        let help = clap::Arg::new("help").short('h').long("help").action(clap::ArgAction::HelpShort).help("Print help");
+        command.disable_help_flag(true).arg(help)
+    };
+    command = with_help(command);
+    for (name, examples) in EXAMPLES {
+        let examples = format!("Examples:\n  {}", examples.join("\n  "));
+        command = match name {
+            "" => command.after_help(examples),
+            _ => {
+                command.mut_subcommand(name, |command| with_help(command.after_help(examples).mut_args(with_defaults)))
+            }
+        };
+    }
+    command
+}
+
+/// Parses the command line of this process.
+///
+/// # Errors
+/// Fails if the command line is wrong, or asks for help or the version.
+pub fn parse() -> Result<Cli, clap::Error> {
+    Cli::from_arg_matches(&command().try_get_matches()?).map_err(|error| error.format(&mut command()))
+}
+
+/// The options that change settings.
 #[derive(Args, Debug, Default)]
 pub struct Settings {
-    /// Settings that differ from the defaults (TOML)
-    #[arg(long, value_name = "FILE")]
+    /// TOML file with the settings that differ from the defaults
+    #[arg(long, value_name = "FILE", help_heading = SETTINGS)]
     pub config: Option<PathBuf>,
-    /// One setting, as ppo.learning_rate=1e-4; may be repeated and wins over the file
-    #[arg(long, value_name = "KEY=VALUE")]
+    /// Change one setting, e.g. ppo.learning_rate=1e-4; repeatable, overrides the file
+    #[arg(long, value_name = "KEY=VALUE", help_heading = SETTINGS)]
     pub set: Vec<Override>,
 }
 
-/// `train`
+/// The options of `train`.
 #[derive(Args, Debug, Default)]
 pub struct TrainArgs {
-    /// File and single settings.
+    /// The configuration file and single settings.
     #[command(flatten)]
     pub settings: Settings,
-    /// All randomness follows from it [default: run.seed]
-    #[arg(long, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
+    /// Random seed of the run [default: {seed}]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
     pub seed: Option<u64>,
-    /// Worker threads, 0 for one per core [default: run.threads]
-    #[arg(long, value_name = "N", value_parser = threads())]
+    /// Number of worker threads; 0: one per core [default: {threads}]
+    #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,
-    /// Control steps over all hands, counted from the start of the run [default: run.total_steps]
-    #[arg(long, value_name = "STEPS", value_parser = steps)]
+    /// Total control steps over all hands, counted from the start of the run [default: {total_steps}]
+    #[arg(long, value_name = "STEPS", value_parser = steps, help_heading = SETTINGS)]
     pub total_steps: Option<u64>,
-    /// Added to the name of the run folder
-    #[arg(long)]
+    /// Suffix of the name of the run folder
+    #[arg(long, help_heading = RUN_FOLDER)]
     pub name: Option<String>,
-    /// The run folder itself, instead of runs/shadow-hand-repose/DATE-TIME[-NAME]
-    #[arg(long, value_name = "DIR", conflicts_with = "name")]
+    /// Path of the run folder, instead of runs/shadow-hand-repose/DATE-TIME[-NAME]
+    #[arg(long, value_name = "DIR", conflicts_with = "name", help_heading = RUN_FOLDER)]
     pub run_dir: Option<PathBuf>,
-    /// Go on with a run, in its folder and with its settings; takes the folder or one of its checkpoints
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "seed", "name", "run_dir"])]
-    pub resume: Option<PathBuf>,
-    /// Begin with the policy of a checkpoint or run, or the built-in one, weights and normaliser; everything else is as in a new
-    /// run
-    #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume")]
+    /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
+    #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
+    pub resume: Option<Option<PathBuf>>,
+    /// Start from the policy (weights and normaliser) of this checkpoint or run, or from the built-in one; everything else is as
+    /// in any new run
+    #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
-    /// Begin a new run with everything of another one's checkpoint (weights, hands, counters; ramps go on), under changed settings;
-    /// takes the folder or one of its checkpoints
-    #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"])]
+    /// Start a new run from the full state of this run or checkpoint (weights, hands, counters; ramps continue), with changed
+    /// settings
+    #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
-    /// How many of the newest checkpoints to keep [default: 2, or as many as there are in a run that is resumed]
-    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000), help_heading = RUN_FOLDER)]
     pub keep: Option<usize>,
-    /// Save and exit with 0 after this time, as 3h50m
+    /// Save and exit with code 0 after this time, e.g. 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
     pub stop_after: Option<Duration>,
-    /// No progress and no hints; warnings, evaluations and the last line are still said
+    /// Hide progress and hints about settings; warnings, evaluations and the final line are still printed
     #[arg(long)]
     pub quiet: bool,
     /// Write the last steps of every episode whose physics diverged, for replay
-    #[arg(long)]
+    #[arg(long, help_heading = RUN_FOLDER)]
     pub dump_diverged: bool,
 }
 
-/// `play`
+/// The options of `play`.
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// A checkpoint, a run folder (its best checkpoint, or its latest), or builtin: the policy that comes with the program
-    /// [default: the newest run, or if there is none the policy that comes with the program]
-    #[arg(long, value_name = "FILE|RUN|builtin")]
+    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest) or builtin, the policy that comes
+    /// with the program [default: the newest run, or builtin if there is none]
+    #[arg(long, value_name = "FILE|RUN|builtin", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Whole episodes to play, every one counted [default: 256; in a window, until it is closed; in a film, 1]
-    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film, 1]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
-    /// Episode k is drawn from (seed, k)
-    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
+    /// Random seed; episode k is drawn from (seed, k)
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = TASK)]
     pub seed: u64,
-    /// Worker threads, 0 for one per core
+    /// Number of worker threads; 0: one per core
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads())]
     pub threads: usize,
-    /// Draw actions from the policy's distribution instead of taking their mean
-    #[arg(long, conflicts_with = "policy")]
+    /// Sample actions from the policy's distribution instead of using its mean
+    #[arg(long, conflicts_with = "policy", help_heading = POLICY)]
     pub stochastic: bool,
-    /// One env.* setting of the task that is played; may be repeated
-    #[arg(long, value_name = "KEY=VALUE")]
+    /// Change one env.* setting of the task; repeatable
+    #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,
-    /// Play this instead of a checkpoint
-    #[arg(long, conflicts_with = "ckpt")]
+    /// Play a baseline instead of a checkpoint: actions of 0, or uniformly random ones
+    #[arg(long, conflicts_with = "ckpt", help_heading = POLICY)]
     pub policy: Option<Baseline>,
-    /// Play in a window, at real time [default: where there is a display]
-    #[arg(long, conflicts_with_all = ["headless", "json", "trace", "video"])]
+    /// Play in a window in real time [default if there is a display]
+    #[arg(long, conflicts_with_all = ["headless", "json", "trace", "video"], help_heading = OUTPUT)]
     pub window: bool,
     /// Play without a window and print the score
-    #[arg(long)]
+    #[arg(long, help_heading = OUTPUT)]
     pub headless: bool,
-    /// Print the score as one JSON object and nothing else
-    #[arg(long)]
+    /// Print only the score, as one JSON object
+    #[arg(long, help_heading = OUTPUT)]
     pub json: bool,
-    /// Write the first episodes, whole, as JSON lines: at least 2000 records
-    #[arg(long, value_name = "FILE")]
+    /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
+    #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub trace: Option<PathBuf>,
-    /// Film the episodes, one after the other: MP4 or GIF, by the name; needs no display
-    #[arg(long, value_name = "FILE")]
+    /// Film the episodes one after another, as .mp4 or .gif; needs no display
+    #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub video: Option<PathBuf>,
-    /// Frames of a film per second of its episodes
-    #[arg(long, default_value_t = 50, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120))]
+    /// Frames of the film per second of simulated time
+    #[arg(long, default_value_t = 50, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120), help_heading = PICTURE)]
     pub fps: u32,
-    /// How it is looked at.
+    /// Size, camera and rendering.
     #[command(flatten)]
     pub shot: Shot,
 }
 
-/// `view`
+/// The options of `view`.
 #[derive(Args, Debug)]
 pub struct ViewArgs {
-    /// File and single settings.
+    /// The configuration file and single settings.
     #[command(flatten)]
     pub settings: Settings,
-    /// What moves the hand
-    #[arg(long, value_enum, default_value_t = Motion::Zero)]
+    /// Motion of the hand: still, random, or a slow swing of each actuator
+    #[arg(long, value_enum, default_value_t = Motion::Zero, help_heading = SETTINGS)]
     pub actions: Motion,
-    /// Episode k is drawn from (seed, k)
-    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST))]
+    /// Random seed; episode k is drawn from (seed, k)
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
     pub seed: u64,
-    /// Draw one picture (PNG) instead of opening a window, and exit; needs no display
-    #[arg(long, value_name = "FILE")]
+    /// Write one PNG picture and exit, without opening a window; needs no display
+    #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub screenshot: Option<PathBuf>,
-    /// Seconds of the episode before the picture
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "screenshot", value_parser = seconds)]
+    /// Time of the picture in the episode, in seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]
     pub at: f64,
-    /// How it is looked at.
+    /// Size, camera and rendering.
     #[command(flatten)]
     pub shot: Shot,
 }
 
-/// How a scene is looked at.
+/// The options for size, camera and rendering.
 #[derive(Args, Clone, Debug)]
 pub struct Shot {
-    /// Width and height of film or picture in pixels [default: 640x480; of one picture 1280x720]
-    #[arg(long, value_name = "WxH", value_parser = size)]
+    /// Size of the film in pixels [default: 640x480]
+    #[arg(long, value_name = "WxH", value_parser = size, help_heading = PICTURE)]
     pub size: Option<[u32; 2]>,
-    /// The direction of view in degrees and its distance in m, as 150,-27,0.66
-    #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true)]
+    /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
+    #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
     pub camera: Option<Camera>,
-    /// fast, or high: with shadows, reflections and smooth edges [default: fast for a film, else high]
-    #[arg(long, value_parser = quality, value_name = "fast|high")]
+    /// Rendering quality; high adds shadows, reflections and smooth edges [default: fast for a film, else high]
+    #[arg(long, value_parser = quality, value_name = "fast|high", help_heading = PICTURE)]
     pub quality: Option<Quality>,
-    /// Show the primitives that collide instead of the real hand's meshes
-    #[arg(long)]
+    /// Show the primitives used for collisions instead of the hand's meshes
+    #[arg(long, help_heading = PICTURE)]
     pub plain: bool,
 }
 
 impl Shot {
-    /// The first of the options that were given.
+    /// Returns the name of the first of these options that was given.
     pub fn given(&self) -> Option<&'static str> {
         let given = [
             ("--size", self.size.is_some()),
@@ -200,26 +285,26 @@ impl Shot {
     }
 }
 
-/// A line for the command of this name that cannot be meant, though each of its parts can.
+/// Returns a usage error for the command `name`, for options that are valid alone but not in combination.
 pub fn usage_error(name: &str, text: &str) -> clap::Error {
-    let mut command = Cli::command();
+    let mut command = command();
     command.build();
     command.find_subcommand_mut(name).expect("a command").error(ErrorKind::ArgumentConflict, text)
 }
 
-/// What moves the hand in `view`.
+/// The motion of the hand in `view`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Motion {
-    /// Every actuator in the middle of its range
+    /// Every actuator stays in the middle of its range
     Zero,
     /// Uniformly random actions
     Random,
-    /// Each actuator swings slowly around the middle, a little after the one before it
+    /// Each actuator swings slowly around the middle of its range, slightly after the previous one
     Wave,
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
-    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, as 640x480")?;
+    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
     let pixels = |text: &str, largest: u32| match text.parse() {
         Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
         _ => Err(format!("{text} must be a whole number from 16 to {largest}")),
@@ -233,23 +318,23 @@ fn camera(text: &str) -> Result<Camera, String> {
         Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
             match (0.05..=10.0).contains(&distance) {
                 true => Ok(Camera { azimuth, elevation, distance }),
-                false => Err(format!("the distance {distance} m must be from 0.05 to 10")),
+                false => Err(format!("the distance of {distance} m must be from 0.05 to 10 m")),
             }
         }
-        _ => Err("must be three numbers, as 150,-27,0.66".into()),
+        _ => Err("must be three numbers, e.g. 150,-27,0.66".into()),
     }
 }
 
 fn steps(text: &str) -> Result<u64, String> {
-    // 1e8 is how people write a large number of steps.
+    // Users write large numbers of steps as 1e8.
     let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
     let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
-    steps.ok_or_else(|| "must be a whole number from 1, as 30000000 or 3e7".into())
+    steps.ok_or_else(|| "must be a whole number of at least 1, e.g. 30000000 or 3e7".into())
 }
 
 fn time(text: &str) -> Result<Duration, String> {
     let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
-    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time, as 3h50m, 90m or 30s".into())
+    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
 }
 
 fn quality(text: &str) -> Result<Quality, String> {
@@ -268,68 +353,88 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Policies that need no checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Baseline {
-    /// Always answers 0: every actuator in the middle of its range
+    /// Actions are always 0: every actuator stays in the middle of its range
     Zero,
     /// Uniformly random actions
     Random,
 }
 
-/// `plot`
+/// The options of `plot`.
 #[derive(Args, Debug)]
 pub struct PlotArgs {
-    /// Run folders, or their metrics.csv
+    /// Run folders or their metrics.csv files
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
-    /// The picture: SVG or PNG, by the name
+    /// Picture to write, as .svg or .png
     #[arg(long, value_name = "FILE", default_value = "learning.svg")]
     pub out: PathBuf,
-    /// A column of metrics.csv, each in a panel of its own; may be repeated [default: goals, rotation error and drops per episode]
+    /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, rotation error and
+    /// drop rate in training]
     #[arg(long, value_name = "COLUMN")]
     pub metric: Vec<String>,
-    /// What is laid along
+    /// Quantity on the x axis: control steps, or hours of collecting and learning
     #[arg(long, value_enum, default_value_t = Along::Steps)]
     pub along: Along,
-    /// Iterations that a point of a curve is the mean of
+    /// Number of iterations averaged into each point of a curve, counted in those of the run with the shortest ones
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub smooth: usize,
-    /// Pixels of the whole picture [default: 800 wide, 260 for each panel]
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    /// Size of the picture in pixels [default: width 800, height 260 per panel]
+    #[arg(long, value_name = "WxH", value_parser = size)]
     pub size: Option<[u32; 2]>,
 }
 
-/// What a learning curve is drawn along.
+/// The quantity on the x axis of a learning curve.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Along {
     /// Control steps over all environments
     Steps,
-    /// Hours spent collecting and learning, without evaluations and saving
+    /// Hours of collecting and learning, without evaluations and saving
     Hours,
 }
 
-/// `bench`
+/// The options of `bench`.
 #[derive(Args, Debug)]
 pub struct BenchArgs {
-    /// File and single settings.
+    /// The configuration file and single settings.
     #[command(flatten)]
     pub settings: Settings,
-    /// Worker threads, 0 for one per core [default: run.threads]
-    #[arg(long, value_name = "N", value_parser = threads())]
+    /// Number of worker threads; 0: one per core [default: {threads}]
+    #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,
-    /// Measure only this part
+    /// Measure only this part: physics and environments, gradient steps, or whole iterations
     #[arg(long, value_enum, value_name = "PART")]
     pub only: Option<Part>,
-    /// Print one JSON object and nothing else
+    /// Print only the results, as one JSON object
     #[arg(long)]
     pub json: bool,
 }
 
-/// A part of the machine's speed.
+/// A part of the benchmark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Part {
-    /// The bare physics, and the environments around it
+    /// Bare physics, and the environments around it
     Physics,
-    /// Gradient steps, and their bare matrix products
+    /// Gradient steps, and their matrix products alone
     Learner,
-    /// Whole iterations
+    /// Whole iterations of training
     Training,
+}
+
+/// The options of `completions`.
+#[derive(Args, Debug)]
+pub struct CompletionsArgs {
+    /// The shell that completes
+    #[arg(value_enum)]
+    pub shell: Shell,
+}
+
+/// A shell that can complete the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Shell {
+    /// The Bourne again shell
+    Bash,
+    /// The Z shell
+    Zsh,
+    /// The friendly interactive shell
+    Fish,
 }

@@ -1,7 +1,7 @@
 //! Collecting a rollout: the policy acts and the environments step, block by block, on all threads.
 //!
-//! A block of environments goes through its steps by itself, with the policy that all share: no thread waits for the
-//! others before the rollout is whole.
+//! Each block of environments goes through its steps independently, with the policy that all share: no thread waits for the
+//! others before the rollout is complete.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -12,7 +12,7 @@ use crate::ppo::{Acting, Ppo, Rollout, RolloutBlock, Workspace};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
 
-/// Arrays that a collection needs besides the rollout, for each block.
+/// Arrays that a collection needs besides the rollout, per block.
 pub struct Scratch {
     blocks: Vec<BlockScratch>,
 }
@@ -24,7 +24,7 @@ struct BlockScratch {
 }
 
 impl Scratch {
-    /// For the environments of `pool` and the policy of `ppo`.
+    /// Creates the arrays for the environments of `pool` and the policy of `ppo`.
     pub fn new<E: Env>(pool: &EnvPool<E>, ppo: &Ppo) -> Self {
         let block = |envs| BlockScratch {
             ends: vec![None; envs],
@@ -35,7 +35,7 @@ impl Scratch {
     }
 }
 
-/// A block on its way through a rollout.
+/// A block that is collecting a rollout.
 struct Collecting<'a, E: Env> {
     envs: &'a mut EnvBlock<E>,
     rollout: &'a mut RolloutBlock,
@@ -44,11 +44,11 @@ struct Collecting<'a, E: Env> {
     result: Result<()>,
 }
 
-/// Steps the pool through a whole rollout with actions of the learner; false if `interrupted` was set meanwhile:
-/// then blocks have come to different steps, and the pool must be restored before it collects again.
+/// Steps the pool through a whole rollout with the learner's actions. Returns false if `interrupted` was set meanwhile: the
+/// blocks may then be at different steps, and the pool must be restored before it collects again.
 ///
 /// # Errors
-/// A panic in an environment, with its number.
+/// Fails with the environment's number if an environment panics.
 pub fn collect<E: Env>(
     pool: &mut EnvPool<E>,
     ppo: &Ppo,

@@ -5,8 +5,8 @@ use serde_json::{Value, json};
 use crate::config::EnvConfig;
 use crate::env::Diverged;
 
-/// One object: `state` is that of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first of the steps, `ctrl` the
-/// controls of each step in the model's order, `actions` what the policy asked for.
+/// Returns one object: `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step, `ctrl` the controls
+/// of each step in the model's order, and `actions` the policy's actions.
 pub fn of(diverged: &Diverged, config: &EnvConfig, iteration: u64, env: usize) -> String {
     let tail = &diverged.tail;
     let actions: Vec<Value> = tail.actions.iter().map(|action| json!(action.as_slice())).collect();

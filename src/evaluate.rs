@@ -1,7 +1,7 @@
-//! Plays whole episodes of the task, every one counted: what a score is made of.
+//! The evaluation of an actor: plays whole episodes of the task, all of which count towards a score.
 //!
-//! Episode k depends on (seed, k) and the actor alone. Episodes run in groups of a fixed size, one in each lane, so that the
-//! nets always see batches of one shape and the result does not depend on threads or on how many episodes are asked for.
+//! Episode k depends only on the seed, the purpose, k and the actor. Episodes run in groups of a fixed size, one per lane, so
+//! that the nets always see batches of the same shape and results do not depend on threads or the number of episodes.
 
 use std::f64::consts::TAU;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -17,23 +17,23 @@ use crate::ppo::{FrozenPolicy, Workspace};
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
 
-/// Episodes that run together.
+/// The number of episodes that run together.
 const LANES: usize = 64;
 
-/// Control steps of one swing of [`Actor::Wave`].
+/// The period of [`Actor::Wave`] in control steps.
 const SWING: f64 = 300.0;
 
-/// What chooses the actions.
+/// The source of actions.
 pub enum Actor<'a> {
     /// The mean action of a policy.
     Mean(FrozenPolicy<'a>),
     /// Actions drawn from the distribution of a policy.
     Stochastic(FrozenPolicy<'a>),
-    /// Always 0.
+    /// Zero actions.
     Zero,
-    /// Uniform in [-1, 1].
+    /// Uniform random actions in [-1, 1].
     Random,
-    /// Each actuator swings slowly around the middle of its range, a little after the one before it.
+    /// Slow swings of each actuator around the middle of its range, each a little later than the previous actuator's.
     Wave,
 }
 
@@ -42,23 +42,23 @@ pub enum Actor<'a> {
 pub struct Episodes {
     /// Episode k is drawn from (seed, purpose, k).
     pub seed: u64,
-    /// What they are for: the episodes that choose a policy are not those that score it.
+    /// The purpose of the episodes: a policy is not scored on the episodes that selected it.
     pub purpose: &'static str,
-    /// Number of the first episode.
+    /// The number of the first episode.
     pub first: usize,
-    /// How many.
+    /// The number of episodes.
     pub count: usize,
 }
 
-/// What an observer of the episodes sees: a reset, or a step just taken.
+/// An observer's view of an episode after a reset or a step.
 pub struct Moment<'a> {
-    /// Number of the episode.
+    /// The number of the episode.
     pub episode: usize,
-    /// The environment after it.
+    /// The environment after the reset or step.
     pub env: &'a Repose,
-    /// The observation after it.
+    /// The observation after the reset or step.
     pub observation: &'a [f32],
-    /// The action as the actor gave it and whether the episode ended; `None` at a reset.
+    /// The action as the actor chose it, and the end of the episode if this step ended it; `None` at a reset.
     pub step: Option<(&'a [f32], Option<End>)>,
 }
 
@@ -80,11 +80,11 @@ impl Lane {
     }
 }
 
-/// Plays the episodes and returns them in order, or `None` if `interrupted` was set meanwhile. The observer sees the moments
-/// of one episode in order, those of different episodes interleaved.
+/// Plays the episodes and returns them in order, or `None` if `interrupted` was set meanwhile. The observer sees the steps of
+/// one episode in order, interleaved with those of others.
 ///
 /// # Errors
-/// The observer's; a panic in an episode, with its number.
+/// Fails if the observer does, or, with the episode's number, if an episode panics.
 pub fn evaluate(
     task: &Arc<Task>,
     actor: &Actor,
@@ -120,7 +120,7 @@ pub fn evaluate(
                 .enumerate()
                 .filter(|(_, (((lane, _), _), _))| lane.running)
                 .try_for_each(|(i, (((lane, action), row), end))| {
-                    // What a panic leaves half done is not used again.
+                    // Unwind safe: a state that a panic left inconsistent is not used again.
                     let stepped = catch_unwind(AssertUnwindSafe(|| *end = lane.env.step(action, row).end));
                     stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
                 })?;
@@ -138,6 +138,17 @@ pub fn evaluate(
 }
 
 impl Actor<'_> {
+    /// Returns the actor's name as shown beside its score.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Actor::Mean(_) => "policy",
+            Actor::Stochastic(_) => "policy, stochastic",
+            Actor::Zero => "zero actions",
+            Actor::Random => "random actions",
+            Actor::Wave => "swinging actions",
+        }
+    }
+
     fn policy(&self) -> Option<&FrozenPolicy<'_>> {
         match self {
             Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
@@ -145,10 +156,10 @@ impl Actor<'_> {
         }
     }
 
-    /// Writes the actions of all lanes; a lane that has ended gets one too, which is not used.
+    /// Writes the actions of all lanes; those of lanes that have ended are not used.
     fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
-            policy.forward(observations, Some(actions), None, work);
+            policy.mean_actions(observations, actions, work);
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
             match self {
@@ -173,17 +184,17 @@ impl Actor<'_> {
     }
 }
 
-/// One environment that is played episode after episode, a step at a time, by an actor that may change.
+/// One environment played episode after episode, one step at a time, by an actor that may change.
 pub struct Player {
     lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
-    /// What the policy needs, from its first step on.
+    /// The policy's workspace, from its first step on.
     work: Option<Workspace>,
 }
 
 impl Player {
-    /// A player at the start of the first of these episodes; how many they are is up to the caller.
+    /// Creates a player at the start of the first of `episodes`; the caller counts the episodes.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
         let (observation, action) = (vec![0.0; OBSERVATION_SIZE], vec![0.0; ACTION_SIZE]);
         let mut player = Self { lane: Lane::new(task), observation, action, work: None };
@@ -191,12 +202,13 @@ impl Player {
         player
     }
 
-    /// Starts this episode.
+    /// Starts the episode with the given number.
     pub fn start(&mut self, episodes: Episodes, episode: usize) {
         self.lane.start(episodes, episode, &mut self.observation);
     }
 
-    /// Takes one step as `actor` chooses, whose policy is always the same; tells if it was the last of the episode.
+    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it. The policy must be
+    /// the same in every call.
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
         self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
@@ -209,12 +221,12 @@ impl Player {
         self.lane.env.redirect(&mut self.observation);
     }
 
-    /// The environment.
+    /// Returns the environment.
     pub fn env(&self) -> &Repose {
         &self.lane.env
     }
 
-    /// The environment, to be shown and pulled at.
+    /// Returns the environment for the window, which lets the user pull at it.
     pub fn env_mut(&mut self) -> &mut Repose {
         &mut self.lane.env
     }
@@ -237,10 +249,11 @@ mod tests {
             let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
-            // Cube and goal are one: as they are, and turned by half a turn about their own x.
+            // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let mut observations = vec![0.1; 2 * OBSERVATION_SIZE];
             for (row, q) in observations.chunks_exact_mut(OBSERVATION_SIZE).zip([[1.0, 0.0], [0.0, 1.0]]) {
-                for place in SPACES.cube_and_goal.unwrap() {
+                let places = SPACES.cube_and_goal.unwrap();
+                for place in [places.cube, places.goal] {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
                 }
             }

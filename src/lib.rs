@@ -1,67 +1,70 @@
-//! Trains a simulated Shadow Hand to turn a cube in its palm to any asked orientation, on a CPU.
+//! Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 //!
 //! # Vocabulary
 //! A *substep* is one physics step, a *step* (or control step) one action of an environment, an *iteration* one rollout of
-//! all environments and the update that learns from it. An *episode* ends *terminated* (the cube was dropped, the physics
+//! all environments and the update that learns from it. An *episode* ends *terminated* (the cube was dropped or the physics
 //! diverged) or *truncated* (time is up). A *goal* is an orientation; it is *reached* when the cube has been within the
-//! tolerance for long enough. Quaternions are w, x, y, z; units are SI and radians, the frame is the world's where nothing
-//! else is said. Doubles in the simulation, floats from the observation on.
+//! tolerance for long enough. Quaternions have the order w, x, y, z. Units are SI and radians; the frame is the world frame
+//! unless stated otherwise. The simulation uses `f64`; everything from the observation on uses `f32`.
 //!
 //! # Modules
-//! | module | what it is |
-//! |---|---|
-//! | [`cli`] | the shape of the command line |
-//! | [`config`] | all settings, their defaults and rules |
-//! | [`train`] | the training, from top to bottom: collect, learn, evaluate, report, save |
-//! | [`agent`] | what learns: environments, learner, rollout; one iteration of it |
-//! | [`mod@collect`] | environments stepping under the policy |
-//! | [`mod@evaluate`] | whole episodes under one policy: what scores are made of |
-//! | [`dump`] | what led to a diverged state, as JSON |
-//! | [`load`] | checkpoints and policies from files that nobody vouches for |
-//! | [`play`], [`pace`], [`trace`] | a policy plays: scores as table and JSON; how long goals take; episodes as JSON lines |
-//! | [`mod@view`] | the scene without a policy |
-//! | [`scenery`], [`window`], [`film`] | the task in a scene to be looked at; interactively; as a film or a picture |
-//! | [`plot`] | learning curves of runs |
-//! | [`mod@bench`] | what this machine can do |
-//! | [`mod@env`] | the task: observation (one table), reward, what training changes of it; many of them in blocks |
-//! | [`schedule`] | blocks of work on all threads, through many rounds without a barrier |
-//! | [`sim`] | the fence around MuJoCo |
-//! | [`ppo`] | the learner: flat parameters, policy, two ways to a gradient (`kernels`, ours; `candle`), one Adam, checkpoints |
-//! | [`ranks`] | how a training is divided: shards, and the ranks that compute them |
-//! | [`spaces`] | what a learner must know of observations and actions |
-//! | [`run`] | the outside: run folder, logs, terminal, signals |
-//! | [`quat`], [`rng`] | rotations; generators named by (seed, purpose, index) |
+//! From top to bottom. A test compares the last column with the actual imports.
 //!
-//! Direction of knowledge: `main → commands (train, play, view, plot, bench) → {agent, evaluate, window, film} → {collect, load} →
-//! {env → sim, ppo, run} → {config, ranks, spaces, rng, quat, schedule}`. `env` and `ppo` do not know each other, `run` knows neither;
-//! a test holds the fences up.
+//! | module | what it is | imports |
+//! |---|---|---|
+//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, manual, play, plot, run, train, view |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, run, schedule, sim |
+//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, ppo, run, see, sim, trace |
+//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
+//! | [`mod@plot`] | learning curves of runs | cli, run |
+//! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, ppo, rng, run, schedule, sim, spaces |
+//! | [`manual`] | shell completions and a manual page | cli, run |
+//! | [`see`] | rendering of the task: window, film, picture | cli, config, env, evaluate, run, sim |
+//! | [`trace`] | episodes as JSON lines | config, env, evaluate |
+//! | [`pace`] | statistics of the time to reach a goal | config, env, evaluate |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, rng, schedule |
+//! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
+//! | [`load`] | checkpoints and policies from untrusted files | config, env, ppo, run |
+//! | [`dump`] | the steps that led to a diverged state, as JSON | config, env |
+//! | [`cli`] | the structure of the command line | config, sim |
+//! | [`mod@env`] | the task: observation (one table), reward, changes for training; many environments in blocks | config, quat, ranks, rng, schedule, sim, spaces |
+//! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, quat, ranks, rng, spaces |
+//! | [`sim`] | the only interface to MuJoCo | quat, schedule |
+//! | [`config`] | all settings, their defaults and rules | run |
+//! | [`run`] | the outside world: run folder, files, logs, terminal, signals | - |
+//! | [`ranks`] | the division of a training into shards, and the ranks that compute them | - |
+//! | [`spaces`] | what a learner needs to know about observations and actions | - |
+//! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
+//! | [`quat`] | rotations | - |
+//! | [`rng`] | random generators named by (seed, purpose, index) | - |
+//!
+//! `env` and `ppo` do not depend on each other: they meet in `collect`, `evaluate` and the modules above. `run` depends on
+//! neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal) is
+//! confined to one folder, unsafe code to three files.
 //!
 //! # Data path of an iteration
-//! N environments in blocks of n, T steps, O and A numbers in an observation and an action; a block's arrays are time-major
-//! and allocated once. Each block goes through this by itself, on whichever thread is free:
+//! There are N environments in blocks of n, T steps, and O and A values in an observation and an action. A block's arrays
+//! are time-major and allocated once. Each block goes through these steps independently, on whichever thread is free:
 //! ```text
 //! observations[t] --acting.act--> actions[t], log_probs[t], values[t]
-//! actions[t] --envs.step--> rewards[t], ends, observations[t + 1] (of the new episode where one ended), final observations
-//! rewards[t] --acting.settle--> scaled; + γ V(final observation) where the episode was truncated or its goal replaced
+//! actions[t] --envs.step--> rewards[t], ends, observations[t + 1] (of the new episode if one ended), final observations
+//! rewards[t] --acting.settle--> scaled; + γ V(final observation) if the episode was truncated or its goal replaced
 //! ```
-//! Then the learner takes all blocks together:
+//! Then the learner processes all blocks together:
 //! ```text
-//! rollout --ppo.update--> advantages, epochs × minibatches (as many samples of each shard) of (loss → flat gradient, added over
-//!                         the shards as a tree → norm → Adam); then the normaliser
+//! rollout --ppo.update--> advantages, epochs × minibatches (equal parts from each shard) of (loss → flat gradient, summed
+//!                         over the shards as a tree → norm → Adam); then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
-//! Observations are raw everywhere: a policy perceives (its symmetry) and normalises them as it reads them. How a minibatch is
-//! computed is described in `ppo::kernels`; `ppo::candle` is the same in candle's tensors.
+//! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
+//! `ppo::kernels` describes how a minibatch is computed; `ppo::candle` does the same with candle's tensors.
 //!
-//! # What survives
-//! At the end of each iteration [`train`] takes everything that the next one depends on into a [`ppo::Checkpoint`], by
-//! [`agent::Agent::checkpoint`]: the learner's part and the environments'. Whatever ends the iteration after it (a signal, a panic,
-//! a loss that is not finite) leaves that one to be written. [`run`] writes it whole or not at all, under its number, and finds the
-//! newest sound one again. [`load`] is the only way in for files.
-//!
-//! # Features
-//! Without `viewer` there is no window, without `video` there are no films and pictures: [`window`] and [`film`] are then
-//! replaced by modules of the same shape that say so. Neither changes anything else.
+//! # Recovery
+//! At the end of each iteration [`train`] copies everything that the next one depends on into a [`ppo::Checkpoint`] with
+//! [`agent::Agent::checkpoint`]: the state of the learner and of the environments. If the following iteration fails or is
+//! stopped (a signal, a panic, a loss that is not finite), that checkpoint is the one to write. [`run`] writes it whole or
+//! not at all, under its number. [`load`] is the only way to read such files; it also finds the newest undamaged one.
 
 pub mod agent;
 pub mod bench;
@@ -71,9 +74,8 @@ pub mod config;
 pub mod dump;
 pub mod env;
 pub mod evaluate;
-#[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
-pub mod film;
 pub mod load;
+pub mod manual;
 pub mod pace;
 pub mod play;
 pub mod plot;
@@ -82,12 +84,10 @@ pub mod quat;
 pub mod ranks;
 pub mod rng;
 pub mod run;
-pub mod scenery;
 pub mod schedule;
+pub mod see;
 pub mod sim;
 pub mod spaces;
 pub mod trace;
 pub mod train;
 pub mod view;
-#[cfg_attr(not(feature = "viewer"), path = "window_absent.rs")]
-pub mod window;

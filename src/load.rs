@@ -1,7 +1,7 @@
-//! Checkpoints and policies from files, which may come from anybody: such a file can do nothing but be refused.
+//! Reading checkpoints and policies from untrusted files: the worst that such a file can do is to be refused.
 //!
-//! Its size is known before it is read, its shapes before anything is allocated by them, its checksum before anything in it is
-//! used; and no path that stands in it is followed.
+//! Its size is checked before it is read, its shapes before anything is allocated for them, and its checksum before its content
+//! is used. No path in it is followed.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -13,37 +13,38 @@ use crate::env::SPACES;
 use crate::ppo::{Checkpoint, Damaged};
 use crate::run;
 
-/// The key of the one setting that is a path.
+/// The key of the only setting that is a path.
 pub const MODEL: &str = "env.model";
 
-/// The name of the policy that comes with the program, where a file or a run could be named.
+/// The name of the built-in policy, which is accepted in place of a file or a run.
 const BUILTIN: &str = "builtin";
 
-/// That policy.
+/// The built-in policy.
 const BUILTIN_POLICY: &[u8] = include_bytes!("../assets/policies/repose.safetensors");
 
-/// Where a policy comes from.
+/// The source of a policy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// It comes with the program.
+    /// The policy that is built into the program.
     BuiltIn,
-    /// A checkpoint, or a file with a policy alone.
+    /// A checkpoint, or a file with only a policy.
     File(PathBuf),
 }
 
 impl Origin {
-    /// The one that `place` means: `builtin`, a file, or a run folder's best checkpoint, or its latest where there is none yet.
+    /// Returns the origin that `place` names: `builtin`, a file, or a run folder, which stands for its best checkpoint or, if
+    /// there is none yet, its latest.
     ///
     /// # Errors
-    /// Nothing there.
+    /// Fails if there is no such file, run folder or checkpoint.
     pub fn of(place: &Path) -> Result<Self> {
         if place == Path::new(BUILTIN) { Ok(Self::BuiltIn) } else { run::resolve_checkpoint(place).map(Self::File) }
     }
 
-    /// Reads it, and how its policy is to be played, with `overrides` on top.
+    /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.
     ///
     /// # Errors
-    /// Those of [`read`] and [`for_playing`].
+    /// Fails as [`read`] and [`for_playing`] do.
     pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, PolicyConfig)> {
         let (checkpoint, path) = match self {
             Self::BuiltIn => (Checkpoint::parse(BUILTIN_POLICY)?, Path::new(BUILTIN)),
@@ -67,37 +68,37 @@ impl fmt::Display for Origin {
 /// Reads a checkpoint or a policy.
 ///
 /// # Errors
-/// A file that cannot be read, or is damaged or none of this program.
+/// Fails if the file cannot be read, is damaged, or is not one of this program.
 pub fn read(path: &Path) -> Result<Checkpoint> {
     Checkpoint::parse(&run::read_bytes(path)?).with_context(|| cannot_use(path))
 }
 
-/// The first of these files, the newest first, that is not damaged, with a warning for each one before it. One that cannot be read,
-/// or used, is not passed over: it may be all right tomorrow, and what comes after the one before it would be lost.
+/// Returns the first of these files (newest first) that is not damaged, and prints a warning for each one before it. A file that
+/// cannot be read or used is not skipped: it may be usable later, and continuing from an older one would discard its progress.
 ///
 /// # Errors
-/// No file; one that cannot be read; of the last one, if all are damaged.
+/// Fails if there is no file, if one cannot be read or used, or if all are damaged (with the error of the last one).
 pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
-            Err(error) if is_damage(&error) => run::say(&format!("warning: {error:#}\n  The one before is tried.")),
+            Err(error) if is_damage(&error) => run::say(&format!("warning: {error:#}\n  Trying the one before.")),
             result => return Ok((path.clone(), result?)),
         }
     }
     Ok((last.clone(), read(last)?))
 }
 
-/// Whether it is the bytes of a file that are wrong, and not whether or how they can be used.
+/// Returns whether the bytes of the file are damaged, as opposed to intact but unusable.
 pub fn is_damage(error: &Error) -> bool {
     error.is::<Damaged>()
 }
 
-/// The configuration to go on training with, from a checkpoint in the file `path`, with `overrides` on top.
+/// Returns the configuration for resuming the training from a checkpoint in the file `path`, overlaid with `overrides`.
 ///
 /// # Errors
-/// A checkpoint of another version, or whose configuration is invalid, belongs to another policy, or names a scene that no override
-/// names.
+/// Fails if the checkpoint is of another version, or if its configuration is invalid, belongs to another policy, or names a scene
+/// that no override names.
 pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<Config> {
     expect_trainable(checkpoint)?;
     let config = Config::from_text(path, &checkpoint.config, overrides)?;
@@ -105,11 +106,11 @@ pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]
     Ok(config)
 }
 
-/// The configuration of the training that has left a checkpoint in the file `path`, and that of a fork of it, with the `user`'s
-/// file and `overrides` on top.
+/// Returns the configuration of the training that wrote a checkpoint in the file `path`, and that of a fork of it, overlaid with
+/// the `user`'s file and `overrides`.
 ///
 /// # Errors
-/// As [`for_training`].
+/// Fails as [`for_training`] does.
 pub fn for_fork(
     checkpoint: &Checkpoint,
     path: &Path,
@@ -124,10 +125,10 @@ pub fn for_fork(
     Ok((parent, config))
 }
 
-/// How the policy of a checkpoint in the file `path` is to be played, with `overrides` on top.
+/// Returns the settings for playing the policy of a checkpoint in the file `path`, overlaid with `overrides`.
 ///
 /// # Errors
-/// Settings of task or net that are invalid, belong to another policy, or name a scene that no override names.
+/// Fails if the settings of the task or the net are invalid, belong to another policy, or name a scene that no override names.
 pub fn for_playing(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<PolicyConfig> {
     let config = PolicyConfig::from_text(path, &checkpoint.config, overrides)?;
     expect_usable(checkpoint, &config.net, &config.env, overrides)?;
@@ -138,26 +139,24 @@ fn cannot_use(path: &Path) -> String {
     format!("cannot use {}", path.display())
 }
 
-/// Makes sure that a checkpoint holds this policy, and that a scene comes from who runs the program, not from the file.
+/// Checks that a checkpoint holds this policy, and that a custom scene was named by the user and not only by the file.
 fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
     checkpoint.expect_policy(net, &SPACES)?;
     expect_named_scene(env, overrides.iter().any(|set| set.key == MODEL))
 }
 
-/// Makes sure that it holds more than a policy, in a form that this version goes on from.
+/// Checks that a checkpoint has a format from which this version can resume.
 fn expect_trainable(checkpoint: &Checkpoint) -> Result<()> {
-    let advice = "go on with that version, or begin a new run with its policy (--init)";
+    let advice = "resume it with that version, or start a new run with its policy (--init)";
     ensure!(!checkpoint.is_of_0_1, "made by 0.1.0: {advice}");
     Ok(())
 }
 
-/// Makes sure that a scene is named by who runs the program, if it is not the built-in one.
+/// Checks that a scene other than the built-in one was named by the user.
 fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
     if let Some(model) = env.model_file().filter(|_| !named) {
         let set = run::quoted(&format!("{MODEL}={}", model.display()));
-        bail!(
-            "it was made in a scene of its own, and no path in a file is followed: say --set {set} if you want that one"
-        );
+        bail!("it uses a custom scene, and no path in a file is followed: add --set {set} to use that scene");
     }
     Ok(())
 }

@@ -1,29 +1,29 @@
-//! The program: parses the command line, runs the command, prints what went wrong, exits with a code.
+//! The program: parses the command line, runs the command, prints errors and sets the exit code.
 
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
-use clap::Parser;
-use shadow_repose::cli::{Cli, Command};
+use shadow_repose::cli::{self, Command};
 use shadow_repose::run::Requests;
-use shadow_repose::train::{Outcome, train};
-use shadow_repose::{bench, play, plot, run, view};
+use shadow_repose::train::train;
+use shadow_repose::{bench, manual, play, plot, run, view};
 
 fn main() -> ExitCode {
-    let command = match Cli::try_parse() {
+    let command = match cli::parse() {
         Ok(cli) => cli.command,
         Err(answer) => return tell(&answer),
     };
     let result = Requests::listen(matches!(command, Command::Train(_))).and_then(|requests| match command {
         Command::Train(args) => train(&args, &requests),
         Command::Play(args) => play::play(&args, &requests),
-        Command::View(args) => view::view(&args).map(|()| Outcome::Finished),
-        Command::Plot(args) => plot::plot(&args).map(|()| Outcome::Finished),
-        Command::Bench(args) => bench::bench(&args).map(|()| Outcome::Finished),
+        Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
+        Command::Plot(args) => plot::plot(&args).map(|()| ExitCode::SUCCESS),
+        Command::Bench(args) => bench::bench(&args).map(|()| ExitCode::SUCCESS),
+        Command::Completions(args) => manual::completions(&args).map(|()| ExitCode::SUCCESS),
+        Command::Man => manual::man().map(|()| ExitCode::SUCCESS),
     });
     match result {
-        Ok(Outcome::Finished) => ExitCode::SUCCESS,
-        Ok(Outcome::Stopped(code)) => ExitCode::from(code),
+        Ok(code) => code,
         Err(error) => match error.downcast::<clap::Error>() {
             Ok(answer) => tell(&answer),
             Err(error) => {
@@ -34,7 +34,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints help, version, or what is wrong with the command line.
+/// Prints the help, the version or a usage error, and returns the exit code.
 fn tell(answer: &clap::Error) -> ExitCode {
     match answer.print() {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {

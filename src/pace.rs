@@ -1,4 +1,4 @@
-//! How long the goals of episodes take, and how soon cubes are dropped: what a score does not tell about a policy's weaknesses.
+//! The steps that goals take, and early drops: weaknesses of a policy that its score does not show.
 
 use std::collections::BTreeMap;
 
@@ -8,37 +8,37 @@ use crate::config::EnvConfig;
 use crate::env::Env;
 use crate::evaluate::Moment;
 
-/// The goals that were reached in some episodes, and their early drops.
+/// The goals reached in a set of episodes, and their early drops.
 pub struct Pace {
-    /// Steps within tolerance that a goal asks for.
+    /// Steps within the tolerance that reach a goal.
     hold: u32,
-    /// Control steps of a second.
+    /// Control steps per second.
     second: u32,
-    /// Of each episode under way: the goals it has reached, and when and how the present one began.
+    /// For each running episode, the number of goals reached and the current goal.
     under_way: BTreeMap<usize, (u32, Goal)>,
-    /// With the steps that each took.
+    /// The goals reached, with the steps that each took.
     reached: Vec<Goal>,
     episodes: usize,
     early_drops: usize,
 }
 
-/// A goal that was given.
+/// A goal of an episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Goal {
-    /// Control steps: until it was reached; before that, the step of the episode at which it was given.
+    /// Once reached, the control steps that it took; before that, the step of the episode at which it was given.
     steps: u32,
     /// Rotation error when it was given, rad.
     angle: f64,
 }
 
 impl Pace {
-    /// Of episodes with these settings, none of them seen yet.
+    /// Creates an empty `Pace` for episodes with these settings.
     pub fn new(config: &EnvConfig) -> Self {
         let (hold, second) = (config.max_consecutive_successes, (1.0 / config.ctrl_dt).round() as u32);
         Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
     }
 
-    /// Takes a moment; those of one episode in order.
+    /// Adds a reset or step; those of one episode must come in order.
     pub fn observe(&mut self, moment: &Moment) {
         let (stats, angle) = (moment.env.episode(), moment.env.rot_dist());
         let next = Goal { steps: stats.length, angle };
@@ -58,8 +58,9 @@ impl Pace {
         }
     }
 
-    /// `steps_to_goal` (mean and percentiles, control steps with the hold), `drops_first_second` (fraction of the episodes), `steps_fit`
-    /// (the straight line of the steps less the hold over the angle: its offset, and its slope, steps per rad); null where not known.
+    /// Returns `steps_to_goal` (mean and percentiles, control steps including the hold), `drops_first_second` (fraction of the
+    /// episodes) and `steps_fit` (the line of the steps without the hold over the angle: its offset, and its slope in steps per
+    /// rad); null where unknown.
     pub fn named(&self) -> [(&'static str, Value); 3] {
         let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
         steps.sort_by(f64::total_cmp);
@@ -70,16 +71,16 @@ impl Pace {
             "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
         });
         let turning = |goal: &Goal| [goal.angle, f64::from(goal.steps) - f64::from(self.hold)];
-        let [settle, per_rad] = line(self.reached.iter().map(turning));
+        let Line { offset, slope } = line(self.reached.iter().map(turning));
         [
             ("steps_to_goal", to_goal),
             ("drops_first_second", json!(self.early_drops as f64 / self.episodes as f64)),
-            ("steps_fit", json!({ "settle": settle, "per_rad": per_rad })),
+            ("steps_fit", json!({ "settle": offset, "per_rad": slope })),
         ]
     }
 }
 
-/// The value below which this share of the `sorted` ones lies, between neighbours in proportion.
+/// Returns the value below which the fraction `share` of the `sorted` values lies, interpolated linearly.
 fn percentile(sorted: &[f64], share: f64) -> f64 {
     let place = share * sorted.len().saturating_sub(1) as f64;
     let (below, part) = (place as usize, place.fract());
@@ -87,14 +88,20 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
     low + part * (high - low)
 }
 
-/// Offset and slope of the straight line y(x) with the least squared error; `NaN` for fewer than two different x.
-fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
+/// A straight line.
+struct Line {
+    offset: f64,
+    slope: f64,
+}
+
+/// Fits the least-squares line y(x); `NaN` for fewer than two distinct x.
+fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> Line {
     let count = points.clone().count() as f64;
     let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;
     let [x_mean, y_mean] = [mean(&|[x, _]| x), mean(&|[_, y]| y)];
     let spread = mean(&|[x, _]| (x - x_mean).powi(2));
     let slope = if spread > 0.0 { mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread } else { f64::NAN };
-    [y_mean - slope * x_mean, slope]
+    Line { offset: y_mean - slope * x_mean, slope }
 }
 
 #[cfg(test)]
@@ -110,7 +117,7 @@ mod tests {
 
     #[test]
     fn percentiles_lie_between_neighbours_and_the_line_is_the_one_that_was_laid() {
-        // 50 to hold, 34 to settle, 30 a rad.
+        // 50 steps to hold, 34 to settle, 30 per rad.
         let reached: Vec<(u32, f64)> = (0..=10).map(|i| (84 + 3 * i, 0.1 * f64::from(i))).collect();
         let named = pace(&reached).named();
         assert_eq!(named[0].1, json!({ "mean": 99.0, "p10": 87.0, "p50": 99.0, "p90": 111.0, "p99": 113.7 }));

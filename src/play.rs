@@ -1,7 +1,8 @@
-//! Lets a policy play: in a window, as a film, or for its score: whole episodes, a table or one JSON object, and the trace of
+//! Playing a policy: in a window, as a film, or for its score over whole episodes (a table or one JSON object), with a trace of
 //! the first episodes.
 
 use std::path::Path;
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -12,26 +13,27 @@ use crate::cli::{Baseline, PlayArgs, usage_error};
 use crate::config::{Config, EnvConfig, Override, expect_used};
 use crate::env::{SPACES, Score, Task};
 use crate::evaluate::{Actor, Episodes, Moment, evaluate};
-use crate::film::Film;
 use crate::load::Origin;
 use crate::pace::Pace;
 use crate::ppo::Policy;
 use crate::run::{self, Requests};
-use crate::scenery::task_to_see;
+use crate::see::{Film, HAS_WINDOWS, Window, task_to_see};
 use crate::sim::Quality;
 use crate::trace::Trace;
-use crate::train::Outcome;
-use crate::window::{self, Window};
 
-/// Plays as asked: in a window, as a film, or without either; and prints the score of what is not played in a window.
+/// Plays in a window, as a film, or without either, and prints the score unless it was a window. Returns the exit code of the
+/// program.
 ///
 /// # Errors
-/// A checkpoint, setting or scene that cannot be used; a window that cannot be opened; a trace or film that cannot be written.
-pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
+/// Fails if a checkpoint, setting or scene cannot be used, if a window cannot be opened, or if a trace or film cannot be written.
+pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     expect_used(&args.set, "play")?;
     if let Some(option) = args.shot.given().filter(|_| args.video.is_none() && !wants_window(args)) {
-        let text = format!("{option} is for a film (--video) or a window, and there is neither");
+        let text = format!("{option} applies only to a film (--video) or a window");
         return Err(usage_error("play", &text).into());
+    }
+    if args.shot.size.is_some() && args.video.is_none() {
+        return Err(usage_error("play", "--size applies only to a film (--video)").into());
     }
     let loaded = match args.policy {
         Some(_) => None,
@@ -42,20 +44,28 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
         None => Config::resolve(None, &args.set)?.env,
     };
     run::start_threads(args.threads)?;
-    if wants_window(args) && show(args, &config, loaded.as_ref())? {
-        return Ok(Outcome::Finished);
+    if let (Some(loaded), false) = (&loaded, args.json) {
+        run::say(&format!("playing {}", loaded.name));
     }
-    let actor = match (&loaded, args.policy) {
+    if wants_window(args) && show(args, &config, loaded.as_ref())? {
+        return Ok(ExitCode::SUCCESS);
+    }
+    play_unseen(args, requests, &config, loaded.as_ref())
+}
+
+/// Plays without a window and prints the score.
+fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<ExitCode> {
+    let actor = match (loaded, args.policy) {
         (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()),
         (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()),
         (None, Some(Baseline::Random)) => Actor::Random,
         (None, _) => Actor::Zero,
     };
-    let checkpoint = loaded.as_ref().map(|loaded| loaded.origin.to_string());
-    // Opened before playing: a place that cannot be written to should not cost the score.
+    let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
+    // Opened before playing, so that a path that cannot be written to does not cost the score.
     let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
-    let mut trace = output.as_ref().map(|_| Trace::new(&config, checkpoint.as_deref()));
-    let mut pace = Pace::new(&config);
+    let mut trace = output.as_ref().map(|_| Trace::new(config, checkpoint.as_deref()));
+    let mut pace = Pace::new(config);
     if let (Some(output), Some(video)) = (&output, &args.video) {
         ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
     }
@@ -66,17 +76,17 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
         }
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
-        score(&Task::new(&config)?, actor, episodes(args, 256), requests.stop(), observe)
+        score(&Task::new(config)?, actor, episodes(args, 256), requests.stop(), observe)
     };
     let played = match &args.video {
-        Some(path) => film(path, &config, &actor, args, requests, &mut observe)?,
+        Some(path) => film(path, config, &actor, args, requests, &mut observe)?,
         None => score(&actor, &mut observe)?,
     };
     let Some(played) = played else {
         output
             .into_iter()
             .for_each(|output| run::say(&format!("{}: interrupted, not written", output.path().display())));
-        return Ok(Outcome::Stopped(requests.exit_code()));
+        return Ok(requests.exit_code());
     };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
@@ -84,31 +94,28 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<Outcome> {
     played.divergence().into_iter().for_each(|warning| run::say(&format!("warning: {warning}")));
     if args.json {
         run::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)))?;
-        return Ok(Outcome::Finished);
+        return Ok(ExitCode::SUCCESS);
     }
-    let name = match &actor {
-        Actor::Mean(_) => "policy",
-        Actor::Stochastic(_) => "policy, stochastic",
-        Actor::Random => "random actions",
-        Actor::Zero | Actor::Wave => "zero actions",
-    };
     if let Some(checkpoint) = &checkpoint {
         run::print(&format!("checkpoint {checkpoint}\n"))?;
     }
-    let mut columns = vec![(name, played)];
+    let mut columns = vec![(actor.name(), played)];
     if loaded.is_some() && args.video.is_none() {
-        columns.push(("zero actions", score(&Actor::Zero, &mut |_| {})?.context("nothing interrupts these episodes")?));
+        columns.push((
+            Actor::Zero.name(),
+            score(&Actor::Zero, &mut |_| {})?.context("these episodes cannot be interrupted")?,
+        ));
     }
     run::print(&table(&columns))?;
-    Ok(Outcome::Finished)
+    Ok(ExitCode::SUCCESS)
 }
 
 fn wants_window(args: &PlayArgs) -> bool {
     let otherwise = args.headless || args.json || args.trace.is_some() || args.video.is_some();
-    args.window || !otherwise && window::PRESENT && run::has_display()
+    args.window || !otherwise && HAS_WINDOWS && run::has_display()
 }
 
-/// Plays in a window; false if none can be opened and none was asked for by name.
+/// Plays in a window. Returns false if none can be opened and none was requested explicitly.
 fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
     let task = task_to_see(config, &args.shot, [1280, 720], Quality::High)?;
     let (names, actors, first) = match (loaded, args.policy) {
@@ -124,7 +131,7 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
     };
     let window = match Window::open(&task, names, first) {
         Err(error) if !args.window => {
-            run::say(&format!("note: {error:#}\n  Playing on as with --headless."));
+            run::say(&format!("note: {error:#}\n  Continuing as with --headless."));
             return Ok(false);
         }
         window => window?,
@@ -133,7 +140,7 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
     Ok(true)
 }
 
-/// Plays the episodes one after the other and films them. Interrupted, it leaves the film of what was played.
+/// Plays the episodes one after another and films them. If interrupted, it leaves a film of what was played.
 fn film(
     path: &Path,
     config: &EnvConfig,
@@ -145,7 +152,7 @@ fn film(
     let task = task_to_see(config, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
-    // It is worth having if it is interrupted, as nothing else is that is played.
+    // Unlike the other outputs, a film is worth keeping if it is interrupted.
     requests.wait_for_end();
     let mut played = Vec::new();
     for first in all.first..all.first + all.count {
@@ -164,37 +171,43 @@ fn film(
     Ok((played.len() == all.count).then(|| Score::of(&played)))
 }
 
-/// The episodes that are asked for, or else so many.
+/// Returns the requested episodes, or `otherwise` of them if no number was given.
 fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     let count = args.episodes.unwrap_or(otherwise) as usize;
     Episodes { seed: args.seed, purpose: "score", first: 0, count }
 }
 
-/// A policy, with the task that it was trained for and `--set` on top.
+/// A policy, and the task that it was trained for, overlaid with `--set`.
 struct Loaded {
     origin: Origin,
+    /// What it is called when it begins to play.
+    name: String,
     config: EnvConfig,
     policy: Policy,
 }
 
 impl Loaded {
     fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
-        let origin = match (place, run::newest_checkpoint()) {
+        let origin = match (place, run::newest_run()) {
             (Some(place), _) => Origin::of(place)?,
-            (None, Some(newest)) => Origin::File(newest),
+            (None, Some(newest)) => Origin::of(&newest)?,
             (None, None) => {
-                run::say("there is no run here: playing the policy that is built in");
+                run::say("there is no run here: playing the built-in policy");
                 Origin::BuiltIn
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
         let policy = Policy::load(&config.net, SPACES, &checkpoint)
             .with_context(|| format!("cannot play the policy {origin}"))?;
-        Ok(Self { origin, config: config.env, policy })
+        let name = match &origin {
+            Origin::BuiltIn => "the built-in policy, repose.safetensors".to_owned(),
+            Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
+        };
+        Ok(Self { origin, name, config: config.env, policy })
     }
 }
 
-/// The score of the episodes; none if interrupted.
+/// Plays the episodes and returns their score, or `None` if interrupted.
 fn score(
     task: &Arc<Task>,
     actor: &Actor,
@@ -202,7 +215,7 @@ fn score(
     interrupted: &AtomicBool,
     observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
-    let progress = run::Bar::new(episodes.count as u64, "episodes");
+    let progress = run::Bar::new(episodes.count as u64, "episodes", actor.name());
     let played = evaluate(task, actor, episodes, interrupted, &mut |moment| {
         observe(&moment);
         if moment.step.is_some_and(|(_, end)| end.is_some()) {
@@ -213,7 +226,7 @@ fn score(
     Ok(played.map(|played| Score::of(&played)))
 }
 
-/// One object with everything that is known; what has no value is null.
+/// Returns one object with all figures; those without a value are null.
 fn json_score(score: &Score, pace: &Pace, checkpoint: Option<&str>, seed: u64) -> Value {
     let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
     let mut value = json!({
@@ -238,36 +251,40 @@ fn json_score(score: &Score, pace: &Pace, checkpoint: Option<&str>, seed: u64) -
     value
 }
 
-/// A row for each figure, a column for each score.
+/// Formats a table with a row for each figure and a column for each score; two columns fit into 60 characters.
 fn table(columns: &[(&str, Score)]) -> String {
-    let mut text = format!("{:<24}", "");
-    columns.iter().for_each(|(name, _)| text += &format!("{name:>20}"));
+    let mut text = format!("{:<21}", "");
+    columns.iter().for_each(|(name, _)| text += &format!(" {name:>18}"));
     let columns: Vec<_> = columns.iter().map(|(_, score)| figures(score)).collect();
     for (row, (label, _)) in columns[0].iter().enumerate() {
-        text += &format!("\n{label:<24}");
-        columns.iter().for_each(|column| text += &format!("{:>20}", column[row].1));
+        text += &format!("\n{label:<21}");
+        columns.iter().for_each(|column| text += &format!(" {:>18}", column[row].1));
     }
     text + "\n"
 }
 
-/// The figures of a score, as they are called in the table.
+/// Returns the figures of a score with their labels in the table.
 fn figures(score: &Score) -> Vec<(String, String)> {
     let number = |value: f64, decimals: usize| match value.is_nan() {
         true => "-".to_owned(),
         false => format!("{value:.decimals$}"),
     };
-    let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
     let mut figures = vec![
         ("episodes".to_owned(), score.episodes.to_string()),
         ("goals per episode".to_owned(), number(score.goals, 3)),
-        ("  95 % interval".to_owned(), format!("{low} … {high}")),
+    ];
+    if score.episodes > 1 {
+        let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
+        figures.push(("  95 % interval".to_owned(), format!("{low} … {high}")));
+    }
+    figures.extend([
         ("steps in tolerance, %".to_owned(), number(100.0 * score.in_tolerance, 2)),
         ("rotation error, rad".to_owned(), number(score.rot_dist, 3)),
         ("steps per goal".to_owned(), number(score.steps_per_goal, 0)),
         ("drop rate, %".to_owned(), number(100.0 * score.drop_rate, 1)),
         ("episode length, steps".to_owned(), number(score.length, 1)),
         ("return".to_owned(), number(score.episode_return, 2)),
-    ];
+    ]);
     figures.extend(score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2))));
     figures.push(("diverged episodes".to_owned(), score.diverged.to_string()));
     figures

@@ -1,11 +1,11 @@
-//! Unit quaternions as `[w, x, y, z]`, the order of MuJoCo. A quaternion and its negative are the same rotation.
+//! Unit quaternions as `[w, x, y, z]`, the order that MuJoCo uses. A quaternion and its negative are the same rotation.
 
 use std::ops::{Add, Mul, Sub};
 
 /// A unit quaternion w, x, y, z.
 pub type Quat = [f64; 4];
 
-/// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
+/// Returns the Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
 pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     [aw, ax, ay, az]: [T; 4],
     [bw, bx, by, bz]: [T; 4],
@@ -18,29 +18,29 @@ pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     ]
 }
 
-/// The inverse rotation.
+/// Returns the inverse rotation.
 pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
 }
 
-/// `v` turned by `q`.
+/// Returns `v` rotated by `q`.
 pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
     let [_, x, y, z] = mul(mul(q, [0.0, x, y, z]), conj(q));
     [x, y, z]
 }
 
-/// The one of `q` and `-q` with w ≥ 0: one sign for each rotation.
+/// Returns the one of `q` and `-q` with w ≥ 0, so that each rotation has one sign.
 pub fn canonical(q: Quat) -> Quat {
     if q[0] < 0.0 { q.map(|x| -x) } else { q }
 }
 
-/// The angle in rad, 0 to π, of the rotation that takes `b` to `a`.
+/// Returns the angle in rad, 0 to π, of the rotation that takes `b` to `a`.
 pub fn angle_between(a: Quat, b: Quat) -> f64 {
     let [_, x, y, z] = mul(a, conj(b));
     2.0 * (x * x + y * y + z * z).sqrt().min(1.0).asin()
 }
 
-/// A uniformly distributed rotation from three uniform numbers in [0, 1).
+/// Returns a uniformly distributed rotation, given three uniform numbers in [0, 1).
 ///
 /// K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {
@@ -81,7 +81,7 @@ mod tests {
         assert!((angle_between(ABOUT_Z_90, identity) - PI / 2.0).abs() < 1e-12);
         assert!((angle_between(ABOUT_Z_90.map(|x| -x), identity) - PI / 2.0).abs() < 1e-12);
         assert!((angle_between([0.0, 1.0, 0.0, 0.0], identity) - PI).abs() < 1e-12);
-        // Rounding may leave a vector part longer than one.
+        // Rounding may make the vector part longer than one.
         assert!(angle_between([0.0, 1.0 + 1e-15, 0.0, 0.0], identity).is_finite());
     }
 
@@ -102,7 +102,7 @@ mod tests {
                 angle_between(q, [1.0, 0.0, 0.0, 0.0])
             })
             .collect();
-        // The angle of a uniform rotation has the density (1 - cos a) / π, so the mean π/2 + 2/π.
+        // The angle of a uniform rotation has the density (1 - cos a) / π, so its mean is π/2 + 2/π.
         let mean = angles.iter().sum::<f64>() / angles.len() as f64;
         assert!((mean - (PI / 2.0 + 2.0 / PI)).abs() < 0.02, "mean angle {mean}");
     }

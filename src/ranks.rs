@@ -1,25 +1,25 @@
-//! How a training is divided, so that what it computes does not depend on that.
+//! The division of a training run among ranks, which does not affect what it computes.
 //!
-//! The environments are dealt to shards, whose number is a setting: a power of two. Whatever is computed of many samples is
-//! computed shard by shard and put together in the order of the shards, gradients as a binary tree. A rank computes some shards that
-//! follow one another: a subtree. So one rank, or two, or four come to the same bits.
+//! The environments are dealt to shards; their number is a setting and a power of two. Everything that is computed from
+//! many samples is computed shard by shard and combined in the order of the shards, gradients as a binary tree. A rank
+//! computes consecutive shards, which form a subtree. So one, two or four ranks give the same bits.
 
 use std::ops::Range;
 
 use pulp::Arch;
 
-/// The ranks of a training as one of them sees them. All of them make the same calls in the same order.
+/// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {
-    /// How many there are: a power of two.
+    /// Returns the number of ranks: a power of two.
     fn size(&self) -> usize;
 
-    /// The number of this one.
+    /// Returns the index of this rank.
     fn rank(&self) -> usize;
 
-    /// Puts the sum of what all ranks give in the place of it, added as a binary tree in the order of the ranks.
+    /// Replaces the values by their sum over all ranks, added as a binary tree in the order of the ranks.
     fn add_up(&self, numbers: &mut [f32]);
 
-    /// What all ranks give, in their order; all give as many.
+    /// Returns the values of all ranks, in their order; all ranks pass the same number of values.
     fn gather(&self, numbers: Vec<f64>) -> Vec<f64>;
 }
 
@@ -42,59 +42,60 @@ impl Ranks for Alone {
     }
 }
 
-/// The shards of a training, and which of them are computed here.
+/// The shards of a training run, and which of them this rank computes.
 pub struct Division {
     shards: usize,
     ranks: Box<dyn Ranks>,
 }
 
 impl Division {
-    /// So many shards on these ranks.
+    /// Divides this number of shards among these ranks.
     ///
     /// # Panics
-    /// A number of shards that is no power of two, or less than the ranks.
+    /// Panics if either number is not a power of two, or if there are fewer shards than ranks.
     pub fn new(shards: usize, ranks: Box<dyn Ranks>) -> Self {
         let fits = shards.is_power_of_two() && ranks.size().is_power_of_two() && ranks.size() <= shards;
         assert!(fits, "{shards} shards on {} ranks", ranks.size());
         Self { shards, ranks }
     }
 
-    /// So many shards on one rank.
+    /// Assigns this number of shards to one rank.
     pub fn alone(shards: usize) -> Self {
         Self::new(shards, Box::new(Alone))
     }
 
-    /// All shards.
+    /// Returns the number of all shards.
     pub fn shards(&self) -> usize {
         self.shards
     }
 
-    /// Those that are computed here.
+    /// Returns the shards of this rank.
     pub fn own(&self) -> Range<usize> {
         let each = self.shards / self.ranks.size();
         each * self.ranks.rank()..each * (self.ranks.rank() + 1)
     }
 
-    /// Puts the sum over all ranks in the place of the sum over the shards of this one.
+    /// Replaces the sum over the shards of this rank by the sum over all ranks.
     pub fn add_up(&self, numbers: &mut [f32]) {
         self.ranks.add_up(numbers);
     }
 
-    /// The sums over all shards, added in their order, of what each of the own ones gives: rows of equal length.
+    /// Returns the sums over all shards, added in their order. `of_own` yields one row for each shard of this rank, all
+    /// of equal length.
     pub fn total(&self, of_own: impl Iterator<Item = Vec<f64>>) -> Vec<f64> {
         let all = self.ranks.gather(of_own.flatten().collect());
         let width = all.len() / self.shards;
         (0..width).map(|i| all.iter().skip(i).step_by(width).sum()).collect()
     }
 
-    /// The largest of what the ranks give.
+    /// Returns the largest of the values of all ranks.
     pub fn largest(&self, own: f64) -> f64 {
         self.ranks.gather(vec![own]).into_iter().fold(f64::NEG_INFINITY, f64::max)
     }
 }
 
-/// Writes the sum of parts of equal length, a power of two of them, added as a binary tree: the first and the second, the third and the
-/// fourth, and so on, then these sums likewise.
+/// Writes the sum of `parts`, which have equal length and whose number is a power of two. They are added as a binary
+/// tree: the first and the second, the third and the fourth, and so on, then these sums likewise.
 pub fn tree_sum(out: &mut [f32], parts: &[&[f32]]) {
     match parts {
         [part] => out.copy_from_slice(part),
@@ -125,14 +126,14 @@ mod tests {
 
     #[test]
     fn parts_are_added_as_a_tree() {
-        // What is far below 1e8 is lost beside it: only among themselves do the ones count.
+        // A one is lost when added to 1e8; only ones that are added to each other first count.
         let parts = [1e8f32, 1.0, 1.0, 1.0, -1e8, 3.0, 1.0, 2.0].map(|x| [x, 1.0]);
         let parts: Vec<&[f32]> = parts.iter().map(|part| &part[..]).collect();
         let mut out = [0.0; 2];
         tree_sum(&mut out, &parts);
         let expected = ((1e8f32 + 1.0) + (1.0 + 1.0)) + ((-1e8f32 + 3.0) + (1.0 + 2.0));
         assert_eq!(out, [expected, 8.0]);
-        // Two ranks with half of the parts each come to the same.
+        // Two ranks with half of the parts each give the same result.
         let [mut first, mut second] = [[0.0; 2]; 2];
         tree_sum(&mut first, &parts[..4]);
         tree_sum(&mut second, &parts[4..]);
@@ -144,7 +145,7 @@ mod tests {
     fn totals_are_added_in_the_order_of_the_shards() {
         let division = Division::alone(4);
         assert_eq!((division.shards(), division.own()), (4, 0..4));
-        // 1 is lost in 1e16: in this order once, in others not or twice.
+        // 1 is lost when added to 1e16: once in this order, never or twice in others.
         let rows = [1e16, 1.0, -1e16, 1.0].map(|x| vec![x, 1.0]).into_iter();
         assert_eq!(division.total(rows), [1.0, 4.0]);
     }

@@ -1,16 +1,17 @@
-//! Randomness without state: a generator is named by (seed, purpose, index).
+//! Stateless randomness: a generator is identified by (seed, purpose, index).
 //!
-//! No generator is carried from one iteration or episode to the next, so whoever knows the three names can draw the same
-//! numbers again, on any thread, in any order, after any interruption. Within an episode, how far a generator has come is
-//! part of what is saved.
+//! No generator is carried from one iteration or episode to the next, so anyone who knows these three can draw the same
+//! numbers again, on any thread, in any order, after any interruption. Within an episode, the position of its generator
+//! is part of what is saved.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The one generator of the program; its values are the same in every version of its crate.
+/// The only generator of the program; its values are the same in every version of its crate.
 pub type Rng = ChaCha8Rng;
 
-/// The generator of stream `index` for `purpose` (at most 24 bytes) under `seed`; different names never share numbers.
+/// Returns the generator of stream `index` for `purpose` (at most 24 bytes) under `seed`. Different identifiers never
+/// share numbers.
 pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     let mut key = [0; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());
@@ -20,10 +21,10 @@ pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     rng
 }
 
-/// Key, stream and position of a generator: all there is to know of it.
+/// The key, stream and position of a generator: its complete state.
 pub type Position = [u64; 6];
 
-/// Where a generator is; at most 2⁶⁴ words from its start.
+/// Returns the state of a generator that is less than 2⁶⁴ words from its start.
 pub fn position(rng: &Rng) -> Position {
     let seed = rng.get_seed();
     let (words, _) = seed.as_chunks::<8>();
@@ -31,7 +32,7 @@ pub fn position(rng: &Rng) -> Position {
     [a, b, c, d, rng.get_stream(), rng.get_word_pos() as u64]
 }
 
-/// The generator that is there.
+/// Returns the generator in this state.
 pub fn at([key @ .., stream, word]: Position) -> Rng {
     let mut seed = [0; 32];
     for (bytes, word) in seed.chunks_exact_mut(8).zip(key) {
@@ -43,7 +44,7 @@ pub fn at([key @ .., stream, word]: Position) -> Rng {
     rng
 }
 
-/// A uniform number in [low, high).
+/// Draws a uniformly distributed number in [low, high).
 pub fn uniform(rng: &mut Rng, low: f64, high: f64) -> f64 {
     low + (high - low) * rng.random::<f64>()
 }

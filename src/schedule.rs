@@ -1,15 +1,16 @@
 //! Runs blocks of work through many rounds on all threads, without a barrier between the rounds.
 //!
-//! A block is what one thread works on at a time; its rounds happen in order. Whoever is free takes the next round of the
-//! block that has waited longest, and nobody waits for a block that another thread is at: with fewer blocks left than
-//! threads, the others leave. What a block holds must not depend on the number of threads: then neither does the result.
+//! One thread works on a block at a time, and the rounds of a block run in order. A free thread takes the next round of
+//! the block that has waited longest; no thread waits for a block that another one is working on. If fewer blocks than
+//! threads are left, the other threads leave. The content of a block must not depend on the number of threads; then the
+//! result does not either.
 
 use std::any::Any;
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
-/// The number of items in each block, for `items` that belong together of so many `in_all`: enough blocks for many threads, enough
-/// items for whole vectors of work.
+/// Returns the number of items in each block when `items` of a total of `in_all` items are split: enough blocks for
+/// many threads, enough items in each for full vectors of work.
 pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
     let size = (in_all / 32).clamp(8, 64);
     (0..items).step_by(size).map(|first| size.min(items - first)).collect()
@@ -22,11 +23,11 @@ struct Waiting<B> {
     block: B,
 }
 
-/// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool, and gives
-/// the blocks back in their order.
+/// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool, and
+/// returns the blocks in their order.
 ///
 /// # Panics
-/// If `work` does, after the other blocks have gone through their rounds.
+/// Panics if `work` does, after the other blocks have finished their rounds.
 pub fn in_rounds<B: Send>(
     blocks: impl IntoIterator<Item = B>,
     rounds: usize,
@@ -35,7 +36,7 @@ pub fn in_rounds<B: Send>(
     let wait = |(place, block)| Waiting { place, round: 0, block };
     let queue: Mutex<VecDeque<Waiting<B>>> = Mutex::new(blocks.into_iter().enumerate().map(wait).collect());
     let done: Mutex<Vec<Waiting<B>>> = Mutex::new(Vec::new());
-    // Neither lock is held while there is work, so no panic happens under them.
+    // Neither lock is held during work, so no panic can occur under them.
     rayon::broadcast(|_| {
         loop {
             let Some(mut next) = queue.lock().expect("no panic under this lock").pop_front() else { break };
@@ -53,7 +54,7 @@ pub fn in_rounds<B: Send>(
     done.into_iter().map(|waiting| waiting.block).collect()
 }
 
-/// What a panic said.
+/// Returns the message of a panic.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
@@ -72,12 +73,12 @@ mod tests {
                 let seen = pool.install(|| in_rounds(vec![Vec::new(); blocks], 50, |seen, round| seen.push(round)));
                 assert_eq!(seen, vec![(0..50).collect::<Vec<_>>(); blocks], "{threads} threads, {blocks} blocks");
                 let numbers = pool.install(|| in_rounds(0..blocks, 3, |_, _| {}));
-                assert!(numbers.into_iter().eq(0..blocks), "the blocks come back in their order");
+                assert!(numbers.into_iter().eq(0..blocks), "blocks are returned in order");
             }
         }
     }
 
-    /// A thread that waits inside one block for parallel work of its own may be given another block meanwhile.
+    /// A thread that waits inside one block for its own parallel work may pick up another block in the meantime.
     #[test]
     fn work_that_is_parallel_in_itself_does_not_hang() {
         for threads in [1, 2, 4] {

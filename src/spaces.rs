@@ -1,16 +1,25 @@
-//! What a learner must know of the observations and actions of an environment.
+//! What a learner must know about the observations and actions of an environment.
 //!
-//! Apart, since the environment makes it and the learner reads it, and neither knows the other.
+//! It is separate because the environment creates it and the learner reads it, and neither depends on the other.
 
-/// The sizes of observations and actions, and where in an observation stands what a learner makes use of.
+/// The sizes of observations and actions, and the parts of an observation that a learner uses.
 #[derive(Clone, Copy, Debug)]
 pub struct Spaces {
-    /// Numbers in an observation.
+    /// The number of values in an observation.
     pub observation_size: usize,
-    /// Numbers in an action.
+    /// The number of values in an action.
     pub action_size: usize,
-    /// Where the orientations (w,x,y,z) of a cube and of its goal begin, if there is one: for `ppo.symmetry`.
-    pub cube_and_goal: Option<[usize; 2]>,
-    /// How far from its goal an observation is, in the unit of `ppo.away_range`.
+    /// The location of a cube and its goal, if there is one; for `ppo.symmetry`.
+    pub cube_and_goal: Option<CubeAndGoal>,
+    /// The distance of an observation from its goal, in the unit of `ppo.away_range`.
     pub distance: fn(&[f32]) -> f32,
+}
+
+/// The offsets of the orientations (w, x, y, z) of a cube and its goal in an observation.
+#[derive(Clone, Copy, Debug)]
+pub struct CubeAndGoal {
+    /// The offset of the orientation of the cube.
+    pub cube: usize,
+    /// The offset of the orientation of its goal.
+    pub goal: usize,
 }

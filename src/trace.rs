@@ -1,25 +1,25 @@
-//! The first episodes of a score, step by step, as JSON lines: enough to replay and check each of them elsewhere.
+//! The first episodes of a score, step by step, as JSON lines: enough to replay and check each step elsewhere.
 
 use serde_json::{Map, Value, json};
 
 use crate::config::EnvConfig;
-use crate::env::{ACTUATORS, End, Env, FINGERTIPS, JOINTS, OBSERVATION, Part};
+use crate::env::{ACTUATORS, End, Env, FINGERTIPS, Group, JOINTS, OBSERVATION};
 use crate::evaluate::Moment;
 
-/// Episodes are written, whole and in order, until there are this many records.
+/// The number of records at which writing stops; episodes are written whole and in order.
 const ENOUGH: usize = 2000;
 
-/// The records of the episodes that may still be needed.
+/// The records of episodes that may still be needed.
 pub struct Trace {
     header: Value,
-    /// Per episode its lines.
+    /// The lines of each episode.
     episodes: Vec<Vec<String>>,
-    /// The last episode that can be needed, as far as is known.
+    /// The last episode that may be needed, as far as is known.
     last: usize,
 }
 
 impl Trace {
-    /// An empty trace of the task with these settings, played by the policy in `checkpoint`.
+    /// Creates an empty trace of the task with these settings, played by the policy in `checkpoint`.
     pub fn new(config: &EnvConfig, checkpoint: Option<&str>) -> Self {
         let header = json!({
             "sim_dt": config.sim_dt,
@@ -32,7 +32,7 @@ impl Trace {
             "friction_scale": config.friction_scale,
             "cube_mass_scale": config.cube_mass_scale,
             "checkpoint": checkpoint,
-            "observation": OBSERVATION.map(|Part { name, start, length, unit }| {
+            "observation": OBSERVATION.map(|Group { name, start, length, unit }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
             }),
             "joint_names": JOINTS.map(|joint| format!("rh_{joint}")),
@@ -44,10 +44,10 @@ impl Trace {
         Self { header, episodes: Vec::new(), last: usize::MAX }
     }
 
-    /// Takes a moment, if it can be needed.
+    /// Records `moment` if it may be needed.
     ///
-    /// Episodes run side by side, and it is not known beforehand how long each will be; but once the episodes up to one have
-    /// enough records together, none after it can be needed any more.
+    /// Episodes run in parallel, and their lengths are not known beforehand; but once the episodes up to some number have
+    /// enough records together, no later one is needed.
     pub fn record(&mut self, moment: &Moment) {
         if moment.episode > self.last {
             return;
@@ -67,7 +67,7 @@ impl Trace {
         }
     }
 
-    /// The whole text.
+    /// Returns the whole text.
     pub fn finish(self) -> String {
         let lines = std::iter::once(self.header.to_string()).chain(self.episodes.into_iter().flatten());
         lines.map(|line| line + "\n").collect()
@@ -107,7 +107,7 @@ fn record(moment: &Moment) -> Value {
     })
 }
 
-/// Floats as the doubles they are, so that a reader gets them back exactly.
+/// Returns floats as doubles, so that a reader gets exactly the same values.
 fn doubles(values: &[f32]) -> Value {
     values.iter().map(|&x| json!(f64::from(x))).collect()
 }

@@ -1,25 +1,26 @@
-//! The scene without a policy: in a window, or as one picture.
+//! Showing the scene without a policy: in a window, or as one picture.
 
 use anyhow::Result;
 
-use crate::cli::{Motion, ViewArgs};
-use crate::config::{Config, expect_used};
+use crate::cli::{Motion, ViewArgs, usage_error};
+use crate::config::{Config, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
-use crate::film;
 use crate::run;
-use crate::scenery::task_to_see;
+use crate::see::{Window, screenshot, task_to_see};
 use crate::sim::Quality;
-use crate::train::user_file;
-use crate::window::Window;
 
-/// Shows the scene as asked.
+/// Shows the scene in a window, or writes one picture of it.
 ///
 /// # Errors
-/// A setting or scene that cannot be used; no window, with what is missing; a picture that cannot be written.
+/// Fails if a setting or the scene cannot be used, if no window can be opened (with what is missing), or if the picture cannot be
+/// written.
 pub fn view(args: &ViewArgs) -> Result<()> {
     expect_used(&args.settings.set, "view")?;
+    if args.shot.size.is_some() && args.screenshot.is_none() {
+        return Err(usage_error("view", "--size applies only to a picture (--screenshot)").into());
+    }
     args.screenshot.as_deref().map_or(Ok(()), run::expect_folder)?;
-    let config = Config::resolve(user_file(&args.settings)?.as_ref(), &args.settings.set)?;
+    let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
     let actors = [Actor::Zero, Actor::Random, Actor::Wave];
     let first = match args.actions {
@@ -29,7 +30,9 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     };
     let episodes = Episodes { seed: args.seed, purpose: "score", first: 0, count: usize::MAX };
     if let Some(path) = &args.screenshot {
-        return film::screenshot(path, &task, &actors[first], episodes, args.at);
+        let [width, height] = screenshot(path, &task, &actors[first], episodes, args.at)?;
+        run::say(&format!("{}: {width}x{height}", path.display()));
+        return Ok(());
     }
     let window = Window::open(&task, vec!["zero", "random", "wave"], first)?;
     run::say(&window.play(&task, &actors, episodes)?);

@@ -1,4 +1,7 @@
-//! What a training asks the allocator for, once it runs. Alone in its binary: the count is of the whole process.
+//! The largest allocation of a training once it runs. A separate binary, because the allocator is that of the whole process.
+
+#![allow(unsafe_code)]
+#![allow(clippy::unwrap_used)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -13,16 +16,16 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: all is left to the system's allocator.
+// SAFETY: every call is forwarded to the system's allocator.
 unsafe impl GlobalAlloc for Watching {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: as promised by the caller.
+        // SAFETY: the caller upholds the contract.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: as promised by the caller.
+        // SAFETY: the caller upholds the contract.
         unsafe { System.dealloc(ptr, layout) }
     }
 }
@@ -41,8 +44,8 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     };
     let first = iterate();
     let later = [iterate(), iterate()];
-    // gemm packs the largest weight, 157 × 256 floats, into a buffer of its own. An array of all weights or of a block of rows
-    // in a net would be larger, one of all samples much larger.
+    // gemm packs the largest weight matrix, 157 × 256 floats, into its own buffer. An array of all weights, or of a block of rows
+    // in a net, would be larger; one of all samples, much larger.
     let packed = 4 * OBSERVATION_SIZE * config.ppo.hidden[0];
     assert!(first > 500_000 && later.iter().all(|&largest| largest <= packed), "{first} bytes, then {later:?}");
 }

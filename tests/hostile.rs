@@ -1,5 +1,7 @@
-//! Files and inputs that somebody made to harm, and days of logging: whatever they are, the memory stays small. Alone in its
-//! binary, because what is measured is the whole process.
+//! Memory stays small with untrusted files and inputs, and during days of logging. A separate binary, because the memory of the
+//! whole process is measured.
+
+#![allow(clippy::unwrap_used)]
 
 use std::fs;
 use std::path::Path;
@@ -12,22 +14,22 @@ use shadow_repose::config::Config;
 use shadow_repose::env::Task;
 use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Progress, Report, Status};
+use shadow_repose::run::{Report, Status, StatusLine};
 
 #[path = "../fuzz/targets.rs"]
 mod targets;
 
-/// One test at a time: they measure memory.
+/// Held by each test, so that they run one at a time: they measure memory.
 static ALONE: Mutex<()> = Mutex::new(());
 
-/// The memory of this process in KiB, as the system names it: `VmRSS` now, `VmHWM` at most.
+/// Returns the memory of this process in KiB, by the system's name for it: `VmRSS:` is the current value, `VmHWM:` the peak.
 fn memory(name: &str) -> u64 {
     let status = fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find_map(|line| line.strip_prefix(name)).expect("Linux tells it");
+    let line = status.lines().find_map(|line| line.strip_prefix(name)).expect("Linux reports it");
     line.trim_matches(|c: char| !c.is_ascii_digit()).parse().unwrap()
 }
 
-/// The bytes of a small but whole checkpoint.
+/// Returns a small but complete checkpoint.
 fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
@@ -37,7 +39,8 @@ fn a_checkpoint() -> Checkpoint {
     checkpoint
 }
 
-/// Bits flipped, parts cut out, swapped, repeated or filled, lengths made huge; mostly in the part that has a structure.
+/// Returns the bytes with bits flipped, parts cut out, shuffled, repeated or overwritten, or lengths made huge; more often in the
+/// first `structured` bytes.
 fn mutated(good: &[u8], structured: usize, rng: &mut Rng) -> Vec<u8> {
     let mut bytes = good.to_vec();
     for _ in 0..rng.random_range(1..4) {
@@ -55,7 +58,7 @@ fn mutated(good: &[u8], structured: usize, rng: &mut Rng) -> Vec<u8> {
             5 => bytes.extend_from_within(from..from + length),
             6 => bytes[from..from + 8]
                 .copy_from_slice(&[u64::MAX, 1 << 62, 1 << 33, 0][rng.random_range(0..4)].to_le_bytes()),
-            // A digit more or another one: sizes in the header, numbers in the settings.
+            // Changes a digit or inserts some: sizes in the header, values in the settings.
             _ => match bytes[from..end].iter().position(u8::is_ascii_digit) {
                 Some(digit) if rng.random::<bool>() => bytes[from + digit] = b'9',
                 Some(digit) => bytes.splice(from + digit..from + digit, *b"99999999").for_each(drop),
@@ -79,7 +82,7 @@ fn ten_thousand_mutations_of_a_checkpoint_and_of_a_config_do_no_harm() {
         assert_eq!(target(good), [true; 2]);
         for _ in 0..10_000 {
             let bad = mutated(good, header(good), &mut rng);
-            // What is accepted has not been changed, whatever the layout of its header.
+            // If it is accepted, its content has not changed, whatever the layout of its header.
             if target(&bad)[0] {
                 let [found, expected] = [&bad, good].map(|bytes| Checkpoint::parse(bytes).unwrap().to_bytes().unwrap());
                 assert_eq!(found.len(), expected.len());
@@ -98,11 +101,11 @@ fn ten_thousand_mutations_of_a_checkpoint_and_of_a_config_do_no_harm() {
         ));
     }
     let most = memory("VmHWM:");
-    println!("at most {most} KiB");
+    println!("peak: {most} KiB");
     assert!(most < 1 << 20, "{most} KiB");
 }
 
-/// After a change of the format; the bad seeds are made from these by hand.
+/// Writes the good seeds, after a change of the format. The bad seeds are made from these by hand.
 fn write_good_seeds(folder: &Path) {
     let whole = a_checkpoint();
     let bytes = whole.to_bytes().unwrap();
@@ -127,18 +130,18 @@ fn the_seeds_of_the_fuzz_targets_do_no_harm() {
             let [accepted, accepted_sealed] = target(&fs::read(&seed).unwrap());
             let kind = seed.file_name().unwrap().to_str().unwrap().split('-').next().unwrap().to_owned();
             assert_eq!(accepted, kind == "good", "{}", seed.display());
-            // What is bad is refused for what it is, not for its checksum.
+            // Bad seeds are refused for their content, not for their checksum.
             assert!(kind == "damaged" || accepted_sealed == accepted, "{}", seed.display());
         }
     }
 }
 
-/// The memory after so many rows of logging, less that after a tenth of them, in KiB.
+/// Logs this number of rows and returns the growth of memory after the first tenth of them, in KiB.
 fn growth(rows: u64) -> i64 {
     let place = tempfile::tempdir().unwrap();
     let names: Vec<String> = (0..30).map(|i| format!("group/value_{i}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut report = Report::new(place.path(), &names, Progress::new(0, rows, true));
+    let mut report = Report::new(place.path(), &names, StatusLine::new(0, rows, true));
     report.open_logs(0..0, 0);
     let mut early = 0;
     for row in 1..=rows {
@@ -157,8 +160,8 @@ fn growth(rows: u64) -> i64 {
     }
     report.finish();
     drop(report);
-    // A resumed session goes through all of it.
-    let mut resumed = Report::new(place.path(), &names, Progress::new(rows - 1, rows, true));
+    // A resumed session reads all of it.
+    let mut resumed = Report::new(place.path(), &names, StatusLine::new(rows - 1, rows, true));
     resumed.open_logs(0..rows - 1, rows - 1);
     resumed.finish();
     let text = fs::metadata(place.path().join("metrics.csv")).unwrap().len();
@@ -174,7 +177,7 @@ fn the_memory_stays_flat_while_rows_are_logged() {
 }
 
 #[test]
-#[ignore = "a minute: the same with a million rows, as in 12 hours and more"]
+#[ignore = "takes a minute: the same with a million rows, as in 12 hours or more"]
 fn the_memory_stays_flat_while_a_million_rows_are_logged() {
     let _alone = ALONE.lock().unwrap();
     let growth = growth(1_000_000);

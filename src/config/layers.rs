@@ -1,4 +1,4 @@
-//! Where a value comes from: the default, under a user's file, under single settings.
+//! The layers of a configuration: the defaults, overlaid with the user's file, overlaid with single settings.
 
 use std::path::{Path, PathBuf};
 
@@ -10,19 +10,20 @@ use super::BASE;
 use super::overlay::{overlay, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
+use crate::run;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
 
-/// What a policy is whose file was made before there was a setting, also where that is another default today.
+/// Values of settings that older policy files lack; they may differ from today's defaults.
 const BEFORE: &str = "[ppo]\nsymmetry = \"none\"";
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Override {
-    /// The dotted key, as `ppo.learning_rate`.
+    /// The dotted key, e.g. `ppo.learning_rate`.
     pub key: String,
-    /// The text behind the equals sign.
+    /// The text after the equals sign.
     pub value: String,
 }
 
@@ -34,12 +35,12 @@ impl std::str::FromStr for Override {
             Some((key, value)) if !key.trim().is_empty() => {
                 Ok(Self { key: key.trim().into(), value: value.trim().into() })
             }
-            _ => Err(format!("`{text}` is not of the form key=value, as in ppo.learning_rate=1e-4")),
+            _ => Err(format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4")),
         }
     }
 }
 
-/// A configuration text and the name to use for it in messages.
+/// A configuration text and the path to name in messages about it.
 pub struct Source {
     /// The file it came from.
     pub path: PathBuf,
@@ -47,38 +48,38 @@ pub struct Source {
     pub text: String,
 }
 
-/// How a policy is to be played: all that is read of the settings in its file.
+/// The settings for playing a policy: the only ones that are read from its file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyConfig {
-    /// The task that it was trained for.
+    /// The task that the policy was trained for.
     pub env: EnvConfig,
-    /// The policy itself.
+    /// The structure of the policy.
     pub net: NetConfig,
 }
 
 impl Config {
-    /// The base, overlaid by the user's file and then by `overrides`.
+    /// Returns the base, overlaid with the user's file and then with `overrides`.
     ///
     /// # Errors
-    /// One error that lists every unknown key, every value of a wrong type and every value out of range.
+    /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let file = user.map(|source| source.path.as_path());
         layered(file, &user.map(Source::table).transpose()?.into_iter().collect::<Vec<_>>(), overrides)
     }
 
-    /// A configuration that a run has written whole.
+    /// Parses a complete configuration that a run has written, overlaid with `overrides`.
     ///
     /// # Errors
-    /// As [`Config::resolve`].
+    /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
         Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
     }
 
-    /// These settings, overlaid by the user's file and then by `overrides`; but for the scene: no path in a file is followed. The
-    /// shards stay where they fit.
+    /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
+    /// settings, because no path in a checkpoint is followed. The number of shards is kept if it still fits.
     ///
     /// # Errors
-    /// As [`Config::resolve`].
+    /// Fails as [`Config::resolve`] does.
     pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let mut own = self.clone();
         (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
@@ -91,8 +92,8 @@ impl Config {
         Ok(changed)
     }
 
-    /// What `other` says differently, but for what may change in the course of a run: how far it goes, on how many threads, and where
-    /// its scene lies.
+    /// Lists the settings that differ in `other`, except those that may change during a run: the total number of steps, the
+    /// number of threads and the path of the scene.
     pub fn differences(&self, other: &Self) -> Vec<String> {
         let table = |of: &Self| {
             let mut same = of.clone();
@@ -109,7 +110,7 @@ impl Config {
             .collect()
     }
 
-    /// The whole configuration as TOML.
+    /// Returns the whole configuration as TOML.
     pub fn to_text(&self) -> String {
         let sections = Table::try_from(self).expect("a configuration is a tree of tables");
         let mut text = String::new();
@@ -123,11 +124,11 @@ impl Config {
 }
 
 impl PolicyConfig {
-    /// What playing takes of the configuration of a run: how the policy was trained is not even looked at, so that the settings of
-    /// training can come and go.
+    /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
+    /// added and removed between versions.
     ///
     /// # Errors
-    /// As [`Config::resolve`].
+    /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
         let mut table = Source { path: path.into(), text: text.into() }.table()?;
         table.retain(|section, _| section == "env" || section == "ppo");
@@ -137,10 +138,19 @@ impl PolicyConfig {
         if let Some(Value::Table(ppo)) = table.get_mut("ppo") {
             ppo.retain(|key, _| OF_NETS.contains(&key));
         }
-        let before = BEFORE.parse().expect("our own settings are TOML");
+        let before = BEFORE.parse().expect("the built-in configuration is TOML");
         let Config { env, ppo, .. } = layered(Some(path), &[before, table], overrides)?;
         Ok(Self { env, net: ppo.net() })
     }
+}
+
+/// Reads the user's configuration file, if one was given.
+///
+/// # Errors
+/// Fails if the file cannot be read.
+pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
+    let read = |path: &Path| Ok(Source { path: path.to_owned(), text: run::read_text(path)? });
+    path.map(read).transpose()
 }
 
 impl Source {
@@ -149,16 +159,16 @@ impl Source {
     }
 }
 
-/// The base, overlaid by these tables and then by `overrides`; problems are said to be of `file`.
+/// Returns the base, overlaid with `tables` and then with `overrides`. The error message names `file`.
 fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Result<Config> {
-    let base: Table = BASE.parse().expect("our own settings are TOML");
+    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
     let (mut merged, mut problems) = (base.clone(), Vec::new());
     let singles = overrides.iter().map(|set| table_of(&set.key, &set.value, &base));
     for table in tables.iter().cloned().chain(singles) {
         overlay(&mut merged, &table, &base, "", &mut problems);
     }
-    // Words and sizes that no key of that type can have: each key is tried alone among the defaults, so that one that fails can be
-    // named. With the default in its place the other rules can be checked.
+    // Unknown words and wrong array sizes: each key is deserialized alone among the defaults, so that the one that fails can be
+    // named. It is replaced by its default so that the other rules can be checked.
     for (section, keys) in &base {
         for (key, default) in keys.as_table().into_iter().flatten() {
             let mut alone = base.clone();
@@ -208,7 +218,7 @@ mod tests {
         let [large, going_on] =
             [large, going_on].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
         assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
-        // A file too may hold a part of a ramp.
+        // A file may also set part of a ramp.
         assert_eq!(large.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
         assert_eq!(large.ppo.max_std, Ramp { from: 0.6, to: 0.2, steps: 50_000_000 });
         assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
@@ -230,7 +240,7 @@ mod tests {
         let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=20000000}"]);
         assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 20_000_000 });
         assert_eq!(tolerance(&["training.tolerance={to=0.06}"]), Ramp { to: 0.06, ..default });
-        // A part of what was set to a constant before.
+        // Part of a ramp that was set to a constant before.
         let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
         assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0 });
     }
@@ -257,11 +267,11 @@ mod tests {
     fn settings_that_are_gone_are_answered_with_what_to_do() {
         for (gone, advice) in [
             ("training.tolerance_steps=0", "write it as a ramp"),
-            ("training.hold_scale=0.3", "whatever the task asks"),
-            ("training.bootstrap_reached=true", "training always does"),
+            ("training.hold_scale=0.3", "independent of the task's values"),
+            ("training.bootstrap_reached=true", "training now always behaves"),
             ("ppo.init_std=0.6", "starts with ppo.max_std"),
-            ("ppo.exploring_share=0", "it brought nothing"),
-            ("ppo.activation=silu", "no policy that came with the program had it"),
+            ("ppo.exploring_share=0", "it did not help"),
+            ("ppo.activation=silu", "no policy that came with the program used it"),
         ] {
             let text = errors(&[gone]);
             let key = gone.split_once('=').unwrap().0;
@@ -276,7 +286,7 @@ mod tests {
         let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, sets);
         let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
         assert_eq!((found.env.rot_eps, found.env.sim_dt, found.net.hidden), (0.2, 0.005, vec![9]));
-        // It was made before there was a symmetry.
+        // The file is older than the setting `ppo.symmetry`.
         assert_eq!(found.net.symmetry, Symmetry::None);
         let whole = Config::resolve(None, &[]).unwrap();
         assert_eq!(policy(&whole.to_text(), &[]).unwrap(), PolicyConfig { env: whole.env, net: whole.ppo.net() });
@@ -335,7 +345,7 @@ mod tests {
             ("ppo.hidden=[]", "must hold one to 64 sizes"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
-            ("ppo.away_range=[0.5,0.5]", "must rise from 0 or more"),
+            ("ppo.away_range=[0.5,0.5]", "must be [near, far] with 0 <= near < far"),
             ("env.goal_position=[1,2]", "goal_position"),
             ("nonsense=1", "nonsense: unknown key"),
             ("learning_rate=1", "did you mean ppo.learning_rate?"),
@@ -348,11 +358,11 @@ mod tests {
             ("env.vel_obs_scale=1e300", "must be at most 1000000"),
             (
                 "training.drop_reward.to=-1e10",
-                "training.drop_reward = -10000000000: must be at most 1000000000 in size",
+                "training.drop_reward = -10000000000: must be at most 1000000000 in magnitude",
             ),
             ("env.act_moving_average=0", "must be above 0"),
-            ("env.num_hand_dofs=23", "must be 24, the task is laid out for it"),
-            ("env.num_actuators=24", "must be 20, the task is laid out for it"),
+            ("env.num_hand_dofs=23", "must be 24, fixed by the layout of the task"),
+            ("env.num_actuators=24", "must be 20, fixed by the layout of the task"),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(part), "{bad}: {part} is not in\n{text}");

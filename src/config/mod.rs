@@ -1,9 +1,10 @@
-//! Every setting of the program: its type, where its value comes from, and which values are allowed.
+//! The settings of the program: their types, the sources of their values, and the rules for valid values.
 //!
-//! No default is written in Rust: `configs/repose.toml` is the base, a user's file and `--set` lie on top, all merged as
-//! tables before typing, so that each source meets the same checks. Nothing here reads files or knows who uses a setting.
+//! No default is written in Rust: `configs/repose.toml` is the base, over which the user's file and `--set` are applied. They
+//! are merged as tables before typing, so that every source goes through the same checks. Nothing here depends on the code
+//! that uses a setting.
 //!
-//! A new training key is written at four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
+//! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
 
 mod layers;
 mod overlay;
@@ -13,10 +14,10 @@ mod rules;
 mod settings;
 mod used;
 
-/// The default configuration, commented.
+/// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
-pub use layers::{Override, PolicyConfig, Source};
+pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use settings::{
     Activation, BUILTIN_MODEL, Backend, Config, EnvConfig, NetConfig, PpoConfig, Precision, RunConfig, SuccessHold,

@@ -1,12 +1,12 @@
-//! Laying one table of settings over another: keys and types are those of the base, what does not fit is reported.
+//! Overlaying one table of settings with another: keys and types are those of the base; what does not fit is reported.
 
 use toml::{Table, Value};
 
 use super::ramp::Ramp;
 use super::{BASE, removed};
 
-/// The table with this one value; text that is no TOML value, and any text for a string key, is taken as a string.
-pub fn table_of(key: &str, text: &str, base: &Table) -> Table {
+/// Returns the table with this one value. Text that is not a TOML value becomes a string, as does any text for a string key.
+pub(super) fn table_of(key: &str, text: &str, base: &Table) -> Table {
     let parsed = format!("value = {text}").parse::<Table>();
     let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
     let wants_text = lookup(base, key).is_some_and(Value::is_str);
@@ -14,7 +14,7 @@ pub fn table_of(key: &str, text: &str, base: &Table) -> Table {
         Some(value) if !wants_text || value.is_str() => value,
         _ => Value::String(text.to_owned()),
     };
-    // Nothing lies deeper than a part of a ramp in a section: what follows is part of an unknown name.
+    // The deepest level is a part of a ramp in a section; anything deeper belongs to an unknown name.
     let parts: Vec<&str> = key.splitn(3, '.').collect();
     for part in parts[1..].iter().rev() {
         value = Table::from_iter([((*part).to_owned(), value)]).into();
@@ -31,11 +31,11 @@ fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     }
 }
 
-/// Whoever has so many is helped by the first of them.
+/// The maximum number of problems to report; the first ones are enough to start with.
 const MOST_PROBLEMS: usize = 30;
 
-/// Lays `table` over `merged`, whose keys and types are those of `base`; what does not fit is left out and reported.
-pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
+/// Applies `table` over `merged`, whose keys and types are those of `base`; what does not fit is skipped and reported.
+pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
     for (key, value) in table {
         if problems.len() >= MOST_PROBLEMS {
             return;
@@ -47,7 +47,7 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
         }
         match (base.get(key), value) {
             (None, _) => problems.push(unknown(&name)),
-            // A plain number for a ramp is a constant.
+            // A plain number in place of a ramp is a constant.
             (Some(expected), Value::Integer(_) | Value::Float(_)) if is_ramp(expected) => {
                 let parts = ["from", "to"].map(|part| (part.to_owned(), value.clone()));
                 let constant = Table::from_iter(parts.into_iter().chain([("steps".to_owned(), Value::Integer(0))]));
@@ -67,12 +67,12 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
     }
 }
 
-/// Whether the base has a ramp here.
+/// Returns whether this value of the base is a ramp.
 fn is_ramp(base: &Value) -> bool {
     base.clone().try_into::<Ramp>().is_ok()
 }
 
-/// `value` as the type that the base has, or what that type is called.
+/// Converts `value` to the type of the base's value, or returns a description of that type.
 fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     match (expected, value) {
         (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
@@ -81,26 +81,26 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         | (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
         (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(*i as f64)),
         (Value::Integer(_), Value::Integer(i)) if *i >= 0 => Ok(value.clone()),
-        // 1e8 is how people write a large number of steps.
+        // Users write large numbers of steps as 1e8.
         (Value::Integer(_), Value::Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => {
             Ok(Value::Integer(*x as i64))
         }
         (Value::Array(expected), Value::Array(values)) => {
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&expected[0], v)).collect();
-            typed.map(Value::Array).map_err(|rule| format!("an array, each of it {rule}"))
+            typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Float(_), _) => Err("a number".into()),
         (Value::Integer(_), _) => Err("a whole number, not negative".into()),
         (Value::String(_), _) => Err("a string".into()),
         (Value::Boolean(_), _) => Err("true or false".into()),
-        (Value::Array(_), _) => Err("an array".into()),
+        (Value::Array(_), _) => Err(format!("an array, e.g. {expected}")),
         (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = … }".into()),
         (Value::Table(_), _) => Err("a section with keys".into()),
         _ => Err("of another type".into()),
     }
 }
 
-/// Names longer than this are not compared with ours: it would take the square of their length.
+/// The maximum length of a name that is compared with the known ones: the comparison takes quadratic time.
 const LONGEST_NAME: usize = 64;
 
 fn unknown(name: &str) -> String {
@@ -119,10 +119,10 @@ fn unknown(name: &str) -> String {
     let distance = |candidate: &String| {
         let whole = strsim::damerau_levenshtein(name, candidate);
         let last = |s: &str| s.rsplit('.').next().unwrap_or_default().to_owned();
-        // The right key in the wrong section is as near as one wrong letter.
+        // The right key in the wrong section counts as one wrong letter.
         whole.min(1 + strsim::damerau_levenshtein(&last(name), &last(candidate)))
     };
-    // A setting is not answered with a section.
+    // A section is never suggested for a setting.
     let alike = |candidate: &&String| candidate.contains('.') || !name.contains('.');
     let nearest = known.iter().filter(alike).min_by_key(|candidate| distance(candidate));
     match nearest {

@@ -1,41 +1,41 @@
-//! A setting that changes in the course of a training.
+//! Settings that change in the course of a training.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Goes from one value to another in so many control steps over all hands, and stays there. A plain number in the settings is a
-/// constant.
+/// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. A
+/// plain number in the settings is a constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ramp {
     /// The value at the first step.
     pub from: f64,
-    /// The value at the last step, and ever after.
+    /// The value at the last step and from then on.
     pub to: f64,
-    /// How long that takes; 0: `to` from the first step on.
+    /// The length of the ramp in control steps; 0: the value is `to` from the first step on.
     pub steps: u64,
 }
 
 impl Ramp {
-    /// A value that does not change.
+    /// Returns a ramp whose value does not change.
     pub fn constant(value: f64) -> Self {
         Self { from: value, to: value, steps: 0 }
     }
 
-    /// The value after `env_steps` control steps, which grows by as much in each.
+    /// Returns the value after `env_steps` control steps; it changes by the same difference in each step.
     pub fn by_equal_steps(&self, env_steps: u64) -> f64 {
         let share = self.share(env_steps);
         self.from * (1.0 - share) + self.to * share
     }
 
-    /// The value after `env_steps` control steps, which grows by the same factor in each.
+    /// Returns the value after `env_steps` control steps; it changes by the same factor in each step.
     pub fn by_equal_factors(&self, env_steps: u64) -> f64 {
         let share = self.share(env_steps);
         self.from.powf(1.0 - share) * self.to.powf(share)
     }
 
-    /// How much of it is over, from 0 to 1.
+    /// Returns the fraction of the ramp that is over, from 0 to 1.
     fn share(&self, env_steps: u64) -> f64 {
         if self.steps == 0 { 1.0 } else { (env_steps as f64 / self.steps as f64).min(1.0) }
     }

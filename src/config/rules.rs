@@ -1,4 +1,4 @@
-//! Which values are allowed.
+//! The rules for valid values.
 
 use std::f64::consts::PI;
 
@@ -6,50 +6,50 @@ use toml::{Table, Value};
 
 use super::settings::{Backend, Config, Precision};
 
-// The keys of simple rules, in words; of a ramp both ends must keep them.
+// The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule.
 
-/// Settings above 0.
+/// Settings that must be above 0.
 const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.act_moving_average env.rot_eps \
     env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm \
     ppo.reward_scale ppo.max_std";
 
-/// Settings of 0 and above.
+/// Settings that must be at least 0.
 const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise training.task_reward \
     ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.min_std ppo.away_std";
 
-/// Settings of 1 and above.
+/// Settings that must be at least 1.
 const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.hold ppo.horizon ppo.epochs ppo.minibatches \
     run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
 
-/// Settings from 0 to 1.
+/// Settings that must be from 0 to 1.
 const SHARES: &str = "env.act_moving_average ppo.gamma ppo.lambda";
 
-/// The largest value of a setting.
+/// The largest valid values of settings.
 const AT_MOST: &[(&str, f64)] = &[
     ("env.num_envs", 65536.0),
     ("training.hold", 1e9),
     ("run.eval_episodes", 1048576.0),
     ("run.threads", 4096.0),
-    // A rotation error is never larger.
+    // No rotation error is larger.
     ("env.success_tolerance", PI),
-    // Of what is observed, squares are taken in floats.
+    // Observed values are squared in `f32`.
     ("env.vel_obs_scale", 1e6),
 ];
 
-/// The largest size of a number of the task or the training that is no count: what comes near it was not meant.
+/// The largest magnitude of a value in `[env]` and `[training]` that is not a count: anything near it is a mistake.
 const LARGEST: f64 = 1e9;
 
-/// The largest coordinate of the goal, m: everything near it is measured in floats.
+/// The largest coordinate of the goal, m: everything near it is measured in `f32`.
 const FARTHEST: f64 = 100.0;
 
-/// Settings that are what the task is laid out for.
+/// Settings whose only valid value is fixed by the layout of the task.
 const FIXED: &[(&str, f64)] = &[("env.num_hand_dofs", 24.0), ("env.num_actuators", 20.0)];
 
-/// Places of two ramps that are compared.
+/// The number of intervals at whose ends two ramps are compared.
 const COMPARED: u64 = 64;
 
-/// Every rule that the values break, as "key = value: must …".
-pub fn violations(config: &Config) -> Vec<String> {
+/// Returns every rule that the values break, as "key = value: must …".
+pub(super) fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
     let table = Table::try_from(config).expect("a configuration is a tree of tables");
     POSITIVE.split_whitespace().for_each(|key| rules.number(&table, key, |x| x > 0.0, "be above 0"));
@@ -60,13 +60,13 @@ pub fn violations(config: &Config) -> Vec<String> {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
     }
     for (key, only) in FIXED {
-        rules.number(&table, key, |x| x == *only, &format!("be {only}, the task is laid out for it"));
+        rules.number(&table, key, |x| x == *only, &format!("be {only}, fixed by the layout of the task"));
     }
     for (section, keys) in table.iter().filter(|(section, _)| ["env", "training"].contains(&section.as_str())) {
         for (key, value) in keys.as_table().into_iter().flatten() {
             let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
             if let Some(x) = too_large.filter(|_| key != "hold") {
-                rules.check(false, &format!("{section}.{key}"), x, &format!("be at most {LARGEST} in size"));
+                rules.check(false, &format!("{section}.{key}"), x, &format!("be at most {LARGEST} in magnitude"));
             }
         }
     }
@@ -77,7 +77,7 @@ pub fn violations(config: &Config) -> Vec<String> {
     rules.broken
 }
 
-/// The numbers of a setting that are no counts.
+/// Returns the values of a setting that are not counts.
 fn floats(value: &Value) -> Vec<f64> {
     match value {
         Value::Float(x) => vec![*x],
@@ -95,7 +95,7 @@ fn env(config: &Config, rules: &mut Rules) {
     rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
-    let rule = format!("be a whole multiple of env.sim_dt = {}, up to 10000 of them", env.sim_dt);
+    let rule = format!("be a whole multiple of env.sim_dt = {}, at most 10000 times it", env.sim_dt);
     rules.check(whole || ratio.is_nan() || ratio <= 0.0, "env.ctrl_dt", env.ctrl_dt, &rule);
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
     let rule = "last between one and 1e9 steps of env.ctrl_dt";
@@ -108,13 +108,13 @@ fn nets(config: &Config, rules: &mut Rules) {
     let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
     rules.check(sizes_fit, "ppo.hidden", &sizes, "hold one to 64 sizes from 1 to 16384");
     let weights = hidden.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
-    rules.check(weights <= 1 << 25, "ppo.hidden", sizes, "have at most 2^25 weights between them");
+    rules.check(weights <= 1 << 25, "ppo.hidden", sizes, "have at most 2^25 weights between its layers");
 }
 
 fn learning(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
     let samples = config.env.num_envs.saturating_mul(ppo.horizon);
-    let rule = "be at most 2^22 samples together with env.num_envs";
+    let rule = "make at most 2^22 samples (num_envs * horizon)";
     rules.check(samples <= 1 << 22, "ppo.horizon", ppo.horizon, rule);
     let divides = ppo.minibatches == 0 || samples.is_multiple_of(ppo.minibatches);
     let rule = format!("divide num_envs * horizon = {samples}");
@@ -124,24 +124,24 @@ fn learning(config: &Config, rules: &mut Rules) {
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
     rules.check(dealt, "run.shards", shards, rule);
     let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
-    let precision = Value::try_from(ppo.precision).expect("a word");
+    let precision = Value::try_from(ppo.precision).expect("a string");
     rules.check(computable, "ppo.precision", precision, "be \"f32\" with ppo.backend = \"candle\"");
     let [low, high] = ppo.learning_rate_range;
     let range = format!("[{low}, {high}]");
     let within = ppo.desired_kl == 0.0 || (low..=high).contains(&ppo.learning_rate);
     let rule = format!("lie in ppo.learning_rate_range = {range} unless ppo.desired_kl = 0");
     rules.check(within, "ppo.learning_rate", ppo.learning_rate, &rule);
-    rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "rise from above 0");
+    rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "be [low, high] with 0 < low <= high");
 }
 
 fn noise(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
-    // The ramps bend differently: that they do not cross is looked at along the way.
+    // The ramps bend differently, so they are compared at several steps.
     let steps = ppo.max_std.steps.max(ppo.min_std.steps);
     let places = (0..=COMPARED).map(|i| steps / COMPARED * i).chain([steps]);
     for (at, [least, most]) in places.map(|at| (at, ppo.std_bounds(at))) {
         let rule = format!("be at most ppo.max_std, which is {most:.4} after {at} steps");
-        // Of two that are meant to be the same, one may be rounded otherwise.
+        // Bounds that are meant to be equal may differ by rounding.
         let crossed = least > most * (1.0 + 1e-9);
         rules.check(!crossed, "ppo.min_std", ppo.min_std, &rule);
         if crossed {
@@ -149,10 +149,15 @@ fn noise(config: &Config, rules: &mut Rules) {
         }
     }
     let [near, far] = ppo.away_range;
-    rules.check(0.0 <= near && near < far, "ppo.away_range", format!("[{near}, {far}]"), "rise from 0 or more");
+    rules.check(
+        0.0 <= near && near < far,
+        "ppo.away_range",
+        format!("[{near}, {far}]"),
+        "be [near, far] with 0 <= near < far",
+    );
 }
 
-/// Collects the rules that were broken.
+/// The rules that were broken.
 #[derive(Default)]
 struct Rules {
     broken: Vec<String>,
@@ -165,7 +170,7 @@ impl Rules {
         }
     }
 
-    /// Checks a number, or both ends of a ramp; those of a constant once.
+    /// Checks a number, or both ends of a ramp; a constant is checked once.
     fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: &str) {
         let (section, name) = key.split_once('.').expect("a key is in a section");
         let value = &table[section][name];

@@ -1,4 +1,4 @@
-//! The settings as types; `configs/repose.toml` says what each key means and in which unit.
+//! The settings as types; `configs/repose.toml` documents the meaning and the unit of each key.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::ramp::Ramp;
 
-/// `env.model` of the scene that is built into the program.
+/// The value of `env.model` for the built-in scene.
 pub const BUILTIN_MODEL: &str = "builtin";
 
 /// The whole configuration of a run.
@@ -15,16 +15,16 @@ pub const BUILTIN_MODEL: &str = "builtin";
 pub struct Config {
     /// The task and its physics.
     pub env: EnvConfig,
-    /// What training changes of the task and adds to its reward.
+    /// Changes to the task and additions to its reward that only training uses.
     pub training: TrainingConfig,
     /// The learner.
     pub ppo: PpoConfig,
-    /// The course of a training.
+    /// The run: length, checkpoints, evaluations, seed, threads.
     pub run: RunConfig,
 }
 
 /// The task.
-#[allow(missing_docs)]
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvConfig {
@@ -56,18 +56,18 @@ pub struct EnvConfig {
     pub vel_obs_scale: f64,
 }
 
-/// What a step outside the tolerance does to the counter of steps within it.
+/// The effect of a step outside the tolerance on the counter of steps within it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SuccessHold {
-    /// It leaves the counter alone.
+    /// The counter stays unchanged.
     Cumulative,
-    /// It sets the counter to zero.
+    /// The counter is reset to zero.
     Consecutive,
 }
 
-/// What only training sees.
-#[allow(missing_docs)]
+/// Settings that only training uses.
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingConfig {
@@ -81,7 +81,7 @@ pub struct TrainingConfig {
 }
 
 /// The learner.
-#[allow(missing_docs)]
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PpoConfig {
@@ -110,8 +110,8 @@ pub struct PpoConfig {
     pub away_range: [f64; 2],
 }
 
-/// The function after each hidden layer.
-#[allow(missing_docs)]
+/// The activation function after each hidden layer.
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
@@ -120,40 +120,40 @@ pub enum Activation {
     Tanh,
 }
 
-/// What a policy takes to be the same.
+/// The states that a policy treats as the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Symmetry {
-    /// Nothing.
+    /// None.
     None,
     /// A cube and the same cube turned onto itself.
     Cube,
 }
 
-/// What computes the gradients.
+/// The implementation that computes the gradients.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
     /// Our own kernels.
     Fused,
-    /// candle's tensors and automatic gradients: slower, the reference for the other.
+    /// candle's tensors and automatic differentiation: slower, the reference for the kernels.
     Candle,
 }
 
-/// The numbers that are multiplied in the nets while learning and collecting; all else is in floats.
+/// The number format of the matrix products in the nets while learning and collecting; everything else is `f32`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
-    /// Floats.
+    /// `f32`.
     F32,
-    /// bf16, with sums in floats, on the tiles of processors that have them.
+    /// bf16 with sums in `f32`, on the matrix tiles of processors that have them.
     Bf16,
     /// The rounding of bf16 without its speed, on any processor.
     Bf16Rounded,
 }
 
-/// The course of a training.
-#[allow(missing_docs)]
+/// The run: length, checkpoints, evaluations, seed, threads.
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
@@ -166,69 +166,69 @@ pub struct RunConfig {
     pub threads: usize,
 }
 
-/// What of the settings of a learner its policy keeps for life.
+/// The settings of a learner that its policy keeps for life.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NetConfig {
-    /// Sizes of the hidden layers, of the actor and of the critic alike.
+    /// The sizes of the hidden layers, the same for actor and critic.
     pub hidden: Vec<usize>,
-    /// The function after each of them.
+    /// The activation function after each of them.
     pub activation: Activation,
-    /// What it takes to be the same.
+    /// The states that it treats as the same.
     pub symmetry: Symmetry,
 }
 
 impl Config {
-    /// Control steps in one iteration.
+    /// Returns the number of control steps in one iteration.
     pub fn steps_per_iteration(&self) -> u64 {
         (self.env.num_envs * self.ppo.horizon) as u64
     }
 
-    /// Samples of a minibatch.
+    /// Returns the number of samples in a minibatch.
     pub fn samples_per_minibatch(&self) -> usize {
         self.env.num_envs * self.ppo.horizon / self.ppo.minibatches
     }
 
-    /// The shards of the training: those that are asked for, or else the most that fit, up to 16.
+    /// Returns the number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
     pub fn shards(&self) -> usize {
         let found = [16, 8, 4, 2].into_iter().find(|&shards| self.divides(shards)).unwrap_or(1);
         if self.run.shards == 0 { found } else { self.run.shards }
     }
 
-    /// Whether environments and minibatches can be dealt to so many shards.
+    /// Returns whether environments and minibatches can be divided evenly into `shards`.
     pub(super) fn divides(&self, shards: usize) -> bool {
         self.env.num_envs.is_multiple_of(shards) && self.samples_per_minibatch().is_multiple_of(shards)
     }
 }
 
 impl PpoConfig {
-    /// The policy that is trained.
+    /// Returns the structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
         NetConfig { hidden: self.hidden.clone(), activation: self.activation, symmetry: self.symmetry }
     }
 
-    /// How far a value may move from the one that was there when the rollout was collected.
+    /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
         if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
     }
 
-    /// The least and the largest standard deviation of the actions after `env_steps` control steps of the whole run.
+    /// Returns the smallest and largest standard deviation of the actions after `env_steps` control steps of the whole run.
     pub fn std_bounds(&self, env_steps: u64) -> [f64; 2] {
         [self.min_std.by_equal_steps(env_steps), self.max_std.by_equal_factors(env_steps)]
     }
 }
 
 impl EnvConfig {
-    /// Physics steps in one control step.
+    /// Returns the number of physics steps in one control step.
     pub fn substeps(&self) -> usize {
         (self.ctrl_dt / self.sim_dt).round() as usize
     }
 
-    /// Control steps after which an episode is truncated.
+    /// Returns the number of control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
         (self.max_episode_seconds / self.ctrl_dt).round() as u32
     }
 
-    /// The user's own scene, or `None` for the built-in one.
+    /// Returns the path of the user's own scene, or `None` for the built-in one.
     pub fn model_file(&self) -> Option<&Path> {
         (self.model != BUILTIN_MODEL).then(|| Path::new(&self.model))
     }

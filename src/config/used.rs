@@ -1,4 +1,4 @@
-//! Which commands a setting does something for.
+//! The commands that use each setting.
 
 use anyhow::{Result, bail};
 use toml::Table;
@@ -10,26 +10,27 @@ use super::overlay::table_of;
 /// The commands that take settings.
 const COMMANDS: [&str; 4] = ["train", "bench", "play", "view"];
 
-/// Settings of `[env]` and `[run]` that fewer commands use than the others of their section.
+/// Settings of `[env]` and `[run]` that are used by fewer commands than the rest of their section.
 const FEWER: [(&str, &[&str]); 5] = [
     ("env.num_envs", &["train", "bench"]),
-    ("run.total_steps", &["train"]),
+    ("run.total_steps", &["train", "bench"]),
     ("run.checkpoint_every", &["train"]),
     ("run.eval_every", &["train"]),
     ("run.eval_episodes", &["train"]),
 ];
 
-/// Makes sure that a command uses all of these settings. A file of settings may hold any: it is one for all commands.
+/// Checks that a command uses all of these single settings. A configuration file may hold any setting, because it is shared by
+/// all commands.
 ///
 /// # Errors
-/// The first that it does not use, with the commands that do.
+/// Fails on the first setting that the command does not use, and names the commands that do.
 pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
-    let base: Table = BASE.parse().expect("our own settings are TOML");
+    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
     for Override { key, value } in overrides {
         let table = table_of(key, value, &base);
         let in_sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
         for (section, name) in in_sections.flat_map(|(section, keys)| keys.keys().map(move |name| (section, name))) {
-            // What is unknown is answered with what is known, elsewhere.
+            // Unknown keys are reported elsewhere, with a suggestion.
             let known = base.get(section).and_then(|keys| keys.get(name)).is_some();
             let users = users(section, name);
             if known && !users.contains(&command) {
@@ -61,7 +62,7 @@ mod tests {
             ("ppo.gamma=0.5", "view", "`train` and `bench` do"),
             ("run.threads=3", "view", "`train` and `bench` do"),
             ("training.tolerance.to=1", "play", "`train` and `bench` do"),
-            ("run.total_steps=3", "bench", "`train` does"),
+            ("run.eval_every=3", "bench", "`train` does"),
             ("ppo={gamma=0.5}", "play", "`train` and `bench` do"),
             ("env={num_envs=9}", "view", "`train` and `bench` do"),
         ] {
@@ -70,6 +71,6 @@ mod tests {
             assert!(answer(set, "train").is_ok());
         }
         assert!(answer("env.sim_dt=0.002", "view").is_ok() && answer("run.seed=3", "bench").is_ok());
-        assert!(answer("env.foo=1", "view").is_ok(), "answered elsewhere");
+        assert!(answer("env.foo=1", "view").is_ok(), "reported elsewhere");
     }
 }

@@ -1,4 +1,4 @@
-//! What a finished episode leaves behind, and the score of many of them.
+//! Statistics of an episode, and the score of a set of episodes.
 
 use anyhow::{Result, ensure};
 
@@ -9,55 +9,69 @@ use super::{EnvState, RewardTerms, SavedEnv, Shaping};
 pub struct EpisodeStats {
     /// Control steps.
     pub length: u32,
-    /// Goals reached: held for as long as asked, after which a new one was drawn.
+    /// Goals reached: held for the required number of steps and then replaced by a new one.
     pub goals: u32,
     /// Steps within the tolerance.
     pub in_tolerance: u32,
-    /// Sum over the steps of the rotation error, rad; a diverged step has none.
+    /// Sum of the rotation error over the steps, rad; a diverged step adds nothing.
     pub rot_dist_sum: f64,
-    /// Sum of the rewards, term by term.
+    /// Sums of the reward terms.
     pub reward: RewardTerms,
-    /// The cube was dropped.
+    /// Whether the cube was dropped.
     pub dropped: bool,
-    /// The physics diverged.
+    /// Whether the physics diverged.
     pub diverged: bool,
 }
 
 impl EpisodeStats {
-    /// How many numbers it saves.
+    /// The number of `f64` values that [`Self::save`] writes.
     pub(super) const NUMBERS: usize = 6;
 
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);
-        state.numbers.extend(self.reward.values());
+        let RewardTerms { rotation, distance, action, bonus, fall } = self.reward;
+        state.numbers.extend([rotation, distance, action, bonus, fall]);
         state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
         state.counters.extend([self.dropped, self.diverged].map(u64::from));
     }
 
     /// # Errors
-    /// Counters that no episode has.
+    /// Fails if values are missing, or if no episode can have these counters.
     pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
         let [rot_dist_sum] = state.numbers()?;
-        let reward = RewardTerms::from(state.numbers()?);
+        let [rotation, distance, action, bonus, fall] = state.numbers()?;
+        let reward = RewardTerms { rotation, distance, action, bonus, fall };
         let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
         let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
-        ensure!(possible, "an episode of {length} steps with {goals} goals and {in_tolerance} steps in tolerance");
+        ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
         let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);
         Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped: dropped != 0, diverged: diverged != 0 })
     }
 }
 
-/// Sums since they were last taken, across episodes; taken before a state is saved, and no part of it.
+/// Sums across episodes since they were last taken. They are taken before a state is saved and are not part of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Recent {
     /// Control steps.
     pub steps: u64,
-    /// Rewards by term.
+    /// Sums of the reward terms.
     pub reward: RewardTerms,
-    /// What training pays besides, by term.
+    /// Sums of the shaping terms that training adds.
     pub shaping: Shaping,
-    /// Steps on which the physics diverged.
+    /// Steps in which the physics diverged.
     pub diverged: u64,
+}
+
+impl Recent {
+    /// Returns the mean of each term of the task's reward over the steps, by name.
+    pub fn reward_named(&self) -> [(&'static str, f64); 5] {
+        self.reward.named().map(|(name, sum)| (name, sum / self.steps as f64))
+    }
+
+    /// Returns the mean of each shaping term over the steps, by name.
+    pub fn shaping_named(&self) -> [(&'static str, f64); 3] {
+        self.shaping.named().map(|(name, sum)| (name, sum / self.steps as f64))
+    }
 }
 
 impl std::ops::AddAssign for Recent {
@@ -69,18 +83,18 @@ impl std::ops::AddAssign for Recent {
     }
 }
 
-/// Means over finished episodes; `NaN` where there is nothing to take a mean of.
+/// Means over finished episodes; `NaN` where there is nothing to average.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Score {
-    /// Episodes counted.
+    /// The number of episodes.
     pub episodes: usize,
-    /// Their control steps together.
+    /// Control steps of all episodes together.
     pub env_steps: u64,
     /// Goals reached per episode.
     pub goals: f64,
-    /// 95 % interval of `goals`: mean ± 1.96 standard errors, not below zero.
+    /// 95 % confidence interval of `goals`: mean ± 1.96 standard errors, clipped at zero.
     pub goals_ci95: [f64; 2],
-    /// Fraction of the steps within tolerance.
+    /// Fraction of the steps within the tolerance.
     pub in_tolerance: f64,
     /// Mean rotation error over the steps, rad.
     pub rot_dist: f64,
@@ -90,31 +104,54 @@ pub struct Score {
     pub drop_rate: f64,
     /// Mean length in control steps.
     pub length: f64,
-    /// Mean sum of rewards.
+    /// Mean sum of rewards of an episode.
     pub episode_return: f64,
-    /// The same by term.
+    /// The same, by term.
     pub reward: RewardTerms,
     /// Episodes that ended because the physics diverged.
     pub diverged: usize,
 }
 
-/// What to say where more than a hundredth of these steps diverged: what is learnt or scored then is not the task.
+/// Returns a warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
 pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
     (diverged * 100 > steps).then(|| {
         format!(
-            "in {diverged} of {steps} steps the physics diverged and the episode ended: the masses, friction, \
-             env.sim_dt or scene cannot be simulated"
+            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of masses, \
+             friction, env.sim_dt and scene cannot be simulated"
         )
     })
 }
 
 impl Score {
-    /// What to say where many of the steps diverged; each ended an episode.
+    /// Returns a warning if many of the steps diverged; each such step ended an episode.
     pub fn divergence(&self) -> Option<String> {
         divergence(self.diverged as u64, self.env_steps)
     }
 
-    /// The score of these episodes.
+    /// Returns all figures by name.
+    pub fn named(&self) -> [(&'static str, f64); 7] {
+        [
+            ("return", self.episode_return),
+            ("length", self.length),
+            ("goals", self.goals),
+            ("in_tolerance", self.in_tolerance),
+            ("drop_rate", self.drop_rate),
+            ("rot_dist", self.rot_dist),
+            ("steps_per_goal", self.steps_per_goal),
+        ]
+    }
+
+    /// Returns the figures, by name, that summarise an evaluation during training.
+    pub fn headline(&self) -> [(&'static str, f64); 4] {
+        [
+            ("goals", self.goals),
+            ("drop_rate", self.drop_rate),
+            ("rot_dist", self.rot_dist),
+            ("return", self.episode_return),
+        ]
+    }
+
+    /// Computes the score of `episodes`.
     pub fn of(episodes: &[EpisodeStats]) -> Self {
         let n = episodes.len() as f64;
         let sum = |f: &dyn Fn(&EpisodeStats) -> f64| episodes.iter().map(f).sum::<f64>();
@@ -138,7 +175,7 @@ impl Score {
             drop_rate: count(&|e| e.dropped) as f64 / n,
             length: steps / n,
             episode_return: total.total() / n,
-            reward: total.values().map(|term| term / n).into(),
+            reward: total.map(|term| term / n),
             diverged,
         }
     }

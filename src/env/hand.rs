@@ -1,39 +1,39 @@
-//! The Shadow Hand in a scene: its names, bound once, in the order of the task, and the layouts that follow from them.
+//! The Shadow Hand in a scene: its names in the task's order, bound once, and the layouts that follow from them.
 
 use anyhow::{Context, Result, ensure};
 
 use crate::sim::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
 
-/// Numbers in an action, one for each actuator.
+/// The length of an action: one value for each actuator.
 pub const ACTION_SIZE: usize = 20;
 
-/// Joints in the order of the observation; in a scene `rh_` stands before the names.
+/// Joints in observation order, without the prefix `rh_` that they have in a scene.
 pub const JOINTS: [&str; 24] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
     "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
 ];
 
-/// Actuators in the order of the action, in a scene with `rh_A_` before them; a J0 drives the sum of J2 and J1.
+/// Actuators in action order, without the prefix `rh_A_` that they have in a scene. A J0 drives the sum of J2 and J1.
 pub const ACTUATORS: [&str; ACTION_SIZE] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "RFJ4", "RFJ3", "RFJ0",
     "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
 ];
 
-/// The body that is turned.
+/// The name of the body that the hand turns.
 pub(super) const CUBE: &str = "cube";
 
-/// Fingertips in the order of the observation, as the scene names them.
+/// Fingertip bodies in observation order, as named in the scene.
 pub const FINGERTIPS: [&str; 5] = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"];
 
-/// Where everything that the task uses lies in a scene.
+/// Everything in a scene that the task uses.
 pub struct Hand {
-    /// In the order of the observation.
+    /// Joints in observation order.
     pub joints: [Hinge; 24],
-    /// In the order of the action.
+    /// Actuators in action order.
     pub actuators: [Actuator; ACTION_SIZE],
-    /// For each actuator the joints whose angles it drives the sum of, as indices into `joints`.
+    /// The joints that each actuator drives the sum of, as indices into `joints`.
     pub driven: [Vec<usize>; ACTION_SIZE],
-    /// Index, middle, ring, little finger, thumb.
+    /// Fingertips: index, middle, ring, little finger, thumb.
     pub fingertips: [Body; 5],
     /// The cube.
     pub cube: FreeJoint,
@@ -42,10 +42,10 @@ pub struct Hand {
 }
 
 impl Hand {
-    /// Finds every name in `scene`, in whatever order its file has them.
+    /// Finds every name in `scene`, in whatever order they appear in its file.
     ///
     /// # Errors
-    /// The first name that is missing or belongs to something else, with the scene's file.
+    /// Fails with the scene's file and the first name that is missing or belongs to something else.
     pub fn bind(scene: &Scene) -> Result<Self> {
         let joints = each(JOINTS, |joint| scene.hinge(&format!("rh_{joint}")))?;
         let driven = each(ACTUATORS, |actuator| Ok(driven_by(actuator)))?;
@@ -58,7 +58,7 @@ impl Hand {
         })?;
         ensure!(
             scene.controls() == ACTION_SIZE,
-            "{}: has {} controls, but the hand has {ACTION_SIZE} and nothing else may need one",
+            "{}: has {} controls, but it must have exactly the {ACTION_SIZE} of the hand",
             scene.origin(),
             scene.controls()
         );
@@ -73,7 +73,7 @@ impl Hand {
     }
 }
 
-/// Indices into [`JOINTS`] of what an actuator drives.
+/// Returns the indices into [`JOINTS`] of the joints that `actuator` drives.
 fn driven_by(actuator: &str) -> Vec<usize> {
     let drives = |joint: &str| match actuator.strip_suffix("J0") {
         Some(finger) => joint.strip_prefix(finger).is_some_and(|rest| rest == "J2" || rest == "J1"),
@@ -84,7 +84,7 @@ fn driven_by(actuator: &str) -> Vec<usize> {
 
 fn each<T, const N: usize>(names: [&str; N], find: impl FnMut(&str) -> Result<T>) -> Result<[T; N]> {
     let found: Vec<T> = names.into_iter().map(find).collect::<Result<_>>()?;
-    found.try_into().ok().context("one result for each name")
+    found.try_into().ok().context("one result per name")
 }
 
 #[cfg(test)]

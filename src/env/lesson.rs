@@ -1,44 +1,44 @@
-//! What training may change of the task and add to its reward, at one moment of a run.
+//! The lesson: what training changes about the task and adds to its reward at a given step of a run.
 
 use std::ops::AddAssign;
 
 use crate::config::{EnvConfig, TrainingConfig};
 
-/// The task as it is trained at some moment: what counts as reaching a goal, how long goals stay, what is paid.
+/// The task as trained at a given step: when a goal is reached, how long goals stay, and what is rewarded.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lesson {
     /// Rotation error that counts as being at the goal, rad.
     pub tolerance: f64,
-    /// Steps within the tolerance until a goal is reached.
+    /// Steps within the tolerance that reach a goal.
     pub hold: u32,
-    /// Chance that the goal is replaced after a step on which it was not reached.
+    /// Probability that the goal is replaced after a step in which it was not reached.
     pub redirect_chance: f64,
-    /// Whether reaching a goal is told as [`super::End::Redirected`], so that the goal is worth as much as if it stayed: no value
-    /// then depends on how long it was held already, which nobody sees. In the task itself the next goal is there at once.
+    /// Whether reaching a goal ends it with [`super::End::Redirected`], so that its value is the same as if it stayed. No value
+    /// then depends on the hold so far, which is not observed. In the task itself the next goal follows immediately.
     pub goals_end: bool,
     /// Weight of the task's own reward.
     pub task_reward: f64,
-    /// Paid for each rad by which the rotation error shrinks, taken back where it grows.
+    /// Reward per rad by which the rotation error shrinks; negative where the error grows.
     progress_reward: f64,
-    /// Paid on every step within the tolerance.
+    /// Reward for every step within the tolerance.
     hold_reward: f64,
-    /// Paid on the step on which the cube is dropped.
+    /// Reward for the step in which the cube is dropped.
     pub drop_reward: f64,
 }
 
-/// What training pays besides the task's own reward.
+/// The rewards that training adds to the task's own.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Shaping {
-    /// For turning towards the goal.
+    /// The reward for turning towards the goal.
     pub progress: f64,
-    /// For being within the tolerance.
+    /// The reward for being within the tolerance.
     pub within: f64,
-    /// For dropping the cube.
+    /// The reward for dropping the cube.
     pub drop: f64,
 }
 
 impl Lesson {
-    /// The task itself: what is played, and what is scored.
+    /// Returns the lesson that is the task itself, as played and scored.
     pub fn task(env: &EnvConfig) -> Self {
         Self {
             tolerance: env.success_tolerance,
@@ -52,10 +52,10 @@ impl Lesson {
         }
     }
 
-    /// The lesson that training gives after `env_steps` control steps of the whole run.
+    /// Returns the lesson after `env_steps` control steps of the whole run.
     pub fn at(env_steps: u64, training: &TrainingConfig) -> Self {
         Self {
-            // By equal factors: halving the error is as hard a step anywhere.
+            // By equal factors: halving the error is equally hard at any size.
             tolerance: training.tolerance.by_equal_factors(env_steps),
             hold: training.hold.by_equal_steps(env_steps).round() as u32,
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
@@ -67,14 +67,14 @@ impl Lesson {
         }
     }
 
-    /// What changes in the course of a training, by name.
+    /// Returns the values that change during training, by name.
     pub fn named(&self) -> [(&'static str, f64); 4] {
         let Self { tolerance, hold, task_reward, drop_reward, .. } = *self;
         let hold = f64::from(hold);
         [("tolerance", tolerance), ("hold", hold), ("task_reward", task_reward), ("drop_reward", drop_reward)]
     }
 
-    /// What a step pays that has turned the cube `progress` rad towards the goal.
+    /// Returns the shaping of a step that turned the cube `progress` rad towards the goal.
     pub(super) fn shaping(&self, progress: f64, within: bool, dropped: bool) -> Shaping {
         Shaping {
             progress: self.progress_reward * progress,
@@ -83,14 +83,14 @@ impl Lesson {
         }
     }
 
-    /// What training pays for a step with this reward of the task.
+    /// Returns the training reward of a step with the task reward `task`.
     pub(super) fn total(&self, task: f64, shaping: Shaping) -> f64 {
         self.task_reward * task + shaping.named().iter().map(|(_, paid)| paid).sum::<f64>()
     }
 }
 
 impl Shaping {
-    /// The terms by name.
+    /// Returns the terms by name.
     pub fn named(&self) -> [(&'static str, f64); 3] {
         [("progress", self.progress), ("within", self.within), ("drop", self.drop)]
     }

@@ -1,6 +1,6 @@
-//! Environments: what an agent acts in, and many of them stepped at once.
+//! Environments that an agent acts in, and pools that step many of them at once.
 //!
-//! Knows physics, not learning: actions come in and observations go out as `f32` slices.
+//! This module knows physics, not learning: actions come in and observations go out as `f32` slices.
 
 mod episode;
 mod hand;
@@ -16,7 +16,7 @@ mod task;
 pub use episode::{EpisodeStats, Recent, Score, divergence};
 pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::{Lesson, Shaping};
-pub use observation::{OBSERVATION, OBSERVATION_SIZE, Part, SPACES};
+pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use pool::{EnvBlock, EnvPool, StepBuffers, stepping};
 pub use repose::{Diverged, Repose, StepDetails};
 pub use reward::RewardTerms;
@@ -29,66 +29,66 @@ use anyhow::Result;
 use crate::rng::Rng;
 use crate::spaces::Spaces;
 
-/// Why what can be earned ends here.
+/// The reason why a return ends at a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// There is no future: nothing can be earned after this step.
+    /// There is no future: no reward follows this step.
     Terminated,
-    /// Only time is up: the value of the final observation stands for what would have come.
+    /// Only the time is up: the value of the final observation replaces the future rewards.
     Truncated,
-    /// The episode goes on, but under another goal: the value of the observation under the old one stands for what would have
-    /// come.
+    /// The episode continues, but under another goal: the value of the observation under the old goal replaces the future
+    /// rewards.
     Redirected,
 }
 
-/// What one step earned and whether it was a last one.
+/// The result of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition {
     /// Reward, before any scaling.
     pub reward: f32,
-    /// Set on the last step of an episode, or under a goal.
+    /// Set on the last step of an episode or under a goal.
     pub end: Option<End>,
 }
 
 /// One environment with continuous actions.
 pub trait Env: Send {
-    /// What is known about a finished episode.
+    /// The record of a finished episode.
     type Episode: Send;
 
-    /// What is trained at some moment of a run, if that changes.
+    /// The variant of the task that is trained at a given step of a run.
     type Lesson: Copy + Send;
 
-    /// Its observations and actions, as a learner must know them.
+    /// The description of observations and actions that a learner needs.
     const SPACES: Spaces;
 
-    /// Trains this lesson from now on.
+    /// Switches to `lesson` from the next step on.
     fn set_lesson(&mut self, lesson: Self::Lesson);
 
-    /// Starts an episode whose randomness is all drawn from `rng`, and writes the first observation.
+    /// Starts an episode that draws all its randomness from `rng`, and writes the first observation.
     fn reset(&mut self, rng: Rng, observation: &mut [f32]);
 
-    /// Makes the episode just started end early, as if `share` (in [0, 1)) of its greatest length had passed.
+    /// Makes the episode just started end early, as if the fraction `share` (in [0, 1)) of its maximum length had passed.
     fn skip_ahead(&mut self, share: f64);
 
-    /// Takes one step and writes the observation after it, also where it ends the episode.
+    /// Takes one step and writes the observation after it, even if the step ends the episode.
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition;
 
-    /// Goes on under another goal after a step that ended with [`End::Redirected`], and writes the observation that shows it.
+    /// Continues under another goal after a step that ended with [`End::Redirected`], and writes the observation that shows it.
     fn redirect(&mut self, observation: &mut [f32]);
 
-    /// The episode so far.
+    /// Returns the record of the episode so far.
     fn episode(&self) -> Self::Episode;
 }
 
 /// An environment that can be saved in the middle of an episode.
 pub trait Resumable: Env {
-    /// Adds to `state` all that its future depends on, always as many numbers and counters.
+    /// Appends to `state` everything that its future depends on, always the same number of values.
     fn save(&self, state: &mut EnvState);
 
-    /// Takes what it has saved from the front of `state`, and writes the observation to act on next; the future is then bit
-    /// for bit that of the environment that saved it.
+    /// Reads from the front of `state` what [`Self::save`] wrote, and writes the observation to act on next. From then on it
+    /// behaves bit for bit like the environment that was saved.
     ///
     /// # Errors
-    /// Numbers that it cannot have saved.
+    /// Fails if these values cannot have been saved by such an environment.
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()>;
 }

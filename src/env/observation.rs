@@ -1,66 +1,67 @@
-//! What stands where in an observation: one table, from which sizes, places, and what others are told of it follow.
+//! The layout of an observation: one table from which sizes, offsets and the descriptions for other modules follow.
 
 use super::hand::{ACTION_SIZE, FINGERTIPS, JOINTS};
-use crate::spaces::Spaces;
+use crate::spaces::{CubeAndGoal, Spaces};
 
-/// Some numbers of an observation that belong together.
+/// A group of consecutive values in an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Part {
-    /// What they are.
+pub struct Group {
+    /// The name of the group.
     pub name: &'static str,
-    /// The place of the first of them.
+    /// The index of its first value.
     pub start: usize,
-    /// How many.
+    /// The number of values.
     pub length: usize,
-    /// In which unit; 1 where they have none.
+    /// The unit; 1 for dimensionless values.
     pub unit: &'static str,
 }
 
-// Each begins where the one before it ends.
-const JOINT_POS: Part = Part { name: "joint_pos", start: 0, length: JOINTS.len(), unit: "rad" };
-const JOINT_VEL: Part = JOINT_POS.then("joint_vel", JOINTS.len(), "rad/s * vel_obs_scale");
-const CUBE_POS: Part = JOINT_VEL.then("cube_pos", 3, "m");
-const CUBE_QUAT: Part = CUBE_POS.then("cube_quat", 4, "1");
-const CUBE_LINVEL: Part = CUBE_QUAT.then("cube_linvel", 3, "m/s");
-const CUBE_ANGVEL: Part = CUBE_LINVEL.then("cube_angvel", 3, "rad/s * vel_obs_scale");
-const GOAL_POS: Part = CUBE_ANGVEL.then("goal_pos", 3, "m");
-const GOAL_QUAT: Part = GOAL_POS.then("goal_quat", 4, "1");
-const RELATIVE_QUAT: Part = GOAL_QUAT.then("relative_quat", 4, "1");
+// Each group begins where the previous one ends.
+const JOINT_POS: Group = Group { name: "joint_pos", start: 0, length: JOINTS.len(), unit: "rad" };
+const JOINT_VEL: Group = JOINT_POS.then("joint_vel", JOINTS.len(), "rad/s * vel_obs_scale");
+const CUBE_POS: Group = JOINT_VEL.then("cube_pos", 3, "m");
+const CUBE_QUAT: Group = CUBE_POS.then("cube_quat", 4, "1");
+const CUBE_LINVEL: Group = CUBE_QUAT.then("cube_linvel", 3, "m/s");
+const CUBE_ANGVEL: Group = CUBE_LINVEL.then("cube_angvel", 3, "rad/s * vel_obs_scale");
+const GOAL_POS: Group = CUBE_ANGVEL.then("goal_pos", 3, "m");
+const GOAL_QUAT: Group = GOAL_POS.then("goal_quat", 4, "1");
+const RELATIVE_QUAT: Group = GOAL_QUAT.then("relative_quat", 4, "1");
 const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
-const TIPS: Part = RELATIVE_QUAT.then("fingertips", 13 * FINGERTIPS.len(), OF_FINGERTIPS);
-const PREVIOUS_ACTION: Part = TIPS.then("previous_action", ACTION_SIZE, "1");
+const TIPS: Group = RELATIVE_QUAT.then("fingertips", 13 * FINGERTIPS.len(), OF_FINGERTIPS);
+const PREVIOUS_ACTION: Group = TIPS.then("previous_action", ACTION_SIZE, "1");
 
-/// All parts in order. Positions and velocities are the world's; quaternions are w,x,y,z, and all but the fingertips' have w ≥ 0.
+/// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z; all but those of the
+/// fingertips have w ≥ 0.
 #[rustfmt::skip]
-pub const OBSERVATION: [Part; 11] = [
+pub const OBSERVATION: [Group; 11] = [
     JOINT_POS, JOINT_VEL, CUBE_POS, CUBE_QUAT, CUBE_LINVEL, CUBE_ANGVEL,
     GOAL_POS, GOAL_QUAT, RELATIVE_QUAT, TIPS, PREVIOUS_ACTION,
 ];
 
-/// Numbers in an observation.
+/// The number of values in an observation.
 pub const OBSERVATION_SIZE: usize = PREVIOUS_ACTION.start + PREVIOUS_ACTION.length;
 
-/// What a learner of this task must know.
+/// The description of this task's observations and actions for a learner.
 pub const SPACES: Spaces = Spaces {
     observation_size: OBSERVATION_SIZE,
     action_size: ACTION_SIZE,
-    cube_and_goal: Some([CUBE_QUAT.start, GOAL_QUAT.start]),
+    cube_and_goal: Some(CubeAndGoal { cube: CUBE_QUAT.start, goal: GOAL_QUAT.start }),
     distance: rotation_error,
 };
 
-impl Part {
-    /// The part that follows.
+impl Group {
+    /// Returns the group that follows this one.
     const fn then(self, name: &'static str, length: usize, unit: &'static str) -> Self {
         Self { name, start: self.start + self.length, length, unit }
     }
 }
 
-/// The rotation error that an observation shows, rad.
+/// Returns the rotation error that an observation shows, rad.
 fn rotation_error(observation: &[f32]) -> f32 {
     2.0 * observation[RELATIVE_QUAT.start].clamp(0.0, 1.0).acos()
 }
 
-/// An observation that is being written, part by part.
+/// An observation that is being written, group by group.
 pub(super) struct Cells<'a> {
     cells: &'a mut [f32],
     written: usize,
@@ -69,15 +70,15 @@ pub(super) struct Cells<'a> {
 
 impl<'a> Cells<'a> {
     pub(super) fn new(observation: &'a mut [f32]) -> Self {
-        assert_eq!(observation.len(), OBSERVATION_SIZE, "length of an observation");
+        assert_eq!(observation.len(), OBSERVATION_SIZE, "observation length");
         Self { cells: observation, written: 0, part: 0 }
     }
 
-    /// Writes the next numbers, which are of the part of this name: the one place where the doubles of the physics become the
-    /// floats of the learner.
+    /// Writes the next values, which must belong to the group `name`. This is the only place where the doubles of the physics
+    /// become the floats of the learner.
     pub(super) fn put<const N: usize>(&mut self, name: &str, values: [f64; N]) {
-        let Part { name: expected, start, length, .. } = OBSERVATION[self.part];
-        assert!(name == expected && self.written + N <= start + length, "{name}: {N} numbers where {expected} is");
+        let Group { name: expected, start, length, .. } = OBSERVATION[self.part];
+        assert!(name == expected && self.written + N <= start + length, "{name}: {N} values do not fit {expected}");
         self.cells[self.written..self.written + N]
             .iter_mut()
             .zip(values)
@@ -86,9 +87,9 @@ impl<'a> Cells<'a> {
         self.part += usize::from(self.written == start + length);
     }
 
-    /// Makes sure that nothing is left of what was there before.
+    /// Checks that every value has been overwritten.
     pub(super) fn finish(self) {
-        assert_eq!(self.written, OBSERVATION_SIZE, "numbers of an observation");
+        assert_eq!(self.written, OBSERVATION_SIZE, "values written to an observation");
     }
 }
 

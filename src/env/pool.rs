@@ -1,7 +1,7 @@
 //! Many environments, in blocks that step independently of one another.
 //!
-//! Environment i reads and writes its own row of each array and owns everything else that it needs, and the randomness of an
-//! episode depends on its number alone; so the results do not depend on which thread steps which block when.
+//! Environment i reads and writes its own row of each array and owns everything else that it needs. The randomness of an
+//! episode depends on its number alone. The results therefore do not depend on which thread steps which block, or when.
 
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,20 +15,20 @@ use crate::rng;
 use crate::schedule::{block_sizes, panic_message};
 use crate::spaces::Spaces;
 
-/// N environments that start their next episode by themselves.
+/// N environments that start their next episode automatically.
 pub struct EnvPool<E: Env> {
     blocks: Vec<EnvBlock<E>>,
 }
 
-/// Some environments of a pool, that one thread steps at a time.
+/// A part of a pool that is stepped by one thread at a time.
 pub struct EnvBlock<E: Env> {
     slots: Vec<Slot<E>>,
     seed: u64,
-    /// Its number among the blocks of all ranks.
+    /// The number of this block among the blocks of all ranks.
     number: usize,
-    /// The number of its first environment.
+    /// The number of its first environment among those of all ranks.
     first: usize,
-    /// The number of environments in the whole pool: so far apart are the numbers of an environment's episodes.
+    /// The number of environments of all ranks, by which the episode numbers of one environment increase.
     stride: u64,
     finished: Vec<E::Episode>,
 }
@@ -38,30 +38,31 @@ struct Slot<E: Env> {
     next_episode: u64,
 }
 
-/// Where a step of a block writes, one row for each of its n environments. O numbers in an observation.
+/// The outputs of a step of a block, with one row for each of its n environments; O is the observation size.
 pub struct StepBuffers<'a> {
-    /// `[n]`
+    /// Rewards `[n]`.
     pub rewards: &'a mut [f32],
-    /// `[n]`
+    /// Ends `[n]`.
     pub ends: &'a mut [Option<End>],
-    /// `[n, O]`, the observation to act on next: of the new episode where one ended, under the new goal where it was replaced.
+    /// Observations `[n, O]` to act on next: the first of the new episode where one ended, under the new goal where the goal
+    /// was replaced.
     pub observations: &'a mut [f32],
-    /// `[n, O]`, the last observation of the episode where one was truncated, or under the goal that was replaced; other rows
-    /// are left alone.
+    /// Final observations `[n, O]` of episodes that were truncated, or under goals that were replaced; other rows are not
+    /// written.
     pub final_observations: &'a mut [f32],
 }
 
 impl<E: Env> EnvPool<E> {
-    /// A pool of these environments (at least one, all of one kind), whose episodes are drawn from `seed`.
+    /// Creates a pool of at least one environment, all of one kind, whose episodes are drawn from `seed`.
     pub fn new(seed: u64, envs: Vec<E>) -> Self {
         Self::of_shards(seed, envs, &Division::alone(1))
     }
 
-    /// The same of the environments of this rank's shards, which have as many each; no block is of two shards.
+    /// Creates a pool of the environments of this rank's shards, equally many per shard; no block spans two shards.
     pub fn of_shards(seed: u64, envs: Vec<E>, division: &Division) -> Self {
         let (shards, own) = (division.shards(), division.own());
         let in_shard = envs.len() / own.len();
-        assert_eq!(in_shard * own.len(), envs.len(), "environments of {} shards", own.len());
+        assert_eq!(in_shard * own.len(), envs.len(), "environments do not divide evenly into {} shards", own.len());
         let sizes = block_sizes(in_shard, in_shard * shards);
         let mut first = own.start * in_shard;
         let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
@@ -75,22 +76,22 @@ impl<E: Env> EnvPool<E> {
         Self { blocks: of_all_shards.enumerate().map(block).collect() }
     }
 
-    /// The number of environments.
+    /// Returns the number of environments.
     pub fn count(&self) -> usize {
         self.blocks.iter().map(EnvBlock::count).sum()
     }
 
-    /// The number of environments in each block.
+    /// Returns the number of environments in each block.
     pub fn block_sizes(&self) -> Vec<usize> {
         self.blocks.iter().map(EnvBlock::count).collect()
     }
 
-    /// The blocks in order.
+    /// Returns the blocks in order.
     pub fn blocks_mut(&mut self) -> &mut [EnvBlock<E>] {
         &mut self.blocks
     }
 
-    /// Starts the first episode of every environment, at random ages so that they do not all end together. Writes the
+    /// Starts the first episode of every environment, at a random age so that they do not all end together, and writes the
     /// `observations` `[n, O]` of each block.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = E::SPACES.observation_size;
@@ -106,24 +107,24 @@ impl<E: Env> EnvPool<E> {
         });
     }
 
-    /// Trains this lesson from now on.
+    /// Switches all environments to `lesson` from the next step on.
     pub fn set_lesson(&mut self, lesson: E::Lesson) {
         self.envs_mut().for_each(|env| env.set_lesson(lesson));
     }
 
-    /// The episodes that ended since the last call, in the order of blocks, then of steps, then of environments.
+    /// Returns the episodes that ended since the last call, ordered by block, then step, then environment.
     pub fn take_finished(&mut self) -> Vec<E::Episode> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// The environments in order.
+    /// Returns the environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
         self.blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env)
     }
 }
 
 impl<E: Resumable> EnvPool<E> {
-    /// The state of every environment. Episodes that ended and were not taken yet are not part of it.
+    /// Returns the state of every environment. It does not include finished episodes that have not been taken yet.
     pub fn save(&self) -> EnvState {
         let mut state = EnvState::default();
         for slot in self.blocks.iter().flat_map(|block| &block.slots) {
@@ -133,11 +134,11 @@ impl<E: Resumable> EnvPool<E> {
         state
     }
 
-    /// Goes on from the state of a pool of as many environments, bit for bit, and writes the `observations` `[n, O]` of each
-    /// block to act on next.
+    /// Resumes, bit for bit, from the state of a pool with the same number of environments, and writes the `observations`
+    /// `[n, O]` of each block to act on next.
     ///
     /// # Errors
-    /// A state that no such pool can have saved.
+    /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
         let size = E::SPACES.observation_size;
         let mut rows = state.rows(self.count())?;
@@ -145,10 +146,10 @@ impl<E: Resumable> EnvPool<E> {
         for (i, (slot, row)) in
             slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
         {
-            let mut state = rows.next().expect("a row for each environment");
+            let mut state = rows.next().expect("one row per environment");
             let restore = || {
                 let [next_episode] = state.counters()?;
-                ensure!(next_episode < 1 << 60, "an episode with the number {next_episode}");
+                ensure!(next_episode < 1 << 60, "episode number {next_episode} is out of range");
                 slot.next_episode = next_episode;
                 slot.env.restore(&mut state, row)?;
                 state.finish()
@@ -161,26 +162,27 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// Its number among the blocks of all ranks.
+    /// Returns the number of this block among the blocks of all ranks.
     pub fn number(&self) -> usize {
         self.number
     }
 
-    /// The number n of its environments.
+    /// Returns the number n of environments in this block.
     pub fn count(&self) -> usize {
         self.slots.len()
     }
 
-    /// Steps every environment with its row of `actions` `[n, A]`, and starts a new episode where one ended, or goes on under another goal.
+    /// Steps every environment with its row of `actions` `[n, A]`. Where an episode ended, starts a new one; where a goal was
+    /// replaced, continues under another.
     ///
     /// # Errors
-    /// A panic in an environment, with its number; the pool cannot be stepped any further.
+    /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
     pub fn step(&mut self, actions: &[f32], buffers: StepBuffers) -> Result<()> {
         let Spaces { observation_size: size, action_size, .. } = E::SPACES;
-        assert_eq!(actions.len(), self.count() * action_size, "actions of a block");
+        assert_eq!(actions.len(), self.count() * action_size, "length of the block's actions");
         assert!(buffers.rewards.len() == self.count() && buffers.ends.len() == self.count(), "rows of a block");
         let both = [buffers.observations.len(), buffers.final_observations.len()];
-        assert_eq!(both, [self.count() * size; 2], "observations of a block");
+        assert_eq!(both, [self.count() * size; 2], "lengths of the block's observations");
         let rows = buffers.observations.chunks_exact_mut(size).zip(buffers.final_observations.chunks_exact_mut(size));
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
@@ -201,7 +203,7 @@ impl<E: Env> EnvBlock<E> {
                     }
                 }
             };
-            // What a panic leaves half done is not used again.
+            // Unwind safe: a state that a panic left inconsistent is not used again.
             if let Err(panic) = catch_unwind(AssertUnwindSafe(step)) {
                 bail!("environment {} panicked: {}", self.first + i, panic_message(&*panic));
             }
@@ -215,7 +217,7 @@ thread_local! {
     static STEPPING: Cell<Option<usize>> = const { Cell::new(None) };
 }
 
-/// The number of the environment that this thread is stepping, if it is: for whoever must tell when there is no way to return.
+/// Returns the number of the environment that this thread is stepping, if any, for reporting fatal errors.
 pub fn stepping() -> Option<usize> {
     STEPPING.get()
 }

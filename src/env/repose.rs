@@ -1,7 +1,7 @@
-//! The environment: a Shadow Hand turns the cube in its palm to one orientation after the other.
+//! The environment: a Shadow Hand turns the cube in its palm to one goal orientation after another.
 //!
-//! The order within a step is fixed: action, physics, errors and reward against the goal in force, hold counter, ends, new
-//! goal, observation with the goal in force next.
+//! The order within a step is fixed: action, physics, errors and reward against the current goal, hold counter, ends, new
+//! goal, observation with the next goal.
 
 use std::sync::Arc;
 
@@ -17,21 +17,21 @@ use super::{
 use crate::config::{EnvConfig, SuccessHold};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Physics, Simulation};
+use crate::sim::{Physics, Pose, Simulation, Velocity};
 use crate::spaces::Spaces;
 
-/// One hand with its cube.
+/// One Shadow Hand with its cube.
 pub struct Repose {
     task: Arc<Task>,
     lesson: Lesson,
     sim: Simulation,
     rng: Rng,
     goal: Quat,
-    /// As the observation shows it: clipped to [-1, 1].
+    /// The previous action as observed: clipped to [-1, 1].
     previous_action: [f32; ACTION_SIZE],
-    /// What the actuators were last told, rad, in the order of the action.
+    /// The last actuator targets, rad, in action order.
     targets: [f64; ACTION_SIZE],
-    /// Control steps since the reset, or more after `skip_ahead`.
+    /// Control steps since the reset, plus those skipped by `skip_ahead`.
     age: u32,
     held: u32,
     episode: EpisodeStats,
@@ -41,19 +41,19 @@ pub struct Repose {
     diverged: Option<Diverged>,
 }
 
-/// How an episode came to its end in a state that cannot be used.
+/// The end of an episode whose physics diverged.
 #[derive(Clone, Debug)]
 pub struct Diverged {
-    /// Its length in control steps, the last one included.
+    /// The length of the episode in control steps, including the last one.
     pub length: u32,
-    /// Its last steps.
+    /// The last steps of the episode.
     pub tail: Tail,
 }
 
-/// What happened in the last step.
+/// Details of the last step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepDetails {
-    /// The goal in force during the step.
+    /// The goal during the step.
     pub goal: Quat,
     /// Rotation error after the step, rad.
     pub rot_dist: f64,
@@ -66,7 +66,7 @@ pub struct StepDetails {
 }
 
 impl Repose {
-    /// An environment of `task`; it must be reset before it is stepped.
+    /// Creates an environment of `task`; it must be reset before it is stepped.
     pub fn new(task: &Arc<Task>) -> Self {
         Self {
             sim: Simulation::new(&task.scene),
@@ -86,47 +86,47 @@ impl Repose {
         }
     }
 
-    /// What happened in the last step.
+    /// Returns details of the last step.
     pub fn last_step(&self) -> &StepDetails {
         &self.last
     }
 
-    /// The goal orientation in force next.
+    /// Returns the goal orientation of the next step.
     pub fn goal(&self) -> Quat {
         self.goal
     }
 
-    /// Steps within tolerance that count towards the present goal.
+    /// Returns the steps within the tolerance that count towards the current goal.
     pub fn held(&self) -> u32 {
         self.held
     }
 
-    /// The present rotation error, rad.
+    /// Returns the current rotation error, rad.
     pub fn rot_dist(&self) -> f64 {
-        quat::angle_between(self.cube().1, self.goal)
+        quat::angle_between(self.cube().orientation, self.goal)
     }
 
-    /// The physics state.
+    /// Returns the physics state.
     pub fn simulation(&self) -> &Simulation {
         &self.sim
     }
 
-    /// The physics state, to be changed; [`Simulation::refresh`] must follow.
+    /// Returns the physics state for modification; call [`Simulation::refresh`] afterwards.
     pub fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.sim
     }
 
-    /// The settings of the task.
+    /// Returns the settings of the task.
     pub fn config(&self) -> &EnvConfig {
         &self.task.config
     }
 
-    /// The sums since the last call.
+    /// Returns the sums since the last call.
     pub fn take_recent(&mut self) -> Recent {
         std::mem::take(&mut self.recent)
     }
 
-    /// The last episode that diverged since the last call.
+    /// Returns the last episode that has diverged since the last call.
     pub fn take_diverged(&mut self) -> Option<Diverged> {
         self.diverged.take()
     }
@@ -139,16 +139,17 @@ impl Repose {
     fn set_goal(&mut self) {
         self.goal = self.draw_rotation();
         let [x, y, z] = self.task.config.goal_position;
-        self.sim.place(self.task.hand.target, [x, y, z + self.task.config.target_height], self.goal);
+        let position = [x, y, z + self.task.config.target_height];
+        self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
     }
 
-    fn cube(&self) -> ([f64; 3], Quat) {
+    fn cube(&self) -> Pose {
         let at = self.task.hand.cube.qpos;
         let q = self.sim.qpos();
-        ([q[at], q[at + 1], q[at + 2]], [q[at + 3], q[at + 4], q[at + 5], q[at + 6]])
+        Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
     }
 
-    /// Clips the action, turns it into actuator targets and writes them as controls.
+    /// Clips the action, converts it to actuator targets and writes them as controls.
     fn actuate(&mut self, action: &[f32]) {
         let alpha = self.task.config.act_moving_average;
         for (i, actuator) in self.task.hand.actuators.iter().enumerate() {
@@ -169,7 +170,7 @@ impl Repose {
         }
     }
 
-    /// Counts a step within tolerance or not; tells if the goal has now been held long enough.
+    /// Updates the hold counter after a step, and returns whether the goal has now been held long enough.
     fn hold(&mut self, within: bool) -> bool {
         if within {
             self.held += 1;
@@ -184,21 +185,21 @@ impl Repose {
         reached
     }
 
-    /// Draws a new goal, and its first step is still to come.
+    /// Draws a new goal and resets the hold counter.
     fn replace_goal(&mut self) {
         self.set_goal();
         self.held = 0;
-        // In a scene where the target is more than a picture: nothing may be left of where it was.
+        // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
     }
 
-    /// Whether the lesson replaces a goal that was not reached now. Chance decides, so that the state needs no clock.
+    /// Decides whether the lesson replaces a goal that was not reached. The decision is random, so the state needs no clock.
     fn gives_up(&mut self) -> bool {
         let chance = self.lesson.redirect_chance;
         chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
     }
 
-    /// Writes the observation `[157]` of the present state, in the order of the task.
+    /// Writes the observation `[157]` of the current state, in the task's order.
     pub fn observe(&self, observation: &mut [f32]) {
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
@@ -206,20 +207,20 @@ impl Repose {
         cells.put("joint_pos", hand.joints.map(|joint| qpos[joint.qpos]));
         cells.put("joint_vel", hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
-        let (position, orientation) = self.cube();
+        let Pose { position, orientation } = self.cube();
         let [vx, vy, vz, spin @ ..] = qvel[hand.cube.dof..].first_chunk::<6>().expect("a free joint");
         cells.put("cube_pos", position);
         cells.put("cube_quat", quat::canonical(orientation));
         cells.put("cube_linvel", [*vx, *vy, *vz]);
-        // MuJoCo keeps the angular velocity of a free joint in the body's frame.
+        // MuJoCo stores the angular velocity of a free joint in the body's frame.
         cells.put("cube_angvel", quat::rotate(orientation, *spin).map(|x| config.vel_obs_scale * x));
         cells.put("goal_pos", config.goal_position);
         cells.put("goal_quat", quat::canonical(self.goal));
         cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
 
         for tip in hand.fingertips {
-            let (position, orientation) = self.sim.pose(tip);
-            let (linear, angular) = self.sim.velocity(tip);
+            let Pose { position, orientation } = self.sim.pose(tip);
+            let Velocity { linear, angular } = self.sim.velocity(tip);
             cells.put("fingertips", position);
             cells.put("fingertips", orientation);
             cells.put("fingertips", linear);
@@ -284,12 +285,12 @@ impl Env for Repose {
         self.recorder.record(&self.sim, action);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
-            // MuJoCo may have cleared the controls; whoever looks should find what was sent.
+            // MuJoCo may have cleared the controls; restore what was sent for anyone who reads them.
             self.send_targets();
         }
 
         let config = &self.task.config;
-        let (position, orientation) = self.cube();
+        let Pose { position, orientation } = self.cube();
         let rot_dist = quat::angle_between(orientation, self.goal);
         let offset = [0, 1, 2].map(|axis| position[axis] - config.goal_position[axis]);
         let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -327,7 +328,7 @@ impl Env for Repose {
             let goal_ends = if reached { self.lesson.goals_end } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(goal_ends.then_some(End::Redirected))
         };
-        // A goal that ends is still seen in the last observation under it, which is bootstrapped.
+        // Where reaching a goal ends it, the final observation must still show it, since its value is bootstrapped.
         if reached && !self.lesson.goals_end {
             self.replace_goal();
         }
@@ -335,7 +336,7 @@ impl Env for Repose {
         Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }
     }
 
-    /// Draws another goal, which must be held anew.
+    /// Draws another goal and resets the hold counter.
     fn redirect(&mut self, observation: &mut [f32]) {
         self.replace_goal();
         self.observe(observation);
@@ -361,16 +362,16 @@ impl Resumable for Repose {
         self.sim.restore(state.numbers_but::<{ 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS }>()?)?;
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
-        ensure!((length - 1.0).abs() < 1e-6, "a goal that is no orientation: {:?}", self.goal);
+        ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
         self.previous_action = state.numbers()?.map(|x| x as f32);
         let clipped = self.previous_action.iter().all(|action| (-1.0..=1.0).contains(action));
-        ensure!(clipped, "a last action beyond [-1, 1]: {:?}", self.previous_action);
+        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.previous_action);
         self.targets = state.numbers()?;
         self.rng = rng::at(state.counters()?);
         let [age, held] = state.counters()?;
-        // Of a fork with shorter episodes it may be the last step already.
+        // `age` has no tighter limit: a fork may have shorter episodes.
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(possible, "an episode at step {age} that has held its goal for {held} steps");
+        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
         self.episode = EpisodeStats::saved(state)?;
         self.recent = Recent::default();

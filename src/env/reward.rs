@@ -4,24 +4,24 @@ use std::ops::AddAssign;
 
 use crate::config::EnvConfig;
 
-/// The terms of a reward; their sum is what is paid.
+/// The terms of a reward, which is their sum.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RewardTerms {
-    /// For a small rotation error.
+    /// The term for a small rotation error.
     pub rotation: f64,
-    /// For the cube's distance from the goal position.
+    /// The term for the cube's distance from the goal position.
     pub distance: f64,
-    /// For the size of the action.
+    /// The term for the size of the action.
     pub action: f64,
-    /// For being within the tolerance.
+    /// The term for being within the tolerance.
     pub bonus: f64,
-    /// For dropping the cube.
+    /// The term for dropping the cube.
     pub fall: f64,
 }
 
 impl RewardTerms {
-    /// The terms of a step that ends with the rotation error `rot_dist` (rad) and the distance `goal_dist` (m), after the
-    /// clipped `action`.
+    /// Computes the terms of a step that ends with the rotation error `rot_dist` (rad) and the distance `goal_dist` (m) after
+    /// the clipped `action`.
     pub fn of_step(config: &EnvConfig, rot_dist: f64, goal_dist: f64, action: &[f32]) -> Self {
         let effort: f64 = action.iter().map(|&a| f64::from(a) * f64::from(a)).sum();
         Self {
@@ -33,34 +33,32 @@ impl RewardTerms {
         }
     }
 
-    /// The terms by name.
+    /// Returns the terms by name.
     pub fn named(&self) -> [(&'static str, f64); 5] {
         let Self { rotation, distance, action, bonus, fall } = *self;
         [("rotation", rotation), ("distance", distance), ("action", action), ("bonus", bonus), ("fall", fall)]
     }
 
-    /// The terms alone, in the same order.
-    pub fn values(&self) -> [f64; 5] {
-        self.named().map(|(_, value)| value)
-    }
-
-    /// What is paid.
+    /// Returns the sum of the terms.
     pub fn total(&self) -> f64 {
-        self.values().iter().sum()
+        self.named().iter().map(|(_, value)| value).sum()
     }
-}
 
-/// In the order of [`RewardTerms::named`].
-impl From<[f64; 5]> for RewardTerms {
-    fn from([rotation, distance, action, bonus, fall]: [f64; 5]) -> Self {
-        Self { rotation, distance, action, bonus, fall }
+    /// Applies `f` to each term.
+    pub fn map(self, f: impl Fn(f64) -> f64) -> Self {
+        let Self { rotation, distance, action, bonus, fall } = self;
+        Self { rotation: f(rotation), distance: f(distance), action: f(action), bonus: f(bonus), fall: f(fall) }
     }
 }
 
 impl AddAssign for RewardTerms {
     fn add_assign(&mut self, other: Self) {
-        let (a, b) = (self.values(), other.values());
-        *self = std::array::from_fn(|i| a[i] + b[i]).into();
+        let Self { rotation, distance, action, bonus, fall } = other;
+        self.rotation += rotation;
+        self.distance += distance;
+        self.action += action;
+        self.bonus += bonus;
+        self.fall += fall;
     }
 }
 
@@ -79,8 +77,10 @@ mod tests {
     fn each_term_is_the_one_of_the_task() {
         // 1 / (0.4 + 0.1), -10 * 0.05, -0.0002 * (1 + 0.25)
         let reward = terms(0.4, 0.05, &[1.0, -0.5]);
-        let expected = [2.0, -0.5, -0.00025, 0.0, 0.0];
-        assert!(reward.values().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12), "{reward:?}");
+        let expected = [("rotation", 2.0), ("distance", -0.5), ("action", -0.00025), ("bonus", 0.0), ("fall", 0.0)];
+        for ((name, found), (expected_name, expected)) in reward.named().into_iter().zip(expected) {
+            assert!(name == expected_name && (found - expected).abs() < 1e-12, "{reward:?}");
+        }
         assert!((reward.total() - 1.49975).abs() < 1e-12);
     }
 

@@ -1,79 +1,79 @@
-//! What environments save of themselves: two tables with a row for each, one of doubles, one of whole numbers.
+//! Saved environments: two tables with one row per environment, one of doubles and one of integers.
 //!
-//! Tables and not bytes, so that a checkpoint can be looked into with any reader of its format, and so that everything in it
-//! has a type that can be checked.
+//! They are tables and not bytes so that a checkpoint can be inspected with any reader of its format, and so that everything
+//! in it has a type that can be checked.
 
 use anyhow::{Context, Result, ensure};
 
-/// The states of N environments, one after the other.
+/// The states of N environments, in order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EnvState {
-    /// `[N, K]`
+    /// The doubles, `[N, K]`.
     pub numbers: Vec<f64>,
-    /// `[N, C]`
+    /// The integers, `[N, C]`.
     pub counters: Vec<u64>,
 }
 
-/// What is still to be read of a saved environment.
+/// The part of a saved environment that is still to be read.
 pub struct SavedEnv<'a> {
     numbers: &'a [f64],
     counters: &'a [u64],
 }
 
 impl EnvState {
-    /// The rows of each of `count` environments.
+    /// Returns the rows of each of `count` environments.
     ///
     /// # Errors
-    /// Tables that do not hold so many rows.
+    /// Fails if the tables do not divide into `count` rows.
     pub fn rows(&self, count: usize) -> Result<impl Iterator<Item = SavedEnv<'_>>> {
         let [numbers, counters] = [self.numbers.len(), self.counters.len()];
         let even =
             numbers.is_multiple_of(count) && counters.is_multiple_of(count) && numbers >= count && counters >= count;
-        ensure!(even, "{numbers} numbers and {counters} counters are no states of {count} environments");
+        ensure!(even, "{numbers} numbers and {counters} counters are not the states of {count} environments");
         let rows = self.numbers.chunks_exact(numbers / count).zip(self.counters.chunks_exact(counters / count));
         Ok(rows.map(|(numbers, counters)| SavedEnv { numbers, counters }))
     }
 }
 
 impl<'a> SavedEnv<'a> {
-    /// The next `N` numbers.
+    /// Reads the next `N` numbers.
     ///
     /// # Errors
-    /// There are not so many.
+    /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let (first, rest) = self.numbers.split_first_chunk().context("a state with too few numbers")?;
+        let (first, rest) = self.numbers.split_first_chunk().context("the state has too few numbers")?;
         self.numbers = rest;
         Ok(*first)
     }
 
-    /// All numbers but the last `N`.
+    /// Reads all numbers except the last `N`.
     ///
     /// # Errors
-    /// There are not so many.
+    /// Fails if fewer than `N` are left.
     pub fn numbers_but<const N: usize>(&mut self) -> Result<&'a [f64]> {
-        let count = self.numbers.len().checked_sub(N).context("a state with too few numbers")?;
+        let count = self.numbers.len().checked_sub(N).context("the state has too few numbers")?;
         let (first, rest) = self.numbers.split_at(count);
         self.numbers = rest;
         Ok(first)
     }
 
-    /// The next `N` counters.
+    /// Reads the next `N` counters.
     ///
     /// # Errors
-    /// There are not so many.
+    /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let (first, rest) = self.counters.split_first_chunk().context("a state with too few counters")?;
+        let (first, rest) = self.counters.split_first_chunk().context("the state has too few counters")?;
         self.counters = rest;
         Ok(*first)
     }
 
-    /// Makes sure that all was read.
+    /// Checks that everything has been read.
     ///
     /// # Errors
-    /// Something is left.
+    /// Fails if anything is left.
     pub fn finish(self) -> Result<()> {
         let left = self.numbers.len() + self.counters.len();
-        ensure!(left == 0, "a state with {left} numbers too many");
+        ensure!(left == 0, "the state has {left} numbers too many");
         Ok(())
     }
 }

@@ -1,49 +1,48 @@
-//! The last steps of an episode, as far back as is needed to see how the physics diverged: a state, and the controls that were
-//! sent from there on.
+//! The last steps of an episode, far enough back to show how the physics diverged: a state and the controls sent after it.
 
 use super::ACTION_SIZE;
 use crate::sim::{Simulation, SimulationState};
 
-/// Steps from one kept state to the next.
+/// The number of steps between two kept states.
 const STEPS: usize = 16;
 
-/// Enough to replay the end of an episode in any MuJoCo.
+/// The data needed to replay the end of an episode in any MuJoCo.
 #[derive(Clone, Debug)]
 pub struct Tail {
     /// The state before the first of these steps.
     pub start: SimulationState,
-    /// What the actuators were told in each step, in the model's order.
+    /// The controls sent in each step, in the model's order.
     pub controls: Vec<[f64; ACTION_SIZE]>,
-    /// What the policy asked for in each step.
+    /// The policy's action in each step.
     pub actions: Vec<[f32; ACTION_SIZE]>,
 }
 
-/// Keeps the steps since the last two kept states: at least the last 16, where the episode has so many.
+/// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
 #[derive(Debug, Default)]
-pub struct Recorder {
+pub(super) struct Recorder {
     before: Option<Tail>,
     now: Option<Tail>,
 }
 
 impl Recorder {
     /// Forgets the episode.
-    pub fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         (self.before, self.now) = (None, None);
     }
 
-    /// Takes a step that is about to be made; its controls are in place.
-    pub fn record(&mut self, sim: &Simulation, action: &[f32]) {
+    /// Records a step that is about to be taken, after its controls have been set.
+    pub(super) fn record(&mut self, sim: &Simulation, action: &[f32]) {
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS) {
             let (controls, actions) = (Vec::with_capacity(STEPS), Vec::with_capacity(STEPS));
             self.before = self.now.replace(Tail { start: sim.state(), controls, actions });
         }
-        let tail = self.now.as_mut().expect("it was just begun");
-        tail.controls.push(*sim.ctrl().first_chunk().expect("a control for each actuator"));
-        tail.actions.push(*action.first_chunk().expect("a whole action"));
+        let tail = self.now.as_mut().expect("just begun");
+        tail.controls.push(*sim.ctrl().first_chunk().expect("one control per actuator"));
+        tail.actions.push(*action.first_chunk().expect("a complete action"));
     }
 
-    /// The steps so far; none before the first.
-    pub fn tail(&self) -> Option<Tail> {
+    /// Returns the recorded steps; `None` before the first step.
+    pub(super) fn tail(&self) -> Option<Tail> {
         let now = self.now.clone()?;
         Some(match self.before.clone() {
             Some(mut tail) => {

@@ -1,4 +1,4 @@
-//! What all environments of a run share.
+//! The task that all environments of a run share.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use super::hand::CUBE;
 use crate::config::EnvConfig;
 use crate::sim::{Look, Scene, Variation};
 
-/// The scene, the hand in it, and the settings.
+/// A scene, the hand in it, and the settings.
 pub struct Task {
     pub(super) scene: Scene,
     pub(super) hand: Hand,
@@ -20,15 +20,15 @@ impl Task {
     /// Loads the scene that `config` names and binds the hand in it.
     ///
     /// # Errors
-    /// A scene that cannot be loaded or lacks a name, with its file.
+    /// Fails with the scene's file if the scene cannot be loaded or lacks a name.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
         Self::of(Scene::load(config.model_file(), variation(config))?, config)
     }
 
-    /// The same task in a scene to be looked at.
+    /// Loads the same task in a scene for display.
     ///
     /// # Errors
-    /// As [`Task::new`], and meshes that cannot be read.
+    /// Fails like [`Task::new`], or if meshes cannot be read.
     pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
         Self::of(Scene::load_to_see(config.model_file(), variation(config), look)?, config)
     }
@@ -38,12 +38,12 @@ impl Task {
         Ok(Arc::new(Self { scene, hand, config: config.clone() }))
     }
 
-    /// The settings.
+    /// Returns the settings.
     pub fn config(&self) -> &EnvConfig {
         &self.config
     }
 
-    /// The scene.
+    /// Returns the scene.
     pub fn scene(&self) -> &Scene {
         &self.scene
     }

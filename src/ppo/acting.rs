@@ -1,4 +1,4 @@
-//! Acting during a rollout: actions drawn from the policy of the iteration, and what rewards and values need of it.
+//! Acting during a rollout: draws actions from the current policy and bootstraps rewards with its values.
 
 use rand_distr::{Distribution, StandardNormal};
 
@@ -13,7 +13,7 @@ use crate::spaces::Spaces;
 pub struct Acting<'a> {
     pub(super) policy: FrozenPolicy<'a>,
     pub(super) config: &'a PpoConfig,
-    /// The noise scale far away from the goal.
+    /// The noise scale far from the goal.
     pub(super) away_scale: f32,
 }
 
@@ -24,7 +24,7 @@ impl Acting<'_> {
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
         let (actions, means) = (&mut block.actions[acted.clone()], &mut block.means[acted]);
-        self.policy.forward(observations, Some(means), Some(&mut block.values[one.clone()]), work);
+        self.policy.mean_actions_and_values(observations, means, &mut block.values[one.clone()], work);
         let std = self.policy.std();
         let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
@@ -38,14 +38,14 @@ impl Acting<'_> {
                 *action = mean + *scale * std * drawn;
                 squares += ((*action - mean) / (*scale * std)).powi(2);
             }
-            // The density lacks the scale, here and in the losses: it is the same in both, and only their ratio counts.
+            // The log-density omits the scale, here and in the losses; it would cancel in the ratio of the two.
             *log_prob = -0.5 * squares - constant;
         }
     }
 
-    /// What the noise is multiplied by. Near the goal the policy's own noise is as small as the goal must be met exactly; far from
-    /// it that would only slow learning down, since both what a sample tells of the better action and how far an update of a given
-    /// KL divergence goes are in proportion to it.
+    /// Returns the factor on the policy's noise. Near the goal, the policy's own noise is as small as the required
+    /// precision demands. Far from it, so little noise would only slow learning down: both what a sample reveals about
+    /// better actions and how far an update with a given KL divergence moves the policy are proportional to the noise.
     fn noise_scale(&self, observation: &[f32]) -> f32 {
         if self.away_scale <= 1.0 {
             return 1.0;
@@ -55,8 +55,9 @@ impl Acting<'_> {
         1.0 + (self.away_scale - 1.0) * share
     }
 
-    /// Scales the rewards of a step and, for each environment whose future was cut off, adds the discounted value of its final
-    /// observation, so that the advantages need one array of ends only. `cut_off` `[n]`, `final_observations` `[n, O]`.
+    /// Scales the rewards of a step. Where the future of an environment was cut off, also adds the discounted value of
+    /// its final observation, so that advantages need only one array of ends. `cut_off` `[n]`, `final_observations`
+    /// `[n, O]`.
     pub fn settle(
         &self,
         rewards: &mut [f32],
@@ -71,7 +72,7 @@ impl Acting<'_> {
             *reward *= self.config.reward_scale as f32;
             if cut_off {
                 let mut value = [0.0];
-                self.policy.forward(observation, None, Some(&mut value), work);
+                self.policy.values(observation, &mut value, work);
                 *reward += self.config.gamma as f32 * value[0];
             }
         }
@@ -80,6 +81,6 @@ impl Acting<'_> {
     /// Writes the values of the observations after the last step.
     pub fn finish(&self, block: &mut RolloutBlock, horizon: usize, work: &mut Workspace) {
         let (seen, one) = (block.step(horizon, self.policy.spaces().observation_size), block.step(horizon, 1));
-        self.policy.forward(&block.observations[seen], None, Some(&mut block.values[one]), work);
+        self.policy.values(&block.observations[seen], &mut block.values[one], work);
     }
 }

@@ -1,44 +1,44 @@
-//! Adam on all parameters at once, in place, on all threads; and the norm of a gradient.
+//! Adam, in place on all parameters and in parallel, and the norm of a gradient.
 
 use std::ops::Range;
 
 use pulp::Arch;
 use rayon::prelude::*;
 
-/// Decay of the mean of the gradient.
+/// The decay rate of the mean gradient.
 const BETA1: f64 = 0.9;
 
-/// Decay of the mean of its square.
+/// The decay rate of the mean squared gradient.
 const BETA2: f64 = 0.999;
 
-/// Against a division by zero.
+/// Added to the denominator, so that it is never zero.
 const EPSILON: f64 = 1e-8;
 
-/// Parameters that one task takes.
+/// Parameters that one task updates.
 const CHUNK: usize = 8192;
 
-/// Numbers whose squares one task adds up; fixed, so that the result does not depend on the number of threads.
+/// Values whose squares one task adds up; fixed, so that the result does not depend on the number of threads.
 const NORM_CHUNK: usize = 4096;
 
-/// D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
+/// The Adam optimizer: D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Adam {
+pub(super) struct Adam {
     /// The running mean of the gradient.
     pub mean: Vec<f32>,
-    /// The running mean of its square.
+    /// The running mean of the squared gradient.
     pub square: Vec<f32>,
-    /// Steps taken.
+    /// The number of steps taken.
     pub steps: u64,
 }
 
 impl Adam {
-    /// An optimizer of `count` parameters that has not taken a step.
-    pub fn new(count: usize) -> Self {
+    /// Creates an optimizer of `count` parameters that has not taken a step.
+    pub(super) fn new(count: usize) -> Self {
         Self { mean: vec![0.0; count], square: vec![0.0; count], steps: 0 }
     }
 
     /// Moves the parameters one step against the gradient, which is first multiplied by `scale`.
-    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], learning_rate: f64, scale: f64) {
+    pub(super) fn step(&mut self, parameters: &mut [f32], gradient: &[f32], learning_rate: f64, scale: f64) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
         let scale = scale as f32;
@@ -62,8 +62,8 @@ impl Adam {
     }
 }
 
-/// The Euclidean norm of a gradient, whose squares are added up group by group.
-pub fn norm(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
+/// Returns the Euclidean norm of a gradient. The squares are added group by group.
+pub(super) fn norm(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
     let squares = |group: &Range<usize>| {
         let chunks: Vec<f64> = gradient[group.clone()].par_chunks(NORM_CHUNK).map(sum_of_squares).collect();
         chunks.iter().sum::<f64>()
@@ -71,7 +71,7 @@ pub fn norm(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
     groups.iter().map(squares).sum::<f64>().sqrt()
 }
 
-/// The sum of the squares, added up in lanes: first floats within a lane, then doubles.
+/// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
 fn sum_of_squares(x: &[f32]) -> f64 {
     let mut lanes = [0.0f32; 32];
     Arch::new().dispatch(
@@ -90,7 +90,7 @@ fn sum_of_squares(x: &[f32]) -> f64 {
 mod tests {
     use super::*;
 
-    /// The numbers are those of this program (PyTorch):
+    /// The expected values are those of this program (PyTorch):
     /// ```python
     /// import torch
     /// x = torch.tensor([1.0, -2.0, 3.0], requires_grad=True)

@@ -1,4 +1,4 @@
-//! That the two backends compute the same: a file of tests alone.
+//! Tests that the two backends compute the same.
 
 #[cfg(test)]
 mod tests {
@@ -10,14 +10,18 @@ mod tests {
     use crate::config::{self, Activation, Config, Precision};
     use crate::ranks::Division;
     use crate::rng;
-    use crate::spaces::Spaces;
+    use crate::spaces::{CubeAndGoal, Spaces};
 
     const BACKENDS: [config::Backend; 2] = [config::Backend::Fused, config::Backend::Candle];
 
-    const SPACES: Spaces =
-        Spaces { observation_size: 157, action_size: 20, cube_and_goal: Some([51, 64]), distance: |_| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 157,
+        action_size: 20,
+        cube_and_goal: Some(CubeAndGoal { cube: 51, goal: 64 }),
+        distance: |_| 0.0,
+    };
 
-    /// A learner of that kind, and a rollout that it could have collected with a slightly different policy.
+    /// Returns a learner with this backend, and a rollout that a slightly different policy could have collected.
     fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
@@ -36,7 +40,7 @@ mod tests {
             fill(&mut block.values, 0.4);
             fill(&mut block.advantages, 2.0);
             fill(&mut block.returns, 1.0);
-            // A few act with more noise than the others.
+            // Every third sample acts with more noise.
             block.noise_scales.iter_mut().step_by(3).for_each(|scale| *scale = 1.5);
             let means = block.means.chunks_exact(20).zip(block.actions.chunks_exact(20)).zip(&block.noise_scales);
             for (((means, actions), scale), log_prob) in means.zip(&mut block.log_probs) {
@@ -48,12 +52,12 @@ mod tests {
         (ppo, rollout)
     }
 
-    /// One gradient step at the rate of 1e-3, without clipping.
+    /// Takes one gradient step with a learning rate of 1e-3, without clipping.
     fn step(ppo: &mut Ppo) {
         ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 1e-3, 1.0);
     }
 
-    /// The gradient of these samples, which stays in the learner.
+    /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         gradient_of(ppo, rollout, Minibatch { samples, own_shards: 1, shards: 1 })
     }
@@ -63,7 +67,7 @@ mod tests {
         ppo.losses(&sums, minibatch.count() as f64)
     }
 
-    /// These numbers parameter by parameter.
+    /// Splits these values by parameter tensor.
     fn by_name<'a>(policy: &Policy, numbers: &'a [f32]) -> Vec<(String, &'a [f32])> {
         policy.layout.views().into_iter().map(|view| (view.name, &numbers[view.range])).collect()
     }
@@ -76,7 +80,7 @@ mod tests {
     #[test]
     fn losses_and_gradients_of_the_kernels_are_those_of_candle() {
         for activation in [Activation::Elu, Activation::Relu, Activation::Tanh] {
-            // Three sizes of minibatches: one group, whole groups, and blocks that do not divide the last group.
+            // Three sizes of minibatches: one group, groups of equal size, and groups of unequal size.
             for samples in [20, 1024, 1301] {
                 let what = format!("{activation:?}, {samples} samples");
                 let [(fused, kernels), (candle, reference)] = BACKENDS.map(|backend| {
@@ -95,7 +99,7 @@ mod tests {
                     assert_close(found, expected, 2e-4, &format!("{what}: {name}"));
                 }
                 assert_eq!(fused.clip_fraction, candle.clip_fraction, "{what}");
-                assert!((0.05..0.98).contains(&fused.clip_fraction), "{what}: some are clipped, not all");
+                assert!((0.05..0.98).contains(&fused.clip_fraction), "{what}: some are clipped, but not all");
                 let [a, b] = [&kernels, &reference].map(|ppo| by_name(&ppo.policy, &ppo.gradient));
                 for ((name, a), (_, b)) in a.into_iter().zip(b) {
                     let largest = b.iter().fold(0.0f32, |most, x| most.max(x.abs()));
@@ -144,13 +148,14 @@ mod tests {
             let difference =
                 |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt();
             let (apart, moved) = (difference(a, b), difference(a, first));
-            assert!(apart < 1e-2 * moved, "{name} moved by {moved}, and is {apart} from candle's");
+            assert!(apart < 1e-2 * moved, "{name} moved by {moved}, but is {apart} from candle's");
         }
     }
 
     #[test]
     fn gradients_of_a_larger_norm_than_allowed_are_scaled_down_to_it() {
-        // Adam's first step moves a weight by the rate; gradients far below its epsilon of 1e-8 hardly move anything.
+        // Adam's first step moves weights by the learning rate, but hardly if gradients are far below its epsilon,
+        // 1e-8.
         for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
             let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
             (ppo.config.epochs, ppo.config.minibatches, ppo.config.desired_kl) = (1, 1, 0.0);
@@ -173,7 +178,7 @@ mod tests {
                 let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
                 let mut losses = Vec::new();
                 for (i, &number) in threads.iter().enumerate() {
-                    // First a few samples, in the end all.
+                    // A few samples at first, all of them in the end.
                     let samples = if i + 1 < threads.len() { &samples[..40] } else { &samples[..] };
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(number).build().unwrap();
                     losses.push(pool.install(|| gradient(&mut ppo, &rollout, samples)));

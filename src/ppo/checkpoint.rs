@@ -1,7 +1,8 @@
-//! What a checkpoint holds of a learner, and what a policy alone: weights, normaliser, optimizer, learning rate; with the whole
-//! configuration and the progress of the run, and with whatever else the training needs to go on.
+//! The content of checkpoints: weights, normaliser, optimizer and learning rate of a learner, the whole configuration,
+//! the progress of the run, and whatever else a training run needs to resume. A policy alone contains only weights,
+//! normaliser, configuration and progress.
 //!
-//! Reading is strict: the arrays must be those that the configuration describes, no more and no fewer, of the same shapes.
+//! Reading is strict: the arrays must be exactly those that the configuration describes, with the same shapes.
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
@@ -15,82 +16,113 @@ use crate::spaces::Spaces;
 /// The text `format` of a file.
 const FORMAT: &str = "shadow-repose checkpoint 3";
 
-/// The same of a file of version 0.1.0, whose policy can be played and begun with, and nothing else.
+/// The same in files of version 0.1.0. Their policy can be played, or used as the start of a run, and nothing else.
 const FORMAT_0_1: &str = "shadow-repose checkpoint 2";
 
-/// Ours takes a thousand bytes.
+/// The most bytes of a configuration that are read; ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
-/// The name of the learning rate as it has been adapted.
+/// The name of the adapted learning rate.
 const LEARNING_RATE: &str = "learning_rate";
 
-/// How far a run has come.
+/// The progress of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
-    /// Iterations finished.
+    /// The number of finished iterations.
     pub iteration: u64,
     /// Control steps over all environments.
     pub env_steps: u64,
-    /// Goals per episode and rotation error (rad) of the best evaluation.
-    pub best: Option<[f64; 2]>,
-    /// Where it left another run, if it is a fork of one.
+    /// The best evaluation so far.
+    pub best: Option<Evaluation>,
+    /// The checkpoint that it was forked from, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fork: Option<Fork>,
 }
 
-/// The checkpoint of another run that a run began with.
+/// The scores that evaluations are compared by; in a file, an array of both.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(from = "[f64; 2]", into = "[f64; 2]")]
+pub struct Evaluation {
+    /// Goals per episode.
+    pub goals: f64,
+    /// Rotation error, rad.
+    pub rot_dist: f64,
+}
+
+impl Evaluation {
+    /// Returns whether it is better than the best so far: more goals, or the same number with a smaller error.
+    pub fn beats(self, best: Option<Self>) -> bool {
+        let rank = |it: Self| (it.goals, -it.rot_dist);
+        // If every episode diverged at once, there is no rotation error to compare.
+        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| rank(self) > rank(best))
+    }
+}
+
+impl From<[f64; 2]> for Evaluation {
+    fn from([goals, rot_dist]: [f64; 2]) -> Self {
+        Self { goals, rot_dist }
+    }
+}
+
+impl From<Evaluation> for [f64; 2] {
+    fn from(Evaluation { goals, rot_dist }: Evaluation) -> Self {
+        [goals, rot_dist]
+    }
+}
+
+/// The checkpoint of another run that a run was forked from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Fork {
-    /// Its file, where it was then; only ever shown.
+    /// The path of its file at that time, for display only.
     pub from: String,
     /// The iterations that the other run had finished.
     pub iteration: u64,
-    /// The control steps that it had made.
+    /// The control steps that the other run had taken.
     pub env_steps: u64,
 }
 
-/// A checkpoint, or a policy alone, outside of any learner.
+/// A checkpoint, or a policy alone, independent of a learner.
 #[derive(Clone, Debug)]
 pub struct Checkpoint {
     /// The configuration of the run, as TOML.
     pub config: String,
-    /// How far the run had come.
+    /// The progress of the run.
     pub progress: Progress,
-    /// Version 0.1.0 has made it.
+    /// Whether version 0.1.0 wrote it.
     pub is_of_0_1: bool,
     content: Content,
 }
 
 impl Checkpoint {
-    /// Reads the bytes of a file.
+    /// Parses the bytes of a file.
     ///
     /// # Errors
-    /// Bytes that are no whole checkpoint of this program.
+    /// Fails if the bytes are not a complete checkpoint of this program.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let mut content = Content::parse(bytes)?;
-        let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata lack `{key}`"));
+        let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
         let format = text("format")?;
         let is_of_0_1 = format == FORMAT_0_1;
-        ensure!(format == FORMAT || is_of_0_1, "its format is `{format}`, this program reads `{FORMAT}`");
+        ensure!(format == FORMAT || is_of_0_1, "its format is `{format}`; this program reads `{FORMAT}`");
         let config = text("config")?;
         ensure!(
             config.len() <= LONGEST_CONFIG,
-            "its configuration has {} bytes, at most {LONGEST_CONFIG} are read",
+            "its configuration has {} bytes; at most {LONGEST_CONFIG} are allowed",
             config.len()
         );
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
         if let Some(key) = content.texts.keys().next() {
-            bail!("its metadata hold an unknown `{key}`");
+            bail!("its metadata has an unknown `{key}`");
         }
         Ok(Self { config, progress, is_of_0_1, content })
     }
 
-    /// The bytes of a file.
+    /// Returns the bytes of a file.
     ///
     /// # Errors
-    /// Numbers that are not finite.
+    /// Fails if a value is not finite.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let mut content = self.content.clone();
         for (key, text) in
@@ -101,7 +133,7 @@ impl Checkpoint {
         content.to_bytes()
     }
 
-    /// What playing needs of it.
+    /// Returns only the parts that playing needs.
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
@@ -116,7 +148,7 @@ impl Checkpoint {
         self.content.arrays.insert(name.to_owned(), array);
     }
 
-    /// The shape of an array, if it is there.
+    /// Returns the shape of an array, if it exists.
     pub fn shape(&self, name: &str) -> Option<&[usize]> {
         self.content.arrays.get(name).map(Array::shape)
     }
@@ -125,10 +157,10 @@ impl Checkpoint {
         self.content.arrays.remove(name).with_context(|| format!("tensor `{name}` is missing"))
     }
 
-    /// Takes out doubles of any shape.
+    /// Removes an f64 array of any shape and returns its values.
     ///
     /// # Errors
-    /// The array is missing or of another type.
+    /// Fails if the array is missing or of another type.
     pub fn take_doubles(&mut self, name: &str) -> Result<Vec<f64>> {
         match self.take(name)? {
             Array::F64(_, values) => Ok(values),
@@ -136,10 +168,10 @@ impl Checkpoint {
         }
     }
 
-    /// Takes out whole numbers of any shape.
+    /// Removes a u64 array of any shape and returns its values.
     ///
     /// # Errors
-    /// The array is missing or of another type.
+    /// Fails if the array is missing or of another type.
     pub fn take_counters(&mut self, name: &str) -> Result<Vec<u64>> {
         match self.take(name)? {
             Array::U64(_, values) => Ok(values),
@@ -149,11 +181,12 @@ impl Checkpoint {
 
     fn take_vector(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
         let values = self.take_doubles(name)?;
-        ensure!(values.len() == size, "tensor `{name}` has {} numbers, expected {size}", values.len());
+        ensure!(values.len() == size, "tensor `{name}` has {} values, expected {size}", values.len());
         Ok(values)
     }
 
-    /// Takes out the floats that these views name, each with this prefix, as one array in the order of the views.
+    /// Removes the f32 arrays of these views, with `prefix` before their names, and returns their values in the order
+    /// of the views.
     pub(super) fn take_floats(&mut self, prefix: &str, views: &[View]) -> Result<Vec<f32>> {
         let mut all = Vec::new();
         for View { name, shape, .. } in views {
@@ -167,10 +200,10 @@ impl Checkpoint {
         Ok(all)
     }
 
-    /// Makes sure that it holds the parameters of such a net, before anything is allocated by what `net` says.
+    /// Checks that it contains the parameters of such a net, before the sizes in `net` determine an allocation.
     ///
     /// # Errors
-    /// A tensor that is missing, or of another shape.
+    /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
         let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))
@@ -193,29 +226,29 @@ impl Checkpoint {
         let Normalizer { mean, variance, .. } = &normalizer;
         let small = |x: f64| x.abs() < 1e18;
         let sound = small(count) && mean.iter().chain(variance).copied().all(small);
-        ensure!(sound, "a tensor `normalizer.…` has a value that no observations have");
+        ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
         Policy::new(net, spaces, parameters, normalizer)
     }
 
-    /// Makes sure that everything was taken out.
+    /// Checks that every array was removed.
     ///
     /// # Errors
-    /// Something is left, by its name.
+    /// Fails if one is left, and names it.
     pub fn finish(self) -> Result<()> {
         match self.content.arrays.keys().next() {
-            Some(name) => bail!("tensor `{name}` is not one of this policy"),
+            Some(name) => bail!("tensor `{name}` is not part of this policy"),
             None => Ok(()),
         }
     }
 }
 
 impl Policy {
-    /// The policy of a checkpoint, or of a policy alone.
+    /// Loads the policy of a checkpoint, or a policy alone.
     ///
     /// # Errors
-    /// A tensor that is missing, of another shape or type, or not one of this policy.
+    /// Fails if a tensor is missing, of another shape or type, or not part of this policy.
     pub fn load(net: &NetConfig, spaces: Spaces, checkpoint: &Checkpoint) -> Result<Self> {
         let mut alone = checkpoint.policy_alone();
         let policy = alone.take_policy(net, spaces)?;
@@ -225,7 +258,8 @@ impl Policy {
 }
 
 impl Ppo {
-    /// The policy and all that is needed to go on learning, with the configuration (TOML) and the progress of the run.
+    /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
+    /// progress of the run.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
         let mut checkpoint = Checkpoint { config, progress, is_of_0_1: false, content };
@@ -247,19 +281,19 @@ impl Ppo {
         checkpoint
     }
 
-    /// Begins with the policy of a checkpoint, or of a policy alone.
+    /// Starts with the policy of a checkpoint, or with a policy alone.
     ///
     /// # Errors
-    /// Another policy than the one of the configuration.
+    /// Fails if it is not the policy that the configuration describes.
     pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<()> {
         self.policy = Policy::load(&self.config.net(), self.policy.spaces, checkpoint)?;
         Ok(())
     }
 
-    /// Goes on from a checkpoint, and takes out of it what it needs.
+    /// Resumes from a checkpoint, and removes from it the arrays that it uses.
     ///
     /// # Errors
-    /// A policy alone; a tensor that is missing, or of another shape or type, or with values that it cannot have.
+    /// Fails for a policy alone, or if a tensor is missing, of another shape or type, or has impossible values.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
         self.policy = checkpoint.take_policy(&self.config.net(), self.policy.spaces)?;
         let views = self.policy.layout.views();
@@ -270,8 +304,8 @@ impl Ppo {
             ensure!(sound, "tensor `adam.square.{name}` has a negative value");
         }
         let steps = checkpoint.take_counters("adam.steps")?;
-        // The optimizer counts them in 32 bits: 10¹³ environment steps of the default training.
-        ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is no number of steps");
+        // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
+        ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is not a step count");
         self.adam.steps = steps[0];
         self.learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
         ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
@@ -299,7 +333,7 @@ mod tests {
     }
 
     fn progress() -> Progress {
-        Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]), fork: None }
+        Progress { iteration: 7, env_steps: 99, best: Some(Evaluation { goals: 1.5, rot_dist: 0.25 }), fork: None }
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
@@ -311,7 +345,7 @@ mod tests {
         format!("{:#}", restored.expect_err("must be refused"))
     }
 
-    /// A learner that has taken a step of its optimizer.
+    /// Returns a learner that has taken one optimizer step.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
         let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Division::alone(1)).unwrap();
         ppo.policy.see(&[vec![&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]], &ppo.division);
@@ -375,7 +409,7 @@ mod tests {
         let mut more = checkpoint.clone();
         more.insert("actor.9.weight", Array::F32(vec![1], vec![0.0]));
         let refused = refusal(more.clone(), &mut learner(&[8]));
-        assert!(refused.contains("`actor.9.weight` is not one of this policy"), "{refused}");
+        assert!(refused.contains("`actor.9.weight` is not part of this policy"), "{refused}");
         assert!(Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &more).is_err());
         let mut negative = checkpoint;
         negative.insert("adam.square.log_std", Array::F32(vec![2], vec![0.0, -1.0]));
@@ -385,7 +419,7 @@ mod tests {
     #[test]
     fn a_policy_that_the_configuration_only_claims_is_not_allocated() {
         let checkpoint = saved(&learner(&[8]));
-        // Terabytes, if they were.
+        // Terabytes, if it were allocated.
         let claimed = config(Backend::Fused, &[1 << 20, 1 << 20, 1 << 20]);
         assert!(Policy::load(&claimed.net(), SPACES, &checkpoint).is_err());
     }
@@ -395,5 +429,16 @@ mod tests {
         let mut ppo = learner(&[8]);
         ppo.policy.normalizer.mean[0] = f64::NAN;
         assert!(saved(&ppo).to_bytes().unwrap_err().to_string().contains("normalizer.mean"));
+    }
+
+    #[test]
+    fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
+        let beats = |one: [f64; 2], best: Option<[f64; 2]>| Evaluation::from(one).beats(best.map(Evaluation::from));
+        assert!(beats([0.0, 2.0], None));
+        assert!(beats([1.0, 2.0], Some([0.5, 0.1])));
+        assert!(!beats([0.5, 0.1], Some([1.0, 2.0])));
+        assert!(beats([1.0, 1.9], Some([1.0, 2.0])));
+        assert!(!beats([1.0, 2.0], Some([1.0, 2.0])));
+        assert!(!beats([0.0, f64::NAN], None));
     }
 }

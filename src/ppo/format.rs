@@ -1,7 +1,7 @@
-//! Named arrays and a few texts as the bytes of a safetensors file, with a checksum over all of it.
+//! Named arrays and a few texts as the bytes of a safetensors file, with a checksum over everything.
 //!
-//! Bytes may come from anywhere. Sizes are checked before anything is allocated by them, numbers must be finite, and what the
-//! checksum does not vouch for is refused.
+//! The bytes may come from anywhere. Sizes are checked before they determine an allocation, values must be finite, and
+//! content that does not match the checksum is refused.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
@@ -12,21 +12,21 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 /// The metadata key of the checksum.
 const CHECKSUM: &str = "checksum";
 
-/// A header of ours takes a few KiB; the limit keeps a foreign one from filling the memory.
+/// The largest header that is read. Ours take a few KiB; the limit keeps a foreign one from filling the memory.
 const LARGEST_HEADER: u64 = 1 << 20;
 
-/// An array of any shape, by rows.
+/// An array of any shape, stored by rows.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Array {
-    /// Floats.
+    /// f32 values.
     F32(Vec<usize>, Vec<f32>),
-    /// Doubles.
+    /// f64 values.
     F64(Vec<usize>, Vec<f64>),
-    /// Whole numbers.
+    /// u64 values.
     U64(Vec<usize>, Vec<u64>),
 }
 
-/// What is wrong with bytes that are not as they were written: cut off, or changed since.
+/// The error for bytes that are not as they were written: cut off or changed.
 #[derive(Debug)]
 pub struct Damaged(String);
 
@@ -40,22 +40,22 @@ impl std::error::Error for Damaged {}
 
 /// The content of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Content {
-    /// The texts, by their names.
+pub(super) struct Content {
+    /// Texts by name.
     pub texts: BTreeMap<String, String>,
-    /// The arrays, by their names.
+    /// Arrays by name.
     pub arrays: BTreeMap<String, Array>,
 }
 
 impl Content {
-    /// The bytes of a file with this content.
+    /// Returns the bytes of a file with this content.
     ///
     /// # Errors
-    /// An array with a number that is not finite, or of a shape that does not fit its length.
-    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+    /// Fails if an array has a value that is not finite, or a shape that does not match its length.
+    pub(super) fn to_bytes(&self) -> Result<Vec<u8>> {
         let mut parts = Vec::new();
         for (name, array) in &self.arrays {
-            ensure!(array.is_finite(), "`{name}` is not finite and is not saved");
+            ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
             parts.push((name, array.bytes(), array));
         }
         let mut views = Vec::new();
@@ -65,16 +65,16 @@ impl Content {
         seal(self.texts.clone().into_iter().collect(), views)
     }
 
-    /// Reads the bytes of a file.
+    /// Parses the bytes of a file.
     ///
     /// # Errors
-    /// Bytes that were not written by [`Content::to_bytes`]; [`Damaged`] where they have been changed since.
-    pub fn parse(bytes: &[u8]) -> Result<Self> {
+    /// Fails if the bytes were not written by [`Content::to_bytes`]; with [`Damaged`] if they were changed since.
+    pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let (mut texts, views) = read(bytes)?;
         let stored =
-            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or of an older version")?;
+            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or one of an older version")?;
         let found = checksum(&texts, &views);
-        ensure!(stored == found, Damaged(format!("damaged: its checksum is {found}, it should be {stored}")));
+        ensure!(stored == found, Damaged(format!("damaged: its checksum is {found} instead of {stored}")));
         let mut arrays = BTreeMap::new();
         for (name, view) in views {
             let array = Array::read(&view).with_context(|| format!("tensor `{name}`"))?;
@@ -84,8 +84,8 @@ impl Content {
     }
 }
 
-/// The file with these texts and arrays, and their checksum; its texts in the order of their names: safetensors writes them as they
-/// lie in a hash map, which differs from run to run, and files of equal content should be equal.
+/// Returns the file with these texts and arrays and their checksum. The texts are sorted by name: safetensors writes
+/// them in the order of a hash map, which differs from run to run, and files with equal content should be equal.
 fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
     let mut bytes = safetensors::serialize(views, Some(texts))?;
@@ -94,22 +94,22 @@ fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) ->
     let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
     parsed.values_mut().filter_map(serde_json::Value::as_object_mut).for_each(serde_json::Map::sort_keys);
     let sorted = serde_json::to_vec(&parsed)?;
-    ensure!(sorted.len() <= header.len(), "its header has become longer");
+    ensure!(sorted.len() <= header.len(), "sorting made its header longer");
     header.fill(b' ');
     header[..sorted.len()].copy_from_slice(&sorted);
     Ok(bytes)
 }
 
-/// The texts of a file, and its arrays in the order of their names.
+/// The texts of a file, and its arrays sorted by name.
 type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
 
 fn read(bytes: &[u8]) -> Result<Raw<'_>> {
-    let whole = |error| Damaged(format!("not a whole safetensors file ({error}); it may be cut off"));
+    let whole = |error| Damaged(format!("not a complete safetensors file ({error}); it may be cut off"));
     if let Some(length) = bytes.first_chunk() {
         let length = u64::from_le_bytes(*length);
         ensure!(
             length <= LARGEST_HEADER,
-            Damaged(format!("its header would have {length} bytes, at most {LARGEST_HEADER} are read"))
+            Damaged(format!("its header claims {length} bytes; at most {LARGEST_HEADER} are allowed"))
         );
     }
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
@@ -119,17 +119,17 @@ fn read(bytes: &[u8]) -> Result<Raw<'_>> {
     Ok((texts, views))
 }
 
-/// The file with these bytes, with the checksum that fits what is in it now: for tests of what lies behind the checksum.
+/// Returns the file with these bytes and a checksum that matches its content, for tests of what follows the checksum.
 ///
 /// # Errors
-/// Bytes that are no whole safetensors file.
+/// Fails if the bytes are not a complete safetensors file.
 pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
     let (mut texts, views) = read(bytes)?;
     texts.remove(CHECKSUM);
     seal(texts, views)
 }
 
-/// The CRC-32 of all names, texts, types, shapes and numbers: it does not depend on how the header is laid out.
+/// Returns the CRC-32 of all names, texts, types, shapes and values. It does not depend on the layout of the header.
 fn checksum(texts: &HashMap<String, String>, views: &[(String, TensorView)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |part: &[u8]| {
@@ -161,7 +161,7 @@ impl Array {
             Dtype::U64 => Self::U64(shape, longs.iter().map(|long| u64::from_le_bytes(*long)).collect()),
             other => bail!("has the type {other:?}, expected F32, F64 or U64"),
         };
-        ensure!(array.is_finite(), "holds a number that is infinite or NaN");
+        ensure!(array.is_finite(), "has a value that is infinite or NaN");
         Ok(array)
     }
 
@@ -181,7 +181,7 @@ impl Array {
         }
     }
 
-    /// The sizes of its dimensions.
+    /// Returns the sizes of its dimensions.
     pub fn shape(&self) -> &[usize] {
         match self {
             Self::F32(shape, _) | Self::F64(shape, _) | Self::U64(shape, _) => shape,
@@ -214,7 +214,7 @@ mod tests {
         format!("{:#}", Content::parse(bytes).unwrap_err())
     }
 
-    /// The place of these bytes in the file.
+    /// Returns the position of these bytes in the file.
     fn find(bytes: &[u8], part: &[u8]) -> usize {
         bytes.windows(part.len()).position(|window| window == part).expect("it is in the file")
     }
@@ -228,7 +228,7 @@ mod tests {
     fn files_of_equal_content_are_equal() {
         let mut many = content();
         (0..20).for_each(|i| drop(many.texts.insert(format!("text {i}"), "x".into())));
-        // Each time another hash map, in an order of its own.
+        // Each call fills a new hash map, with its own order.
         let bytes = many.to_bytes().unwrap();
         assert!((0..20).all(|_| many.clone().to_bytes().unwrap() == bytes));
         assert_eq!(Content::parse(&bytes).unwrap(), many);
@@ -276,6 +276,6 @@ mod tests {
         let at = find(&bytes, &0.2_f64.to_le_bytes());
         bytes[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
         assert!(refusal(&bytes).contains("checksum"));
-        assert!(refusal(&sealed(&bytes).unwrap()).contains("tensor `mean`: holds a number that is infinite or NaN"));
+        assert!(refusal(&sealed(&bytes).unwrap()).contains("tensor `mean`: has a value that is infinite or NaN"));
     }
 }

@@ -1,8 +1,8 @@
 //! Nets made wider without changing what they compute.
 //!
-//! A new unit gets the weights that it would have in a new net, and those behind it that listen to it begin at zero: nothing changes
-//! until they learn to. (Copies of old units, as in T. Chen, I. Goodfellow, J. Shlens, "Net2Net" (2016), would need noise to
-//! become different, and that changes the function.)
+//! A new unit gets the weights that it would have in a new net, but the weights from new units to old units start at
+//! zero: the output does not change until they are trained. (Copies of old units, as in T. Chen, I. Goodfellow, J.
+//! Shlens, "Net2Net" (2016), would need noise to become different, and noise changes the function.)
 
 use anyhow::{Result, ensure};
 
@@ -13,10 +13,11 @@ use crate::config::NetConfig;
 use crate::spaces::Spaces;
 
 impl Checkpoint {
-    /// Makes the nets of a policy, with what its optimizer knows of them, as wide as `to` says; new weights follow from `seed`.
+    /// Widens the nets of a policy, and the optimizer state that belongs to them, to the sizes in `to`. New weights are
+    /// derived from `seed`.
     ///
     /// # Errors
-    /// Nets that would be narrower, or of another depth; tensors that are not those of `from`.
+    /// Fails if a net would become narrower or change its depth, or if the tensors are not those of `from`.
     pub fn grow(&mut self, from: &NetConfig, to: &NetConfig, spaces: Spaces, seed: u64) -> Result<()> {
         if from.hidden == to.hidden {
             return Ok(());
@@ -25,7 +26,7 @@ impl Checkpoint {
             from.hidden.len() == to.hidden.len() && from.hidden.iter().zip(&to.hidden).all(|(old, new)| old <= new);
         ensure!(
             wider,
-            "ppo.hidden = {:?}: nets of {:?} can only be made wider, with as many layers and none smaller",
+            "ppo.hidden = {:?}: nets of {:?} can only be made wider, with the same number of layers and none smaller",
             to.hidden,
             from.hidden
         );
@@ -39,7 +40,8 @@ impl Checkpoint {
         }
         self.grow_array("", (&old, &new), |_| policy)?;
         self.grow_array("adam.mean.", (&old, &new), |_| vec![0.0; new.count()])?;
-        // As if they had seen gradients like those beside them: with none, their first steps would be many times too large.
+        // New entries start with the mean of the old ones of the same tensor: from zero, their first steps would be
+        // many times too large.
         self.grow_array("adam.square.", (&old, &new), |known| {
             let mut begin = vec![0.0; new.count()];
             for (View { range: old, .. }, View { range: new, .. }) in old.views().into_iter().zip(new.views()) {
@@ -50,7 +52,8 @@ impl Checkpoint {
         })
     }
 
-    /// Lays the numbers with this prefix over those that `begin` makes of them, which are as many as the new layout has.
+    /// Replaces the arrays with this prefix by those of the new layout: the values that `begin` returns for them, with
+    /// the existing values copied over.
     fn grow_array(
         &mut self,
         prefix: &str,
@@ -74,7 +77,7 @@ impl Checkpoint {
     }
 }
 
-/// The layers of both nets.
+/// Returns the layers of both nets.
 fn layers(layout: &Layout) -> impl Iterator<Item = &Layer> {
     layout.actor.iter().chain(&layout.critic)
 }
@@ -102,11 +105,11 @@ mod tests {
         ppo
     }
 
-    /// Means and values for some observations.
+    /// Returns means and values for some observations.
     fn answers(ppo: &Ppo) -> Vec<f32> {
         let policy = ppo.policy().freeze();
         let (observations, mut means, mut values) = ([0.3, -2.0, 1.0, 0.0, 5.0, -0.1], [0.0; 4], [0.0; 2]);
-        policy.forward(&observations, Some(&mut means), Some(&mut values), &mut policy.workspace(2));
+        policy.mean_actions_and_values(&observations, &mut means, &mut values, &mut policy.workspace(2));
         means.into_iter().chain(values).collect()
     }
 
@@ -122,10 +125,10 @@ mod tests {
         }
         let second = &to.policy.layout.actor[1];
         let rows: Vec<&[f32]> = to.policy.parameters[second.weight.clone()].chunks_exact(20).collect();
-        assert!(rows[..4].iter().all(|row| row[8..].iter().all(|&x| x == 0.0)), "old units do not listen to new ones");
-        assert!(rows[4..].iter().all(|row| row.iter().all(|&x| x != 0.0)), "new units listen to all");
+        assert!(rows[..4].iter().all(|row| row[8..].iter().all(|&x| x == 0.0)), "old units ignore new ones");
+        assert!(rows[4..].iter().all(|row| row.iter().all(|&x| x != 0.0)), "new units read all");
         let old = &from.policy.layout.actor[0];
-        assert_eq!(to.adam.mean[..24], from.adam.mean[old.weight.clone()], "what the optimizer knew stays");
+        assert_eq!(to.adam.mean[..24], from.adam.mean[old.weight.clone()], "old optimizer state stays");
         assert!(to.adam.mean[24..60].iter().all(|&x| x == 0.0) && to.adam.square[24..60].iter().all(|&x| x == 23.0));
     }
 

@@ -1,4 +1,4 @@
-//! What learning costs on this machine, and what its bare matrix products cost: the limit it is measured against.
+//! Measurements of the cost of learning on this machine and, as its limit, of the matrix products alone.
 
 use std::time::Instant;
 
@@ -8,18 +8,18 @@ use rayon::prelude::*;
 use super::kernels::{Matrix, Multiplier, ROWS};
 use super::{Policy, Ppo, Rollout};
 
-/// Seconds after which, from the third on, no further gradient step is timed.
+/// Seconds after which no further gradient step is timed, once three have been.
 const LIMIT: f64 = 5.0;
 
-/// Times gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a collected rollout, up to
-/// `repeats` of them; seconds for each.
+/// Times up to `repeats` gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a
+/// collected rollout. Returns the seconds of each.
 ///
 /// # Errors
-/// A loss or gradient that is not finite.
+/// Fails if a loss or gradient is not finite.
 pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<f64>> {
     ppo.prepare(rollout);
     ppo.backend.begin(&ppo.policy, rollout);
-    // Samples from all over the rollout, as a shuffled minibatch has them.
+    // Samples from the whole rollout, as in a shuffled minibatch.
     let (samples, step) = (rollout.samples(), ppo.config.minibatches);
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
@@ -33,20 +33,20 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     Ok(seconds)
 }
 
-/// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the gradient of the
-/// inputs is needed, which it is not for observations.
+/// Returns the matrix products of one forward and backward pass: the sizes of the weights `[outputs, inputs]`, and
+/// whether the gradient of the inputs is needed, which is not the case for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
     let nets = [&policy.layout.actor, &policy.layout.critic];
     nets.into_iter().flat_map(|layers| layers.iter().enumerate().map(|(i, layer)| (layer.outputs, layer.inputs, i > 0)))
 }
 
-/// Floating-point operations of those products for one sample, both nets.
+/// Returns the number of floating-point operations of these products for one sample, both nets.
 pub fn flops_per_sample(policy: &Policy) -> f64 {
     products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
 
-/// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads, on numbers that
-/// lie in the caches as far as they fit; for each repeat 10⁹ floating-point operations per second.
+/// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads, with
+/// data that stays in the caches as far as it fits. Returns 10⁹ floating-point operations per second for each repeat.
 pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
     let (policy, arithmetic, blocks) = (&ppo.policy, ppo.arithmetic, samples.div_ceil(ROWS));
     let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");

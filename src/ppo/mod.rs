@@ -1,8 +1,9 @@
-//! Proximal policy optimisation of a Gaussian policy.
+//! Proximal policy optimisation (PPO) of a Gaussian policy.
 //!
-//! Host slices come in and go out; all weights lie in one of them (see `parameters`). Nothing here knows an environment or a file.
-//! In comments: T steps of N environments (the rollout), B = T × N samples, M samples in a minibatch, O and A numbers in an
-//! observation and an action.
+//! Inputs and outputs are host slices; all weights are in one array (see `parameters`). Nothing here depends on an
+//! environment or a file.
+//! Notation in comments: a rollout has T steps of N environments, B = T × N samples; a minibatch has M samples; an
+//! observation has O values and an action A.
 
 mod acting;
 mod adam;
@@ -28,9 +29,9 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 pub use acting::Acting;
-pub use checkpoint::{Checkpoint, Fork, Progress};
+pub use checkpoint::{Checkpoint, Evaluation, Fork, Progress};
 pub use format::{Array, Damaged, sealed};
-pub use gae::gae;
+pub use gae::{Discount, gae};
 pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
@@ -39,30 +40,30 @@ pub use perception::Perception;
 pub use policy::{FrozenPolicy, Policy};
 pub use rollout::{Rollout, RolloutBlock};
 
-use crate::config::{self, PpoConfig};
+use crate::config::{Backend, PpoConfig};
 use crate::ranks::Division;
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
 use adam::{Adam, norm};
-use backend::{Backend, Minibatch, ShardSums};
+use backend::{GradientBackend, Minibatch, ShardSums};
 use candle::Reference;
 use kernels::{Arithmetic, Kernels};
 
-/// The policy and what improves it.
+/// A learner: the policy and everything that trains it.
 pub struct Ppo {
     config: PpoConfig,
     seed: u64,
     policy: Policy,
-    backend: Box<dyn Backend>,
+    backend: Box<dyn GradientBackend>,
     arithmetic: Arithmetic,
-    /// Of all parameters, of the last minibatch.
+    /// The gradient of all parameters for the last minibatch.
     gradient: Vec<f32>,
     adam: Adam,
     learning_rate: f64,
     division: Division,
 }
 
-/// Means over the minibatches of an update, where nothing else is said.
+/// Statistics of an update: means over its minibatches unless stated otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
     /// The clipped surrogate, negated.
@@ -71,90 +72,113 @@ pub struct UpdateStats {
     pub value_loss: f64,
     /// Squared distance of the mean actions from [-1, 1], beyond which they are clipped.
     pub excess: f64,
-    /// Entropy of the policy's own action distribution, nats.
+    /// Entropy of the action distribution at noise scale 1, nats.
     pub entropy: f64,
-    /// KL divergence from the policy that collected, nats.
+    /// KL divergence from the policy that collected the rollout, nats.
     pub kl: f64,
-    /// The same of the first minibatch alone, before any step: zero but for rounding.
+    /// The same for the first minibatch alone, before any gradient step: zero up to rounding.
     pub first_kl: f64,
-    /// The largest |ratio - 1| of the first minibatch: zero but for rounding.
+    /// The largest |ratio - 1| of the first minibatch: zero up to rounding.
     pub first_ratio_error: f64,
     /// Fraction of the samples whose ratio was clipped.
     pub clip_fraction: f64,
-    /// Norm of all gradients together, before clipping.
+    /// Norm of the whole gradient, before clipping.
     pub grad_norm: f64,
-    /// Mean of the policy's own standard deviations, after the update.
+    /// Mean of the standard deviations at noise scale 1, after the update.
     pub std: f64,
-    /// 1 - Var(returns - values) / Var(returns) of the values that the rollout was collected with.
+    /// 1 - Var(returns - values) / Var(returns), with the values predicted during collection.
     pub explained_variance: f64,
     /// The learning rate after the update.
     pub learning_rate: f64,
 }
 
+impl UpdateStats {
+    /// Returns the logged statistics, each with its group and name.
+    pub fn named(&self) -> [(&'static str, f64); 11] {
+        [
+            ("loss/policy", self.policy_loss),
+            ("loss/value", self.value_loss),
+            ("policy/entropy", self.entropy),
+            ("policy/kl", self.kl),
+            ("policy/first_kl", self.first_kl),
+            ("policy/clip_fraction", self.clip_fraction),
+            ("policy/std", self.std),
+            ("policy/excess", self.excess),
+            ("value/explained_variance", self.explained_variance),
+            ("optim/learning_rate", self.learning_rate),
+            ("optim/grad_norm", self.grad_norm),
+        ]
+    }
+}
+
 impl Ppo {
-    /// A new learner for environments with these spaces, of which it computes some shards; all its randomness follows from `seed`.
+    /// Creates a learner for environments with these spaces. It computes the shards that `division` assigns to this
+    /// rank; all its randomness is derived from `seed`.
     ///
     /// # Errors
-    /// A precision that this machine does not have, or a symmetry that the observations do not have.
+    /// Fails if this machine does not support the configured precision, or if the observations lack the configured
+    /// symmetry.
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, division: Division) -> Result<Self> {
         let [_, std] = config.std_bounds(0);
         let policy = Policy::random(&config.net(), spaces, std, seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
-        let backend: Box<dyn Backend> = match config.backend {
-            config::Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
-            config::Backend::Candle => Box::new(Reference::new(config)),
+        let backend: Box<dyn GradientBackend> = match config.backend {
+            Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
+            Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (config, learning_rate) = (config.clone(), config.learning_rate);
         Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division })
     }
 
-    /// The policy as it is now.
+    /// Returns the current policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
     }
 
-    /// A rollout of the configured horizon for blocks of so many environments.
+    /// Creates a rollout of the configured horizon for blocks with these numbers of environments.
     pub fn rollout(&self, block_sizes: &[usize]) -> Rollout {
         Rollout::new(self.config.horizon, block_sizes, &self.policy.spaces)
     }
 
-    /// Keeps the standard deviations of the actions within the bounds for a run after so many control steps.
+    /// Clamps the standard deviations of the actions to their bounds after `env_steps` control steps of the run.
     pub fn limit_std(&mut self, env_steps: u64) {
         let [least, most] = self.config.std_bounds(env_steps).map(|std| std.ln() as f32);
         let log_std = &mut self.policy.parameters[self.policy.layout.log_std.clone()];
         log_std.iter_mut().for_each(|x| *x = x.max(least).min(most));
     }
 
-    /// What acting for blocks of up to `rows` environments needs, to be used again and again.
+    /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
     pub fn workspace(&self, rows: usize) -> Workspace {
         self.policy.workspace(rows, false, self.arithmetic)
     }
 
-    /// The policy of this iteration, to collect a rollout with.
+    /// Returns the policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
         let policy = self.policy.freeze();
         let std = policy.std();
-        // The geometric mean. In proportion to it all standard deviations grow: to those of the policy the losses take the factor for
-        // a constant, though it follows them.
+        // The geometric mean. Away from the goal, all standard deviations are multiplied by one factor that raises this
+        // mean to `away_std`. The losses treat the factor as a constant, although it depends on the policy's standard
+        // deviations.
         let typical = (std.iter().map(|s| s.ln()).sum::<f32>() / std.len() as f32).exp();
         let away_scale = (self.config.away_std as f32 / typical).max(1.0);
         Acting { policy, config: &self.config, away_scale }
     }
 
-    /// The generator of the action noise of a block of environments in an iteration.
+    /// Returns the generator of the action noise for a block of environments in an iteration.
     pub fn noise(&self, iteration: u64, block: usize) -> Rng {
         rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
     }
 
-    /// Learns from a rollout that this policy has collected, then takes its observations into the normaliser, which stays
-    /// the same during collection and update: so the first minibatch still sees the very policy that acted. `None` if `stop`
-    /// was set meanwhile; then the learner must be restored before it is used again.
+    /// Learns from a rollout that this policy collected, then adds its observations to the normaliser. The normaliser
+    /// does not change during collection and learning, so the first minibatch sees exactly the policy that acted.
+    /// Returns `None` if `stop` was set in the meantime; the learner must then be restored before it is used again.
     ///
     /// # Errors
-    /// A loss, gradient or weight that is not finite; the policy must not be used or saved then.
+    /// Fails if a loss, gradient or weight is not finite; the policy must not be used or saved then.
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
-        // On a worker thread: from outside, each of the many short parallel parts would put this one to sleep and wake it.
+        // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
+        // wake it.
         rayon::scope(|_| self.learn(rollout, iteration, stop))
     }
 
@@ -163,7 +187,7 @@ impl Ppo {
         self.backend.begin(&self.policy, rollout);
         let own = self.division.own();
         let in_shard = rollout.samples() / own.len();
-        // Of each shard, as many in each part.
+        // Each part takes this number of samples from each shard.
         let size = in_shard / self.config.minibatches;
         let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
         let mut shuffles: Vec<Rng> = own.clone().map(stream).collect();
@@ -188,7 +212,7 @@ impl Ppo {
         Ok(Some(self.stats(&steps, explained_variance)))
     }
 
-    /// The figures of an update of these steps.
+    /// Returns the statistics of an update with these steps.
     fn stats(&self, steps: &[Step], explained_variance: f64) -> UpdateStats {
         let mean = |of: fn(&Step) -> f64| steps.iter().map(of).sum::<f64>() / steps.len() as f64;
         let std = self.policy.std();
@@ -208,11 +232,12 @@ impl Ppo {
         }
     }
 
-    /// Sets the returns and the advantages, which get mean 0 and standard deviation 1; returns the explained variance.
+    /// Computes the returns and advantages, normalises the advantages to mean 0 and standard deviation 1, and returns
+    /// the explained variance.
     fn prepare(&self, rollout: &mut Rollout) -> f64 {
-        let factors = [self.config.gamma as f32, self.config.lambda as f32];
+        let discount = Discount { gamma: self.config.gamma as f32, lambda: self.config.lambda as f32 };
         rollout.blocks.par_iter_mut().for_each(|block| {
-            gae(factors, &block.rewards, &block.values, &block.dones, &mut block.advantages, &mut block.returns);
+            gae(discount, &block.rewards, &block.values, &block.dones, &mut block.advantages, &mut block.returns);
         });
         let (_, spread) = self.mean_and_variance(rollout, |block| &block.returns);
         let (mean, residual) = self.mean_and_variance(rollout, |block| &block.advantages);
@@ -223,7 +248,7 @@ impl Ppo {
         if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
     }
 
-    /// Mean and variance of what all samples of all ranks have there.
+    /// Returns the mean and variance of one array over all samples of all ranks.
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
         let shards = self.division.own().len();
         let sum = |term: &dyn Fn(f64) -> f64| {
@@ -237,7 +262,8 @@ impl Ppo {
         (mean, sum(&|x| (x - mean).powi(2)) / count)
     }
 
-    /// One gradient step on these samples, shard after shard. The `first` of an update still sees the policy that acted.
+    /// Takes one gradient step on these samples, which are ordered by shard. In the `first` step of an update, the
+    /// policy is still the one that acted.
     fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Step> {
         let (own_shards, shards) = (self.division.own().len(), self.division.shards());
         let minibatch = Minibatch { samples, own_shards, shards };
@@ -253,15 +279,15 @@ impl Ppo {
         if !first {
             self.adapt_learning_rate(losses.kl);
         }
-        // Of the Gaussian with the policy's own standard deviations.
+        // The entropy of the Gaussian at noise scale 1.
         let entropy = self.policy.log_std().iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum();
-        // As in PyTorch's clip_grad_norm_, with its constant against a division by zero.
+        // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         self.adam.step(&mut self.policy.parameters, &self.gradient, self.learning_rate, scale);
         Ok(Step { losses, grad_norm, entropy })
     }
 
-    /// The figures of a minibatch of so many samples, from the sums of the shards of this rank.
+    /// Returns the losses of a minibatch of `samples` samples, given the sums of this rank's shards.
     fn losses(&self, sums: &[ShardSums], samples: f64) -> Losses {
         let row = |sums: &ShardSums| vec![sums.surrogate, sums.value_error, sums.excess, sums.kl, sums.clipped];
         let totals = self.division.total(sums.iter().map(row));
@@ -272,8 +298,8 @@ impl Ppo {
         Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
     }
 
-    /// Goes on with the learning rate of its settings, where they name another one than `before` or keep it fixed; an adapted one
-    /// stays within its range.
+    /// Switches to the configured learning rate if it differs from that in `before` or if the rate is fixed; otherwise
+    /// keeps the adapted rate, clamped to its range.
     pub fn settle_learning_rate(&mut self, before: &PpoConfig) {
         let PpoConfig { learning_rate, learning_rate_range: [lowest, highest], desired_kl, .. } = self.config;
         if desired_kl == 0.0 || learning_rate != before.learning_rate {
@@ -286,12 +312,12 @@ impl Ppo {
     fn check_weights(&self) -> Result<()> {
         for View { name, range, .. } in self.policy.layout.views() {
             let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
-            ensure!(finite, "the step has made `{name}` infinite or NaN: the training has failed and stops here");
+            ensure!(finite, "the update made `{name}` infinite or NaN: the training has failed and stops here");
         }
         Ok(())
     }
 
-    /// Keeps the KL divergence of an update near the desired one, as the reference implementation does.
+    /// Adapts the learning rate to keep the KL divergence near the desired one, as the reference implementation does.
     fn adapt_learning_rate(&mut self, kl: f64) {
         let desired = self.config.desired_kl;
         let [lowest, highest] = self.config.learning_rate_range;
@@ -306,10 +332,10 @@ impl Ppo {
     }
 }
 
-/// Figures of one minibatch.
+/// Losses and statistics of one minibatch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Losses {
-    /// What is minimised.
+    /// The loss that is minimised.
     total: f64,
     /// The clipped surrogate, negated.
     policy: f64,
@@ -317,7 +343,7 @@ struct Losses {
     value: f64,
     /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
     excess: f64,
-    /// Mean KL divergence of the present distribution from the one that acted, nats.
+    /// Mean KL divergence of the current distribution from the one that acted, nats.
     kl: f64,
     /// Fraction of the samples whose ratio was clipped.
     clip_fraction: f64,
@@ -325,7 +351,7 @@ struct Losses {
     ratio_error: f64,
 }
 
-/// What is known of one gradient step.
+/// The results of one gradient step.
 struct Step {
     losses: Losses,
     grad_norm: f64,
@@ -351,7 +377,7 @@ mod tests {
     #[test]
     fn the_learning_rate_follows_the_divergence_within_its_range() {
         let mut ppo = learner(0.01);
-        // The divergence, and the factor that the rate is then changed by.
+        // The KL divergence and the expected factor on the learning rate.
         for (kl, factor) in [(0.021, 1.0 / 1.5), (0.019, 1.0), (0.006, 1.0), (0.004, 1.5), (0.0, 1.5)] {
             ppo.learning_rate = 1e-3;
             ppo.adapt_learning_rate(kl);
@@ -367,7 +393,7 @@ mod tests {
     fn a_fork_takes_the_learning_rate_of_its_settings_where_they_name_another_or_keep_it_fixed() {
         let mut ppo = learner(0.01);
         let before = ppo.config.clone();
-        // As adapted, what the settings name now, the divergence that is desired, and the rate that it goes on with.
+        // The adapted rate, the rate in the new settings, the desired KL divergence and the expected rate.
         for (adapted, named, desired, expected) in
             [(7e-4, 1e-3, 0.01, 7e-4), (7e-4, 6e-4, 0.01, 6e-4), (7e-4, 1e-3, 0.0, 1e-3), (1e-4, 1e-3, 0.01, 5e-4)]
         {
@@ -382,7 +408,7 @@ mod tests {
         let mut ppo = learner(0.0);
         let rollout = Rollout::new(1, &[4], &SPACES);
         ppo.backend.begin(&ppo.policy, &rollout);
-        // Of a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of two actions.
+        // With a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of the two actions.
         let step = ppo.minibatch_step(&rollout, &[0, 1, 2, 3], true).unwrap();
         assert!((step.entropy - 2.0 * 0.908_113).abs() < 1e-5, "{}", step.entropy);
     }

@@ -1,36 +1,36 @@
-//! Running mean and variance of the observations, saved with the policy that has learnt on them.
+//! Running mean and variance of the observations, saved with the policy that was trained on them.
 
 use rayon::prelude::*;
 
 use crate::ranks::Division;
 
-/// Added to the variance, so that a constant input does not divide by zero.
+/// Added to the variance, so that a constant input does not cause a division by zero.
 const EPSILON: f64 = 1e-5;
 
-/// Normalised observations are clipped to ± this many standard deviations, so that a rare shock does not shake the nets.
+/// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
 const CLIP: f32 = 5.0;
 
-/// Rows whose sums one task takes; fixed, so that the result does not depend on the number of threads.
+/// Rows that one task sums; fixed, so that the result does not depend on the number of threads.
 const ROWS_PER_TASK: usize = 1024;
 
-/// Statistics of each of the O numbers of an observation.
+/// Statistics of each of the O values of an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Normalizer {
-    /// `[O]`
+    /// `[O]`: means
     pub mean: Vec<f64>,
-    /// `[O]`, variance.
+    /// `[O]`: variances
     pub variance: Vec<f64>,
-    /// Observations seen.
+    /// The number of observations seen.
     pub count: f64,
 }
 
 impl Normalizer {
-    /// One that has seen nothing and leaves observations of `size` numbers almost as they are.
+    /// Creates a normaliser that has seen nothing and leaves observations of `size` values almost unchanged.
     pub fn new(size: usize) -> Self {
         Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
     }
 
-    /// What it does to an observation, in floats.
+    /// Returns the current normalisation, in f32.
     pub fn scaling(&self) -> Scaling {
         Scaling {
             mean: self.mean.iter().map(|&m| m as f32).collect(),
@@ -38,11 +38,11 @@ impl Normalizer {
         }
     }
 
-    /// Takes the raw rows `[B, O]` of these shards, each as `perceive` leaves it, and those of the other ranks into the statistics. Each
-    /// shard has several arrays, and as many rows as the others.
+    /// Adds the raw rows `[B, O]` of these shards and of the other ranks' shards to the statistics; `perceive` is first
+    /// applied to each row. A shard consists of several arrays; all shards have the same number of rows.
     ///
-    /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances"
-    /// (1979), eq. 2.1.
+    /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+    /// variances" (1979), eq. 2.1.
     pub fn update(&mut self, shards: &[Vec<&[f32]>], division: &Division, perceive: impl Fn(&mut [f32]) + Sync) {
         let size = self.mean.len();
         let in_shard = shards[0].iter().map(|part| part.len() / size).sum::<usize>();
@@ -64,7 +64,7 @@ impl Normalizer {
     }
 }
 
-/// The sums of `f(value, column)` over the perceived rows of each shard, for each column.
+/// Returns, for each shard, the sum of `f(value, column)` over its perceived rows in each column.
 fn column_sums(
     shards: &[Vec<&[f32]>],
     size: usize,
@@ -90,7 +90,7 @@ fn column_sums(
     shards.par_iter().map(of_shard).collect()
 }
 
-/// `(x - mean) · factor`, clipped.
+/// The normalisation `(x - mean) · factor`, clipped.
 #[derive(Clone, Debug)]
 pub struct Scaling {
     /// `[O]`
@@ -100,7 +100,7 @@ pub struct Scaling {
 }
 
 impl Scaling {
-    /// Numbers in an observation.
+    /// Returns the number of values in an observation.
     pub fn size(&self) -> usize {
         self.mean.len()
     }

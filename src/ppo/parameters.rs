@@ -1,31 +1,31 @@
-//! Where each weight of a policy lies in the one array that holds them all.
+//! The location of each weight of a policy in the one array that holds them all.
 //!
-//! Everything that works on all weights alike (the optimizer, the norm of a gradient, a sum over machines) takes the array as it
-//! is; everything that means one of them goes by its range.
+//! Code that treats all weights alike (the optimizer, the norm of a gradient, a sum over ranks) uses the array as a
+//! whole; code that needs one of them uses its range.
 
 use std::ops::Range;
 
-/// The name of the logarithm of the standard deviations.
+/// The name of the logarithms of the standard deviations.
 const LOG_STD: &str = "log_std";
 
-/// The parameters of a policy, in order: actor, critic, each layer by layer, weights before biases; then the logarithm of the
-/// standard deviations.
+/// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases; then the
+/// logarithms of the standard deviations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
     /// The layers of the actor.
     pub actor: Vec<Layer>,
     /// The layers of the critic.
     pub critic: Vec<Layer>,
-    /// The logarithm of the standard deviations, `[A]`.
+    /// The logarithms of the standard deviations, `[A]`.
     pub log_std: Range<usize>,
 }
 
 /// One layer of a net.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// Numbers that go in.
+    /// The number of inputs.
     pub inputs: usize,
-    /// Numbers that come out.
+    /// The number of outputs.
     pub outputs: usize,
     /// `[outputs, inputs]`
     pub weight: Range<usize>,
@@ -33,19 +33,19 @@ pub struct Layer {
     pub bias: Range<usize>,
 }
 
-/// One parameter as it is named in a file.
+/// One parameter tensor as it is named in a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// `actor.0.weight`, for example.
+    /// The name, e.g. `actor.0.weight`.
     pub name: String,
-    /// Sizes of its dimensions.
+    /// The sizes of its dimensions.
     pub shape: Vec<usize>,
-    /// Its numbers, by rows.
+    /// The range of its values, stored by rows.
     pub range: Range<usize>,
 }
 
 impl Layout {
-    /// Of nets with these hidden layers, for observations and actions of these sizes.
+    /// Creates the layout of nets with these hidden layers, for observations and actions of these sizes.
     pub fn new(hidden: &[usize], observation_size: usize, action_size: usize) -> Self {
         let mut at = 0;
         let mut take = |count: usize| {
@@ -65,18 +65,18 @@ impl Layout {
         Self { actor, critic, log_std: take(action_size) }
     }
 
-    /// The number of weights, biases and standard deviations.
+    /// Returns the number of weights, biases and standard deviations.
     pub fn count(&self) -> usize {
         self.log_std.end
     }
 
-    /// The numbers of actor, critic and standard deviations.
+    /// Returns the ranges of actor, critic and standard deviations.
     pub fn groups(&self) -> [Range<usize>; 3] {
         let of = |net: &[Layer]| net[0].weight.start..net[net.len() - 1].bias.end;
         [of(&self.actor), of(&self.critic), self.log_std.clone()]
     }
 
-    /// Each parameter with its name, in order.
+    /// Returns each parameter tensor with its name, in order.
     pub fn views(&self) -> Vec<View> {
         let mut views = Vec::new();
         for (net, layers) in [("actor", &self.actor), ("critic", &self.critic)] {

@@ -1,9 +1,9 @@
-//! What a policy makes of an observation before its nets see it.
+//! The reading of observations by a policy: it exploits the symmetry of the cube, then normalises.
 //!
-//! The cube looks different on each side, but to the hand it is the same from all: turned about itself by one of the 24
-//! rotations that take a cube onto itself, and the goal with it, it moves the same way under the same actions, and the rotation
-//! that is left to the goal stays the same. So a policy need only learn one of 24 ways that a cube can lie, if each
-//! observation is first turned into that one.
+//! The faces of the cube look different, but the hand handles them all alike. If cube and goal are rotated about the
+//! cube's own axes by one of the 24 rotations that map a cube onto itself, the cube moves in the same way under the
+//! same actions, and the remaining rotation to the goal is the same. So if each observation is first mapped to one of
+//! the 24 equivalent ones, a policy has to learn only that one.
 
 use std::f32::consts::FRAC_1_SQRT_2;
 
@@ -13,9 +13,9 @@ use pulp::Arch;
 use super::normalizer::Scaling;
 use crate::config::Symmetry;
 use crate::quat;
-use crate::spaces::Spaces;
+use crate::spaces::{CubeAndGoal, Spaces};
 
-/// The rotations of a cube onto itself, w,x,y,z, one of each pair q and -q.
+/// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
 const ROTATIONS: [[f32; 4]; 24] = {
     const H: f32 = 0.5;
     const R: f32 = FRAC_1_SQRT_2;
@@ -24,21 +24,21 @@ const ROTATIONS: [[f32; 4]; 24] = {
         [0.0, 1.0, 0.0, 0.0],
         [0.0, 0.0, 1.0, 0.0],
         [0.0, 0.0, 0.0, 1.0],
-        // About an axis through the middles of two faces.
+        // Quarter turns about an axis through the centres of two faces.
         [R, R, 0.0, 0.0],
         [R, -R, 0.0, 0.0],
         [R, 0.0, R, 0.0],
         [R, 0.0, -R, 0.0],
         [R, 0.0, 0.0, R],
         [R, 0.0, 0.0, -R],
-        // Through the middles of two edges.
+        // Half turns about an axis through the midpoints of two edges.
         [0.0, R, R, 0.0],
         [0.0, R, -R, 0.0],
         [0.0, R, 0.0, R],
         [0.0, R, 0.0, -R],
         [0.0, 0.0, R, R],
         [0.0, 0.0, R, -R],
-        // Through two corners.
+        // Third turns about an axis through two corners.
         [H, H, H, H],
         [H, -H, H, H],
         [H, H, -H, H],
@@ -50,32 +50,32 @@ const ROTATIONS: [[f32; 4]; 24] = {
     ]
 };
 
-/// What a policy takes to be the same in a raw observation.
+/// The symmetry that a policy exploits in raw observations.
 #[derive(Clone, Copy, Debug)]
 pub struct Perception {
-    /// Where the orientations of cube and goal begin, if they are turned.
-    cube_and_goal: Option<[usize; 2]>,
+    /// The offsets of the orientations of cube and goal, if they are to be rotated.
+    cube_and_goal: Option<CubeAndGoal>,
 }
 
 impl Perception {
-    /// Of a policy with this setting, on observations that `spaces` describes.
+    /// Creates the perception for this setting and the observations that `spaces` describes.
     ///
     /// # Errors
-    /// The symmetry of a cube where there is none.
+    /// Fails if the setting is the symmetry of a cube but the observations contain no cube.
     pub fn new(symmetry: Symmetry, spaces: &Spaces) -> Result<Self> {
         let cube_and_goal = match symmetry {
             Symmetry::None => None,
-            Symmetry::Cube => Some(spaces.cube_and_goal.context("ppo.symmetry = \"cube\": there is no cube here")?),
+            Symmetry::Cube => Some(spaces.cube_and_goal.context("ppo.symmetry = \"cube\": this task has no cube")?),
         };
         Ok(Self { cube_and_goal })
     }
 
-    /// Turns one raw observation `[O]` into the one that all observations of the same share, in place.
+    /// Maps one raw observation `[O]`, in place, to the one that represents all equivalent observations.
     #[inline(always)]
     pub fn turn(self, observation: &mut [f32]) {
-        let Some(places) = self.cube_and_goal else { return };
-        let best = nearest(quaternion(observation, places[0]));
-        for place in places {
+        let Some(CubeAndGoal { cube, goal }) = self.cube_and_goal else { return };
+        let best = nearest(quaternion(observation, cube));
+        for place in [cube, goal] {
             let turned = quat::mul(quaternion(observation, place), best);
             let turned = if turned[0] < 0.0 { turned.map(|x| -x) } else { turned };
             observation[place..place + 4].copy_from_slice(&turned);
@@ -83,31 +83,31 @@ impl Perception {
     }
 }
 
-/// The rotation about the cube's own axes after which it is as near as can be to where it is not turned at all.
+/// Returns the rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
 #[inline(always)]
 fn nearest(cube: [f32; 4]) -> [f32; 4] {
-    // The cosine of half the angle that is left after each; all of them first, which goes in vectors.
+    // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
     let close = ROTATIONS.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
     ROTATIONS[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
 }
 
-/// How a policy reads raw observations: perceived, then normalised.
+/// The way a policy reads raw observations: perception, then normalisation.
 #[derive(Clone, Debug)]
-pub struct Reader {
-    /// What it takes to be the same.
+pub(super) struct Reader {
+    /// The symmetry that it exploits.
     pub perception: Perception,
-    /// What its normaliser does.
+    /// The normalisation.
     pub scaling: Scaling,
 }
 
 impl Reader {
-    /// Numbers in an observation.
-    pub fn size(&self) -> usize {
+    /// Returns the number of values in an observation.
+    pub(super) fn size(&self) -> usize {
         self.scaling.size()
     }
 
     /// Writes what the nets see of the `raw` observations `[B, O]` into `out` `[B, O]`.
-    pub fn read(&self, raw: &[f32], out: &mut [f32]) {
+    pub(super) fn read(&self, raw: &[f32], out: &mut [f32]) {
         out.copy_from_slice(raw);
         Arch::new().dispatch(
             #[inline(always)]
@@ -122,7 +122,7 @@ impl Reader {
 }
 
 fn quaternion(observation: &[f32], place: usize) -> [f32; 4] {
-    *observation[place..].first_chunk().expect("a place within the observation")
+    *observation[place..].first_chunk().expect("an offset within the observation")
 }
 
 #[cfg(test)]
@@ -132,8 +132,12 @@ mod tests {
     use crate::quat::Quat;
     use crate::rng;
 
-    const SPACES: Spaces =
-        Spaces { observation_size: 20, action_size: 1, cube_and_goal: Some([5, 11]), distance: |_| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 20,
+        action_size: 1,
+        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11 }),
+        distance: |_| 0.0,
+    };
 
     fn perceive(symmetry: Symmetry, row: &mut [f32]) {
         Perception::new(symmetry, &SPACES).unwrap().turn(row);
@@ -196,8 +200,8 @@ mod tests {
             let between = |a: [f32; 4], b: [f32; 4]| quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)));
             let left = quat::mul(cube, quat::conj(goal));
             assert!(quat::angle_between(between(new_cube, new_goal), left) < 1e-3);
-            // The rotation that takes a cube farthest from all 24 ways of lying is one of 62.8°, about a direction in which
-            // two of the axes and the diagonal are as near.
+            // The largest misorientation of a cube is 62.8°: there, no rotation, a quarter turn about either of two
+            // axes and a third turn about the diagonal between them are equally near.
             assert!(new_cube[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0, "{new_cube:?}");
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));

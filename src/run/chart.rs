@@ -1,4 +1,4 @@
-//! A picture with curves in panels, one above the other: SVG, or PNG where pictures are built in.
+//! A chart with curves in panels, one above the other: SVG, or PNG with the feature `video`.
 
 use anyhow::{Result, anyhow, bail};
 use plotters::coord::Shift;
@@ -8,35 +8,35 @@ use plotters::prelude::*;
 use super::OutputFile;
 
 /// Curves of one quantity.
-pub struct Panel {
-    /// Of the quantity.
+pub struct Subplot {
+    /// The name of the quantity.
     pub name: String,
-    /// In the order of the legend.
+    /// Curves, in legend order.
     pub curves: Vec<Curve>,
 }
 
 /// A line through points.
 pub struct Curve {
-    /// For the legend.
+    /// The name in the legend.
     pub name: String,
-    /// x and y, x rising.
+    /// Points (x, y), in ascending order of x.
     pub points: Vec<[f64; 2]>,
 }
 
-/// Panels with one x axis.
+/// Panels with a shared x axis.
 pub struct Chart {
-    /// What the x axis shows.
+    /// The label of the x axis.
     pub along: String,
-    /// From top to bottom.
-    pub panels: Vec<Panel>,
+    /// Panels, from top to bottom.
+    pub panels: Vec<Subplot>,
     /// Width and height in pixels.
     pub size: [u32; 2],
 }
 
-/// Not black with opacity, which not every reader of SVG knows.
+/// The colour of the grid. Opaque, since not every SVG viewer supports opacity.
 const GRID: RGBColor = RGBColor(225, 225, 225);
 
-/// Told apart also by those who see no red or green: M. Okabe, K. Ito, "Color universal design" (2008).
+/// Colours of the curves, distinguishable with red-green colour blindness: M. Okabe, K. Ito, "Color universal design" (2008).
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -50,22 +50,22 @@ const COLOURS: [RGBColor; 7] = [
 /// Pixels between two dashes.
 const GAP: i32 = 3;
 
-/// Colour and length of the dashes (pixels) of one curve after the other: when all colours are used they come again, broken.
+/// Returns the colour and dash length (pixels) of each curve in turn. Once all colours are used, they repeat with dashes.
 fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
     let dashes = std::iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
     dashes.flat_map(|dash| COLOURS.iter().map(move |colour| (colour.stroke_width(2), dash)))
 }
 
 impl Chart {
-    /// Writes the picture, in the format that its name asks for.
+    /// Writes the picture in the format given by the extension of its name.
     ///
     /// # Errors
-    /// Another format, a place that cannot be written to, a picture too small for its panels.
+    /// Fails for any other format, if the file cannot be written, or if the picture is too small for its panels.
     pub fn write(&self, output: OutputFile) -> Result<()> {
         let [width, height] = self.size;
         #[cfg(feature = "video")]
         {
-            // Where pictures are built in, letters are measured also for SVG. A second time has no effect.
+            // With this feature, text is measured for SVG too, which needs the font. Registering it twice has no effect.
             let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
         }
         let extension = output.path().extension().and_then(|extension| extension.to_str()).map(str::to_owned);
@@ -125,14 +125,14 @@ impl Chart {
     }
 }
 
-impl Panel {
-    /// What the points of all curves have along an axis.
+impl Subplot {
+    /// Returns the coordinates of the points of all curves along an axis.
     fn values(&self, axis: usize) -> impl Iterator<Item = f64> {
         self.curves.iter().flat_map(|curve| &curve.points).map(move |point| point[axis])
     }
 }
 
-/// From the least to the greatest of the values, and zero; not empty.
+/// Returns the range of the values and zero, with a margin at the top; never empty.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
     if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }
@@ -145,13 +145,13 @@ mod tests {
     #[test]
     fn every_curve_is_drawn_in_a_way_of_its_own() {
         let curve = |i| Curve { name: format!("run {i}"), points: vec![[0.0, f64::from(i)], [1.0, f64::from(i)]] };
-        let panel = Panel { name: "a".into(), curves: (1..=8).map(curve).collect() };
+        let panel = Subplot { name: "a".into(), curves: (1..=8).map(curve).collect() };
         let chart = Chart { along: "steps".into(), panels: vec![panel], size: [600, 500] };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
         chart.write(OutputFile::create(&path).unwrap()).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
-        // The first and the eighth have one colour: two solid lines, one of them in the legend, and the eighth's dashes.
+        // The first and the eighth share a colour: two solid lines, one of them in the legend, and the eighth's dashes.
         let lines = |colour: RGBColor| {
             let stroke = format!("stroke=\"#{:02X}{:02X}{:02X}\"", colour.0, colour.1, colour.2);
             svg.lines().filter(|line| line.starts_with("<polyline") && line.contains(&stroke)).count()
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn all_panels_have_the_same_axis() {
-        let panel = |name: &str, end| Panel {
+        let panel = |name: &str, end| Subplot {
             name: name.into(),
             curves: vec![Curve { name: "run".into(), points: vec![[1.0, 0.5], [end, 0.7]] }],
         };

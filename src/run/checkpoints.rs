@@ -1,4 +1,5 @@
-//! The checkpoints of a run: each there whole or not at all, the newest few kept, and `latest` another name of the newest.
+//! The checkpoints of a run. Each is written completely or not at all, the newest few are kept, and `latest` is a second name of
+//! the newest.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,10 +12,10 @@ use super::output::{name_also, sync_folder, unused_name, write_whole};
 const LATEST: &str = "latest.safetensors";
 const BEST: &str = "best.safetensors";
 
-/// How the name of a checkpoint ends that has been put aside.
+/// The extension of a later checkpoint that was set aside.
 const LATER: &str = "later";
 
-/// The same of a best one that is damaged.
+/// The extension of a damaged best checkpoint that was set aside.
 const DAMAGED: &str = "damaged";
 
 /// The folder `checkpoints` of a run.
@@ -28,17 +29,17 @@ impl Checkpoints {
         Self { folder: run.join("checkpoints") }
     }
 
-    /// Where they are.
+    /// Returns the path of the folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// The newest one.
+    /// Returns the path of the newest checkpoint.
     pub fn latest(&self) -> PathBuf {
         self.folder.join(LATEST)
     }
 
-    /// The one that scored best.
+    /// Returns the path of the checkpoint that scored best.
     pub fn best(&self) -> PathBuf {
         self.folder.join(BEST)
     }
@@ -47,20 +48,20 @@ impl Checkpoints {
         self.folder.join(format!("iteration-{iteration:08}.safetensors"))
     }
 
-    /// Writes the checkpoint of an iteration, calls it the latest, and then removes all but the newest `keep`.
+    /// Writes the checkpoint of an iteration, makes it the latest, and then removes all but the newest `keep`.
     ///
     /// # Errors
-    /// A place that cannot be written to; what was there before is still there then.
+    /// Fails if the checkpoint cannot be written; the earlier ones are kept then.
     pub fn write(&self, iteration: u64, bytes: &[u8], keep: usize) -> Result<()> {
         self.create_folder()?;
         let path = self.of_iteration(iteration);
         write_whole(&path, bytes)?;
         name_also(&path, &self.latest())?;
-        // Later ones are there when an earlier one was resumed from. They must not be gone on from any more, as the logs go on
-        // from here; but whoever has named the wrong file can still have them back.
+        // Later checkpoints exist if the run was resumed from an earlier one. They must not be resumed from, since the logs
+        // continue from here, but users who gave the wrong file can still recover them.
         let (later, earlier): (Vec<_>, Vec<_>) = self.numbered().into_iter().partition(|(of, _)| *of > iteration);
         for (_, path) in earlier.into_iter().skip(keep) {
-            // One too many does no harm.
+            // Best effort: one checkpoint too many is harmless.
             let _ = fs::remove_file(path);
         }
         for (_, path) in later {
@@ -70,19 +71,19 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// Writes the one that scored best.
+    /// Writes the checkpoint that scored best.
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the checkpoint cannot be written.
     pub fn write_best(&self, bytes: &[u8]) -> Result<()> {
         self.create_folder()?;
         write_whole(&self.best(), bytes)
     }
 
-    /// Puts a best one aside that is not to be used any more; where it is then.
+    /// Sets a damaged best checkpoint aside, so that it is no longer used, and returns its new path.
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the file cannot be renamed.
     pub fn put_best_aside(&self) -> Result<PathBuf> {
         let aside = unused_name(&self.best().with_extension(DAMAGED));
         fs::rename(self.best(), &aside).with_context(|| format!("cannot rename {}", self.best().display()))?;
@@ -94,8 +95,9 @@ impl Checkpoints {
         created.with_context(|| format!("cannot create {}", self.folder.display()))
     }
 
-    /// All that may be gone on from, the newest first. `latest` is one of the others under a second name, or, where there are no
-    /// second names, a copy; it is older than the newest if the program ended just before it was made.
+    /// Returns all checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
+    /// copy if the file system does not support hard links. It is older than the newest if the program ended just before updating
+    /// it.
     pub fn newest_first(&self) -> Vec<PathBuf> {
         let mut found: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
         let latest = self.latest();
@@ -107,12 +109,12 @@ impl Checkpoints {
         found
     }
 
-    /// How many of them there are.
+    /// Returns the number of checkpoints, not counting `latest` and `best`.
     pub fn count(&self) -> usize {
         self.numbered().len()
     }
 
-    /// Those of iterations, the newest first.
+    /// Returns the checkpoints named after iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
         let entries = fs::read_dir(&self.folder).into_iter().flatten().flatten();
         let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
@@ -126,7 +128,7 @@ impl Checkpoints {
         numbered
     }
 
-    /// Whether a run has been here.
+    /// Whether a run has saved anything here.
     pub(super) fn begun(&self) -> bool {
         self.best().exists() || !self.newest_first().is_empty()
     }
@@ -160,10 +162,10 @@ mod tests {
         );
         let newest: Vec<PathBuf> = checkpoints.newest_first();
         assert!(newest.len() == 2 && newest[0].ends_with(kept[1]) && newest[1].ends_with(kept[0]), "{newest:?}");
-        // A crash just before the new one is called the latest.
+        // A crash just before the new one becomes the latest.
         fs::write(checkpoints.of_iteration(80), "newer").unwrap();
         assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(80));
-        // A copy, as of a folder that was moved to where there are no second names.
+        // A copy, as in a folder that was moved to a file system without hard links.
         fs::remove_file(checkpoints.latest()).unwrap();
         std::thread::sleep(std::time::Duration::from_millis(20));
         fs::write(checkpoints.latest(), "copy").unwrap();
@@ -191,7 +193,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let checkpoints = Checkpoints::of(place.path());
         checkpoints.write(20, b"good", 1).unwrap();
-        // A folder in its place cannot be replaced, whoever the user is.
+        // A folder with this name cannot be replaced, not even by root.
         fs::create_dir(checkpoints.of_iteration(40)).unwrap();
         assert!(checkpoints.write(40, b"bad", 1).is_err());
         assert_eq!(fs::read(checkpoints.latest()).unwrap(), b"good");

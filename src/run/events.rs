@@ -1,7 +1,7 @@
-//! TensorBoard event files, from the parts of tensorboard-rs that return their errors.
+//! TensorBoard event files, written with those parts of tensorboard-rs that return errors.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{BufReader, BufWriter, ErrorKind, Read};
+use std::io::{BufReader, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -13,30 +13,28 @@ use tensorboard_rs::record_writer::RecordWriter;
 
 use super::file::expect_named;
 use super::output::{make_own, sync_folder};
+use super::records::length_up_to;
 
-/// How the names of event files begin and end.
+/// The prefix and the suffix of the names of event files.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
 
-/// No event of ours is larger; what claims to be is damaged.
-const LARGEST: u64 = 1 << 20;
-
-/// An event file that is being written.
-pub struct EventFile {
+/// An event file being written.
+pub(super) struct EventFile {
     path: PathBuf,
-    /// The same as the writer's.
+    /// The file that `writer` writes to.
     file: File,
     writer: RecordWriter<BufWriter<File>>,
 }
 
 impl EventFile {
-    /// A new event file in `folder`. TensorBoard reads all such files of a folder as one run, in the order of their names,
-    /// and forgets what earlier ones say of `first_step` and later.
+    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,
+    /// and discards values from earlier files at `first_step` and later.
     ///
     /// # Errors
-    /// A file that cannot be written.
-    pub fn create(folder: &Path, first_step: u64) -> Result<Self> {
+    /// Fails if the file cannot be written.
+    pub(super) fn create(folder: &Path, first_step: u64) -> Result<Self> {
         let [begin, end] = NAME;
-        // Readers take the files in the order of their names, and clocks are not to be relied on.
+        // Readers take the files in the order of their names, and clocks are unreliable.
         let mut seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
         let (path, file) = loop {
             let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
@@ -67,11 +65,11 @@ impl EventFile {
         self.write(start, first_step)
     }
 
-    /// Adds the values of one step and flushes; values that are `NaN` are left out.
+    /// Adds the values of one step and flushes. `NaN` values are left out.
     ///
     /// # Errors
-    /// A file that cannot be written.
-    pub fn scalars(&mut self, step: u64, values: &[(impl AsRef<str>, f64)]) -> Result<()> {
+    /// Fails if the file cannot be written.
+    pub(super) fn scalars(&mut self, step: u64, values: &[(impl AsRef<str>, f64)]) -> Result<()> {
         let mut summary = Summary::new();
         for (tag, number) in values.iter().filter(|(_, number)| !number.is_nan()) {
             let mut value = Summary_Value::new();
@@ -92,26 +90,26 @@ impl EventFile {
         written.with_context(|| format!("cannot write {}", self.path.display()))
     }
 
-    /// Makes sure that all events are on the disk, where they can be found.
+    /// Ensures that all events are on the disk, in a file that still has its name.
     ///
     /// # Errors
-    /// A file that cannot be written, or was deleted.
-    pub fn sync(&self) -> Result<()> {
+    /// Fails if the file cannot be written, or was deleted.
+    pub(super) fn sync(&self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         self.file.sync_data().with_context(|| format!("cannot write {}", self.path.display()))
     }
 }
 
-/// Cuts off, in every event file of `folder`, what comes after `last_step`, and what a crash left half written: so no reader
-/// finds a step twice.
+/// Cuts off the events after `last_step`, and those that a crash left incomplete, in every event file of `folder`, so that no
+/// reader finds a step twice.
 ///
 /// # Errors
-/// A file that cannot be read or written.
-pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
+/// Fails if a file cannot be read or written.
+pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     for (_, path) in event_files(folder)? {
         let cut = || {
             let file = File::open(&path)?;
-            let kept = length_up_to(&file, last_step)?;
+            let kept = length_up_to(BufReader::new(&file), last_step)?;
             if kept == file.metadata()?.len() {
                 return Ok(());
             }
@@ -123,41 +121,21 @@ pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     Ok(())
 }
 
-/// Our event files in `folder`, with the second in their names.
+/// Returns this program's event files in `folder`, each with the seconds in its name.
 fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
     let ours = entries.flatten().filter_map(|entry| {
         let name = entry.file_name();
         let (seconds, _) = name.to_str()?.strip_prefix(begin)?.strip_suffix(end)?.split_once('.')?;
-        // Far from the end of all numbers.
+        // Bounded, so that adding to it cannot overflow.
         let seconds = seconds.parse().ok().filter(|&seconds: &u64| seconds < 1 << 40)?;
         Some((seconds, entry.path()))
     });
     Ok(ours.collect())
 }
 
-/// The bytes of the whole events up to `last_step`; steps do not go back within a file.
-fn length_up_to(file: &File, last_step: u64) -> std::io::Result<u64> {
-    let (mut reader, mut length) = (BufReader::new(file), 0);
-    loop {
-        // A record: length, its checksum, the event, its checksum.
-        let (mut header, mut event) = ([0; 12], Vec::new());
-        let whole = match reader.read_exact(&mut header) {
-            Err(error) if error.kind() == ErrorKind::UnexpectedEof => return Ok(length),
-            result => result.map(|()| u64::from_le_bytes(*header.first_chunk().expect("8 of 12 bytes")))?,
-        };
-        if whole > LARGEST || reader.by_ref().take(whole + 4).read_to_end(&mut event)? as u64 != whole + 4 {
-            return Ok(length);
-        }
-        match Event::parse_from_bytes(&event[..whole as usize]) {
-            Ok(event) if event.get_step() <= last_step as i64 => length += 16 + whole,
-            _ => return Ok(length),
-        }
-    }
-}
-
-/// Seconds since 1970.
+/// Returns the seconds since 1970.
 fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
@@ -190,7 +168,7 @@ mod tests {
             let steps: Vec<i64> = read(&path)[2..].iter().map(Event::get_step).collect();
             assert_eq!(steps, (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>());
         }
-        // A second file of the same second and program.
+        // A second file of the same second and process.
         let more = EventFile::create(place.path(), 21).unwrap();
         assert_ne!(more.path, path);
     }

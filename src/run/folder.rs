@@ -1,4 +1,4 @@
-//! The folder of a run and what lies in it.
+//! The folder of a run and its files.
 
 use std::ffi::OsString;
 use std::fs::{self, DirEntry};
@@ -13,14 +13,14 @@ use super::file::{read_text, same_file};
 use super::lock::{LOCK, Locked};
 use super::output::{OUR_PARTIAL, PARTIAL, is_abandoned, sync_folder, write_whole};
 
-/// Where runs go when nothing else is said.
+/// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";
 
 const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
 const DIVERGED: &str = "diverged";
-/// How the names of a run's files begin.
+/// The prefixes of the names of a run's files.
 const OURS: [&[u8]; 9] = [
     b"config.toml",
     b"version.txt",
@@ -33,21 +33,21 @@ const OURS: [&[u8]; 9] = [
     b"diverged",
 ];
 
-/// Files in the folder `diverged`; whoever has so many needs no more to find the cause, but may need the disk.
+/// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
 pub(super) const METRICS: &str = "metrics.csv";
 
-/// `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
+/// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
 #[derive(Clone, Debug)]
 pub struct RunFolder {
     path: PathBuf,
 }
 
 impl RunFolder {
-    /// A new run's folder: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
+    /// Creates the folder of a new run: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
     ///
     /// # Errors
-    /// A folder that already holds a run, or cannot be written to.
+    /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
         let path = match path {
             Some(path) => path.to_owned(),
@@ -58,21 +58,21 @@ impl RunFolder {
         let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
         created.with_context(|| format!("cannot create the run folder {}", run.path.display()))?;
         let lock = run.lock()?;
-        // Another training may have begun and ended meanwhile.
+        // Another training run may have started and ended in the meantime.
         run.expect_free(Some(LOCK))?;
         run.checkpoints().create_folder()?;
         let lock = run.claim(lock)?;
         Ok((run, lock))
     }
 
-    /// Makes sure that nothing of a run is in the folder, `but` for this, and that it is not a folder of one.
+    /// Checks that the folder contains nothing of a run except the file `but`, and that it does not lie inside a run.
     fn expect_free(&self, but: Option<&str>) -> Result<()> {
         let mut names = self.entries()?.into_iter().map(|entry| entry.file_name());
-        // A trace that was never finished is not of a run.
+        // An unfinished trace does not belong to a run.
         let of_a_run = |name: &OsString| !name.as_encoded_bytes().starts_with(OUR_PARTIAL.as_bytes());
         if let Some(name) = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but)) {
             bail!(
-                "{} already holds a run, or a part of one ({}); resume it with --resume, or name another folder",
+                "{} already holds a run, or part of one ({}); resume it with --resume, or choose another folder",
                 self.path.display(),
                 name.to_string_lossy()
             );
@@ -87,17 +87,17 @@ impl RunFolder {
         Ok(())
     }
 
-    /// A new run folder among the temporary files, where its own cannot be written to.
+    /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
         let context = || format!("cannot create a folder in {}", std::env::temp_dir().display());
         Ok(Self { path: folder.with_context(context)?.keep() })
     }
 
-    /// Removes what a run that could not begin has made in its folder, and the folder if nothing else is in it.
+    /// Removes the files of a run that could not start, and its folder if nothing else is in it.
     pub fn clear(&self) {
         for entry in self.entries().into_iter().flatten() {
             let _ = fs::remove_file(entry.path());
@@ -112,12 +112,13 @@ impl RunFolder {
         let _ = fs::remove_dir_all(self.path);
     }
 
-    /// The folder of an existing run that `place` is, or whose checkpoints it is, or that the checkpoint `place` lies in.
+    /// Returns the existing run folder that `place` belongs to: `place` is the folder itself, its checkpoints folder, or a
+    /// checkpoint in it.
     ///
     /// # Errors
-    /// Nothing there, or a file outside a run folder.
+    /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
-        ensure!(place.exists(), "{}: there is no such run folder or checkpoint", place.display());
+        ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
         let path = if place.is_dir() {
             run_of(place)
         } else {
@@ -131,23 +132,24 @@ impl RunFolder {
         Ok(Self { path })
     }
 
-    /// Keeps every other training out of it for as long as the result lives; changes nothing in it.
+    /// Locks the folder against other training processes for as long as the result lives. Creates the lock file if it is
+    /// missing, and changes nothing else.
     ///
     /// # Errors
-    /// Another training uses it, or it cannot be written to.
+    /// Fails if another training process uses the folder, if it contains a link, or if it cannot be written to.
     pub fn lock(&self) -> Result<Locked> {
         self.expect_plain()?;
         Locked::take(&self.path)
     }
 
-    /// Begins to write into a folder that is locked: removes what a crash in the middle of writing left.
+    /// Prepares a locked folder for writing: removes files that a crash left incomplete, and signs the lock.
     ///
     /// # Errors
-    /// A folder that cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn claim(&self, lock: Locked) -> Result<Locked> {
         for entry in self.entries()? {
             let (path, name) = (entry.path(), entry.file_name());
-            // Those of 0.1.0 had the name of the file that they were to become.
+            // 0.1.0 named incomplete files after the files that they would become.
             let left = path.extension().is_some_and(|extension| extension == PARTIAL);
             if left && (is_abandoned(&name.to_string_lossy()) || !name.as_encoded_bytes().starts_with(b".")) {
                 fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
@@ -156,21 +158,22 @@ impl RunFolder {
         lock.sign()
     }
 
-    /// Makes sure that nothing in the folder leads out of it: it may come from somebody else, and will be written into.
+    /// Checks that nothing in the folder links out of it: the folder is untrusted, and will be written to.
     fn expect_plain(&self) -> Result<()> {
         for entry in self.entries()? {
             let path = entry.path();
             let kind = entry.file_type().with_context(|| format!("cannot read {}", path.display()))?;
             ensure!(
                 kind.is_file() || kind.is_dir(),
-                "{}: neither a file nor a folder; no link in a run folder is followed",
+                "{}: neither a file nor a folder; links in a run folder are not followed",
                 path.display()
             );
         }
         Ok(())
     }
 
-    /// What lies in it under the names of a run's files; there may be other things beside.
+    /// Returns the files of the run: those with the names of a run's files, and all in `checkpoints` and `diverged`. Other files
+    /// in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let begins: Vec<&[u8]> = OURS.into_iter().chain([OUR_PARTIAL.as_bytes()]).collect();
         let mut found = Vec::new();
@@ -191,25 +194,25 @@ impl RunFolder {
         Ok(found)
     }
 
-    /// Where it is.
+    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Its checkpoints.
+    /// Returns its checkpoints.
     pub fn checkpoints(&self) -> Checkpoints {
         Checkpoints::of(&self.path)
     }
 
-    /// The best policy, or the latest where none was scored yet, alone.
+    /// Returns the path of the policy without its training state: the best one, or the latest if none was scored yet.
     pub fn policy(&self) -> PathBuf {
         self.path.join(POLICY)
     }
 
-    /// Writes what led to a diverged state, unless there are very many of these already.
+    /// Writes a report of what led to a diverged state, unless there are very many already.
     ///
     /// # Errors
-    /// A folder that cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn dump(&self, name: &str, text: &str) -> Result<()> {
         let folder = self.path.join(DIVERGED);
         fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
@@ -219,19 +222,19 @@ impl RunFolder {
         write_whole(&folder.join(name), text.as_bytes())
     }
 
-    /// The configuration as it stands in the folder, with its file; `None` if it is not there.
+    /// Returns the path and the text of the configuration in the folder; `None` if there is none.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if the file cannot be read.
     pub fn config(&self) -> Result<Option<(PathBuf, String)>> {
         let path = self.path.join(CONFIG);
         if path.exists() { read_text(&path).map(|text| Some((path, text))) } else { Ok(None) }
     }
 
-    /// Writes the configuration and the facts about the program, if they are not there.
+    /// Writes the configuration and the facts about the program, each only if the folder does not hold the same text already.
     ///
     /// # Errors
-    /// A folder that cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn describe(&self, config: &str, version: &str) -> Result<()> {
         for (name, text) in [(CONFIG, config), (VERSION, version)] {
             let path = self.path.join(name);
@@ -243,13 +246,14 @@ impl RunFolder {
     }
 }
 
-/// The checkpoint that `place` means: itself, or of a run folder its best, or its latest where there is none yet.
+/// Returns the checkpoint that `place` refers to: `place` itself, or the best checkpoint of a run folder, or its latest if
+/// there is no best one yet.
 ///
 /// # Errors
-/// Nothing there.
+/// Fails if there is no checkpoint.
 pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     if !place.is_dir() {
-        ensure!(place.exists(), "{}: there is no such checkpoint or run folder", place.display());
+        ensure!(place.exists(), "{}: no such checkpoint or run folder", place.display());
         return Ok(place.to_owned());
     }
     let checkpoints = RunFolder::containing(place)?.checkpoints();
@@ -257,31 +261,29 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
-/// The run that a folder is, or whose folder of checkpoints it is.
+/// Returns the run folder: `folder` itself, or its parent if `folder` is the checkpoints folder of a run.
 fn run_of(folder: &Path) -> PathBuf {
     let run = folder.canonicalize().ok().and_then(|whole| Some(whole.parent()?.to_owned()));
     let inside = run.filter(|run| same_file(Checkpoints::of(run).folder(), folder));
     inside.unwrap_or_else(|| folder.to_owned())
 }
 
-/// The checkpoint of the newest run that has one, if any does.
-pub fn newest_checkpoint() -> Option<PathBuf> {
+/// Returns the folder of the newest run that has a checkpoint, if any.
+pub fn newest_run() -> Option<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
-    // By the time of the latest checkpoint, so that a run that was resumed counts as new.
-    runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, resolve_checkpoint(&run.path).ok()?)))
-        .max()
-        .map(|(_, checkpoint)| checkpoint)
+    // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.
+    runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, run.path))).max().map(|(_, path)| path)
 }
 
 fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|facts| facts.modified()).ok()
 }
 
-/// Creates a folder for a run among the others, named by the time, that no other run has.
+/// Creates a run folder in the default folder of runs, under a name from the current time that no other run has.
 fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     let plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     let name = name.unwrap_or_default();
-    ensure!(name.chars().all(plain), "--name {name}: may hold letters, digits, `-`, `_` and `.` only");
+    ensure!(name.chars().all(plain), "--name {name}: may contain only letters, digits, `-`, `_` and `.`");
     fs::create_dir_all(RUNS).with_context(|| format!("cannot create the folder of runs {RUNS}"))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
     let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
@@ -296,7 +298,7 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
             }
         }
     }
-    unreachable!("the attempts do not end")
+    unreachable!("the number of attempts is unlimited")
 }
 
 #[cfg(test)]
@@ -323,10 +325,10 @@ mod tests {
             run.checkpoints().create_folder().unwrap();
             std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
-            assert!(refusal.contains(name) && refusal.contains("no link"), "{refusal}");
+            assert!(refusal.contains(name) && refusal.contains("not followed"), "{refusal}");
             fs::remove_dir_all(&run.path).unwrap();
         }
-        // One that is laid later is replaced, not written through.
+        // A link that appears later is replaced, not written through.
         std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
         RunFolder { path: place.path().into() }.describe("a = 1", "1").unwrap();
         assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
@@ -345,7 +347,7 @@ mod tests {
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
         let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        // As 0.1.0 named it, and now.
+        // The names that 0.1.0 and this version use.
         let left = ["iteration-00000020.safetensors.partial", ".shadow-repose-999999999-0.partial"];
         let left = left.map(|name| run.checkpoints().folder().join(name));
         left.iter().for_each(|half| fs::write(half, "half").unwrap());
@@ -354,7 +356,7 @@ mod tests {
         assert!(run.checkpoints().newest_first().is_empty());
         drop(lock);
         let lock = run.lock().unwrap();
-        assert!(left.iter().all(|half| half.exists()), "who only looks changes nothing");
+        assert!(left.iter().all(|half| half.exists()), "locking alone removes nothing");
         run.claim(lock).unwrap();
         assert!(!left.iter().any(|half| half.exists()) && living.exists());
     }

@@ -1,6 +1,7 @@
-//! Signals and the time limit: what asks the program to save and stop, or to save and go on. Whoever asks twice to stop, or where
-//! there is nothing to be saved, ends it at once.
+//! Signals and the time limit, which request the program to save and stop, or to save and continue. A second request to stop, or
+//! one while there is nothing to save, ends the program at once.
 
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::thread;
@@ -14,37 +15,39 @@ use signal_hook::low_level::{emulate_default_handler, exit};
 use super::output::remove_unfinished;
 use super::pip;
 
-/// A terminal that is closed sends SIGHUP twice, and some schedulers send SIGTERM and SIGHUP: within this time they are one
-/// request.
+/// Signals within this time are one request to stop: a terminal that is closed sends SIGHUP twice, and some schedulers send both
+/// SIGTERM and SIGHUP.
 const ONE_REQUEST: Duration = Duration::from_secs(1);
 
-/// Who forwards Ctrl-C to a program and to its group sends it twice; who presses it twice takes longer.
+/// The same for SIGINT. Wrappers that forward Ctrl-C to a program and to its group send it twice; a user who presses it twice
+/// takes longer.
 const ONE_KEY: Duration = Duration::from_millis(200);
 
-/// What has been asked for since the program began to listen.
+/// The requests since the program began to listen.
 #[derive(Clone, Debug)]
 pub struct Requests {
     since: Instant,
-    /// The first request to stop is waited for; before that is said, it ends the program at once.
+    /// Whether the program ends by itself after the first request to stop; until this is set, a request ends it at once.
     patient: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
-    /// Which signal asked to stop, or 0.
+    /// The signal that requested the stop, or 0.
     signal: Arc<AtomicI32>,
     save: Arc<AtomicBool>,
 }
 
 impl Requests {
-    /// What nobody can ask anything of.
+    /// Returns requests that never arrive.
     pub fn none() -> Self {
         let (patient, stop, signal, save) = Default::default();
         Self { since: Instant::now(), patient, stop, signal, save }
     }
 
-    /// Catches SIGINT, SIGTERM and SIGHUP from now on, and SIGUSR1 where it is a request to save; not what was ignored when the
-    /// program began, as SIGHUP is under `nohup`. A file that grows beyond its limit (SIGXFSZ) is an error like a full disk.
+    /// Catches SIGINT, SIGTERM and SIGHUP from now on, and, if the program `saves`, SIGUSR1 as a request to save. Signals that
+    /// were ignored when the program started stay ignored, e.g. SIGHUP under `nohup`. A file that grows beyond its limit
+    /// (SIGXFSZ) is an error like a full disk.
     ///
     /// # Errors
-    /// A handler or a thread that the system refuses.
+    /// Fails if the system refuses a handler or a thread.
     pub fn listen(saves: bool) -> Result<Self> {
         let requests = Self::none();
         let mut caught = vec![SIGINT, SIGTERM, SIGHUP];
@@ -59,7 +62,7 @@ impl Requests {
         Ok(requests)
     }
 
-    /// From now on the program looks for requests, and ends by itself.
+    /// Declares that from now on the program checks for requests and ends by itself.
     pub fn wait_for_end(&self) {
         self.patient.store(true, Ordering::Relaxed);
     }
@@ -77,7 +80,7 @@ impl Requests {
                 pip::stop();
                 remove_unfinished();
                 if !saves {
-                    // As a program that never caught it: who started it sees what ended it.
+                    // Ends like a program that never caught the signal, so that the parent process sees the cause.
                     let _ = emulate_default_handler(signal);
                 }
                 exit(128 + signal);
@@ -90,23 +93,23 @@ impl Requests {
         }
     }
 
-    /// Set when the program was asked to stop.
+    /// Returns the flag that is set when the program is requested to stop.
     pub fn stop(&self) -> &AtomicBool {
         &self.stop
     }
 
-    /// The exit code that tells what asked to stop: 128 and the signal's number, or 0 for the time limit.
-    pub fn exit_code(&self) -> u8 {
+    /// Returns the exit code for the cause of the stop: 128 plus the signal's number, or 0 for the time limit.
+    pub fn exit_code(&self) -> ExitCode {
         match self.signal.load(Ordering::Relaxed) {
-            0 => 0,
-            signal => 128 + signal as u8,
+            0 => ExitCode::SUCCESS,
+            signal => ExitCode::from(128 + signal as u8),
         }
     }
 
-    /// Asks to stop when the program has listened for this time.
+    /// Requests a stop when the program has listened for this time.
     ///
     /// # Errors
-    /// A thread that the system refuses.
+    /// Fails if the system refuses a thread.
     pub fn stop_after(&self, limit: Duration) -> Result<()> {
         let (stop, left) = (self.stop.clone(), limit.saturating_sub(self.since.elapsed()));
         let clock = thread::Builder::new().name("time limit".into()).spawn(move || {
@@ -116,13 +119,13 @@ impl Requests {
         clock.map(drop).context("cannot start a thread for the time limit")
     }
 
-    /// Whether it was asked to save since the last call.
+    /// Returns whether a save was requested since the last call.
     pub fn take_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
     }
 }
 
-/// The signals that were ignored when the program began, as bits: whoever starts it so means it to be left alone by them.
+/// Returns the signals that were ignored when the program started, as bits. They stay ignored, as the caller intended.
 fn ignored() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

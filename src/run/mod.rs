@@ -1,4 +1,4 @@
-//! The outside of a run: its folder, its logs, the terminal, signals. Knows neither environments nor learning.
+//! The I/O of a run: its folder, its logs, the terminal, signals. Independent of environments and learning.
 
 mod chart;
 mod checkpoints;
@@ -14,20 +14,21 @@ mod metrics;
 mod output;
 mod pip;
 mod progress;
+mod records;
 mod report;
 
-pub use chart::{Chart, Curve, Panel};
+pub use chart::{Chart, Curve, Subplot};
 pub use checkpoints::Checkpoints;
 pub use file::{read_bytes, read_text, same_file};
 #[cfg(feature = "video")]
 pub use film::{FilmFormat, FilmWriter, write_png};
-pub use folder::{RunFolder, newest_checkpoint, resolve_checkpoint};
+pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use interrupt::Requests;
 pub use lock::Locked;
 pub use meshes::hand_meshes;
 pub use metrics::read_metrics;
 pub use output::{OutputFile, expect_folder, write_whole};
-pub use progress::{Bar, Progress, Status};
+pub use progress::{Bar, Status, StatusLine};
 pub use report::Report;
 
 use std::io::{ErrorKind, Write};
@@ -35,10 +36,10 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, ensure};
 
-/// Prints text on stdout; a reader that has gone away is no error.
+/// Prints text to stdout. A closed pipe is not an error.
 ///
 /// # Errors
-/// A place that cannot be written to, as a full disk.
+/// Fails if stdout cannot be written to, e.g. on a full disk.
 pub fn print(text: &str) -> Result<()> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
@@ -47,7 +48,7 @@ pub fn print(text: &str) -> Result<()> {
     }
 }
 
-/// Prints a line on stderr. What it quotes may come from a file of somebody else, and must not steer the terminal.
+/// Prints a line to stderr. Control characters are escaped, since the line may quote an untrusted file.
 pub fn say(line: &str) {
     let mut harmless = String::with_capacity(line.len() + 1);
     for c in line.chars() {
@@ -60,7 +61,7 @@ pub fn say(line: &str) {
     let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
 }
 
-/// A text as one word for a shell.
+/// Returns a text as a single shell word, quoted if necessary.
 pub fn quoted(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
     if !text.is_empty() && text.chars().all(plain) {
@@ -70,39 +71,49 @@ pub fn quoted(text: &str) -> String {
     }
 }
 
-/// A path as one word for a shell, also where its name is no text.
+/// Returns a path as a single shell word, even if it is not valid UTF-8.
 pub fn quoted_path(path: &Path) -> String {
     path.to_str().map_or_else(
         || {
             let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
-            // Of the escapes only this one means something else there.
+            // The only one of these escapes that means something else in a shell.
             format!("$'{}'", escaped.replace("\\\"", "\""))
         },
         quoted,
     )
 }
 
-/// Whether there is a display that a window could open on.
+/// Returns how the user has called this program, for commands that are printed: by cargo, by a path, or by its name.
+pub fn called_as() -> String {
+    let exe = std::env::current_exe().unwrap_or_default();
+    if std::env::var_os("CARGO_PKG_NAME").is_some_and(|name| name == env!("CARGO_PKG_NAME")) {
+        let is_release = exe.components().any(|part| part.as_os_str() == "release");
+        return format!("cargo run {}--", if is_release { "--release " } else { "" });
+    }
+    std::env::args_os().next().map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
+}
+
+/// Whether there is a display on which a window could open.
 pub fn has_display() -> bool {
     ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
 }
 
-/// More worker threads for each core than this only take turns.
+/// The most worker threads per core; more would only take turns.
 const MOST_THREADS: usize = 16;
 
-/// Gives rayon, and with it every part of the program, this many worker threads (0: one for every core); once.
+/// Starts rayon's global pool, which the whole program uses, with this number of worker threads (0: one per core).
 ///
 /// # Errors
-/// More of them than make sense; threads that the system refuses.
+/// Fails if the number is too large, if the system refuses the threads, or on a second call.
 pub fn start_threads(threads: usize) -> Result<()> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let most = MOST_THREADS * cores;
     ensure!(
         threads <= most,
-        "{threads} worker threads: at most {most} here, {MOST_THREADS} for each core; --threads sets them"
+        "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core; set --threads"
     );
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-    // Its text has the one of its source in it.
+    // The text of this error already contains that of its source.
     pool.build_global().map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
 }
 

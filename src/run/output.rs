@@ -1,6 +1,6 @@
-//! Files that are written whole or not at all: they have another name until they are complete.
+//! Files that are written completely or not at all: they have a temporary name until they are complete.
 //!
-//! No two programs share such a name, and what is unfinished when the program ends is removed.
+//! No two processes share a temporary name, and unfinished files are removed when the program ends.
 
 use std::collections::BTreeSet;
 use std::collections::hash_map::RandomState;
@@ -17,41 +17,40 @@ use anyhow::{Context, Result, bail, ensure};
 use super::file::read_bytes;
 use super::quoted_path;
 
-/// How the name of a file ends that is not complete yet.
-pub const PARTIAL: &str = "partial";
+/// The extension of a file that is not complete yet.
+pub(super) const PARTIAL: &str = "partial";
 
-/// How it begins; then the number of the process follows.
-pub const OUR_PARTIAL: &str = ".shadow-repose-";
+/// The prefix of its name, followed by the process id.
+pub(super) const OUR_PARTIAL: &str = ".shadow-repose-";
 
-/// The most links that are followed from one to the next.
+/// The most consecutive symbolic links that are followed.
 const MOST_LINKS: usize = 40;
 
-/// What this process has not finished.
+/// The files and folders that this process has not finished.
 static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// A file or folder that is removed when this is dropped, or when the program is ended by a signal; unless it has another name
-/// by then.
+/// A file or folder that is removed when this is dropped or when a signal ends the program, unless it has been renamed by then.
 #[derive(Debug)]
-pub struct Unfinished {
+pub(super) struct Unfinished {
     path: PathBuf,
 }
 
 impl Unfinished {
-    /// Something to be made there.
-    pub fn new(path: PathBuf) -> Self {
+    /// Registers a path where something is about to be created.
+    pub(super) fn new(path: PathBuf) -> Self {
         UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
         Self { path }
     }
 
-    /// Something in the folder of a file that it is to become, under a name that nothing else has.
-    pub fn beside(path: &Path) -> Self {
-        // Processes on several machines may have one number.
+    /// Registers a unique name in the same folder as the final `path`.
+    pub(super) fn beside(path: &Path) -> Self {
+        // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
         Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.{PARTIAL}", std::process::id())))
     }
 
-    /// Where it is.
-    pub fn path(&self) -> &Path {
+    /// Returns its path.
+    pub(super) fn path(&self) -> &Path {
         &self.path
     }
 }
@@ -64,8 +63,8 @@ impl Drop for Unfinished {
     }
 }
 
-/// Removes all that this process has not finished, before it ends at once; nothing can be begun after it.
-pub fn remove_unfinished() {
+/// Removes everything that this process has not finished, just before it exits. Nothing can be started afterwards.
+pub(super) fn remove_unfinished() {
     let unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
     unfinished.iter().for_each(|path| remove(path));
     std::mem::forget(unfinished);
@@ -76,28 +75,28 @@ fn remove(path: &Path) {
     let _ = fs::remove_dir_all(path);
 }
 
-/// Whether a name is one of an unfinished file whose process has ended.
-pub fn is_abandoned(name: &str) -> bool {
+/// Whether a name is that of an unfinished file whose process has ended.
+pub(super) fn is_abandoned(name: &str) -> bool {
     let rest = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
     rest.is_some_and(|(process, _)| !Path::new("/proc").join(process).exists())
 }
 
-/// A file to be written, in a place that is known to be writable. Devices and pipes are written to directly.
+/// A file to be written, at a path that is known to be writable. Devices and pipes are written to directly.
 #[derive(Debug)]
 pub struct OutputFile {
-    /// As the user has named it.
+    /// The path as the user gave it.
     path: PathBuf,
     file: File,
-    /// The name that it has until it is complete, and the one that it gets.
+    /// The temporary name and the final one.
     names: Option<(Unfinished, PathBuf)>,
 }
 
 impl OutputFile {
-    /// Opens a place that the user has named; what is there stays until the file is complete. A link stays a link: what it leads
-    /// to is written.
+    /// Opens a path given by the user. An existing file stays until the new one is complete. A symbolic link stays: its target is
+    /// written.
     ///
     /// # Errors
-    /// A place that cannot be written to; a folder that is not there, with how to make it.
+    /// Fails if the path cannot be written to. If its folder does not exist, the message says how to create it.
     pub fn create(path: &Path) -> Result<Self> {
         let context = || format!("cannot write {}", path.display());
         let direct = |file: File| Self { path: path.to_owned(), file, names: None };
@@ -106,7 +105,7 @@ impl OutputFile {
             Ok(facts) if !facts.is_file() => {
                 return OpenOptions::new().write(true).open(path).map(direct).with_context(context);
             }
-            // A link to a stream of this program, such as /dev/stdout: both write at one place, one after the other.
+            // A link to a stream of this process, such as /dev/stdout: both share a file offset, so neither overwrites the other.
             Ok(facts) if path.is_symlink() => {
                 let (out, err) = (io::stdout(), io::stderr());
                 for stream in [out.as_fd(), err.as_fd()] {
@@ -120,10 +119,10 @@ impl OutputFile {
         Self::named(path, end_of_links(path).with_context(context)?)
     }
 
-    /// Opens a place of the program's own: what has this name is replaced, even if it is a link.
+    /// Opens a path of the program's own. Whatever has this name is replaced, even a symbolic link.
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the path cannot be written to.
     pub fn replacing(path: &Path) -> Result<Self> {
         Self::named(path, path.to_owned())
     }
@@ -135,20 +134,20 @@ impl OutputFile {
         Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) })
     }
 
-    /// Writes the content and gives the file its name.
+    /// Writes the content and gives the file its final name.
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the file cannot be written.
     pub fn finish(mut self, bytes: &[u8]) -> Result<()> {
         let written = self.file.write_all(bytes);
         written.with_context(|| format!("cannot write {}", self.path.display()))?;
         self.complete()
     }
 
-    /// Gives the file its name, with what was written to it through [`std::io::Write`].
+    /// Gives the file its final name, after its content was written through [`std::io::Write`].
     ///
     /// # Errors
-    /// A place that cannot be written to.
+    /// Fails if the file cannot be written.
     pub fn complete(self) -> Result<()> {
         let complete = || {
             if let Some((unfinished, target)) = &self.names {
@@ -161,12 +160,12 @@ impl OutputFile {
         complete().with_context(|| format!("cannot write {}", self.path.display()))
     }
 
-    /// As the user has named it.
+    /// Returns the path as the user gave it.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether another one would be the same file.
+    /// Whether the path `other` leads to the same file.
     pub fn is_of(&self, other: &Path) -> bool {
         let target = |path: &Path| {
             end_of_links(path)
@@ -177,19 +176,19 @@ impl OutputFile {
     }
 }
 
-/// Writes a file of the program's own so that whoever looks finds the whole old one or the whole new one.
+/// Writes one of the program's own files atomically: a reader finds either the whole old file or the whole new one.
 ///
 /// # Errors
-/// A place that cannot be written to.
+/// Fails if the file cannot be written.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     OutputFile::replacing(path)?.finish(bytes)
 }
 
-/// Gives a file another name as well, in place of whatever has it. Where the file system knows no second names, it is a copy.
+/// Gives a file a second name, replacing whatever has it. Makes a copy if the file system does not support hard links.
 ///
 /// # Errors
-/// A place that cannot be written to.
-pub fn name_also(path: &Path, name: &Path) -> Result<()> {
+/// Fails if the second name cannot be created.
+pub(super) fn name_also(path: &Path, name: &Path) -> Result<()> {
     let unfinished = Unfinished::beside(name);
     if fs::hard_link(path, unfinished.path()).is_err() {
         return write_whole(name, &read_bytes(path)?);
@@ -198,32 +197,32 @@ pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     named.with_context(|| format!("cannot write {}", name.display()))
 }
 
-/// Brings the name of a new file onto the disk: it is there once its folder is.
+/// Syncs the folder of a new file: the name of the file is on the disk only once its folder is.
 ///
 /// # Errors
-/// A folder that cannot be read, or a disk that fails.
-pub fn sync_folder(path: &Path) -> io::Result<()> {
+/// Fails if the folder cannot be read, or if the disk fails.
+pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
     match File::open(folder_of(path))?.sync_all() {
-        // Some network file systems cannot do this to folders, and do not need it.
+        // Some network file systems cannot sync folders, and do not need to.
         Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
         result => result,
     }
 }
 
-/// A name like this one that nothing has yet.
-pub fn unused_name(path: &Path) -> PathBuf {
+/// Returns `path`, or a numbered variant of it, that does not exist yet.
+pub(super) fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
     let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
     let free = |path: &PathBuf| fs::symlink_metadata(path).is_err();
-    std::iter::once(path.to_owned()).chain(names).find(free).expect("numbers do not end")
+    std::iter::once(path.to_owned()).chain(names).find(free).expect("the numbers are unlimited")
 }
 
-/// Gives a file that has other names too a content of its own: what is written into it from now on is seen nowhere else.
+/// Replaces a file that has other hard links with a copy, so that later writes to it do not change the others.
 ///
 /// # Errors
-/// A place that cannot be written to.
-pub fn make_own(path: &Path) -> io::Result<()> {
+/// Fails if the file cannot be written.
+pub(super) fn make_own(path: &Path) -> io::Result<()> {
     if fs::metadata(path).is_ok_and(|facts| facts.nlink() > 1) {
         let copy = Unfinished::beside(path);
         fs::copy(path, copy.path())?;
@@ -233,16 +232,16 @@ pub fn make_own(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Makes sure that there is a folder for a file that is to be written later.
+/// Checks that the folder of a file that is written later exists.
 ///
 /// # Errors
-/// There is none; how to make it.
+/// Fails if it does not; the message says how to create it.
 pub fn expect_folder(path: &Path) -> Result<()> {
     let folder = folder_of(path);
     let make = quoted_path(folder);
     ensure!(
         folder.is_dir(),
-        "cannot write {}: there is no folder {}; make it with\n  mkdir -p {make}",
+        "cannot write {}: the folder {} does not exist; create it with\n  mkdir -p {make}",
         path.display(),
         folder.display()
     );
@@ -253,7 +252,7 @@ fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// The place that a name leads to, link after link; nothing need be there.
+/// Follows symbolic links to the final path, which need not exist.
 fn end_of_links(path: &Path) -> io::Result<PathBuf> {
     let mut end = path.to_owned();
     for _ in 0..MOST_LINKS {
@@ -262,10 +261,10 @@ fn end_of_links(path: &Path) -> io::Result<PathBuf> {
             Err(_) => return Ok(end),
         }
     }
-    Err(io::Error::other("links that lead in a circle"))
+    Err(io::Error::other("too many levels of symbolic links"))
 }
 
-/// Whether a stream of this process writes into the file with these facts.
+/// Whether a stream of this process writes to the file with this metadata.
 fn is_open(stream: BorrowedFd, facts: &fs::Metadata) -> bool {
     let open = stream.try_clone_to_owned().and_then(|own| File::from(own).metadata());
     open.is_ok_and(|open| (open.dev(), open.ino()) == (facts.dev(), facts.ino()))
@@ -336,7 +335,7 @@ mod tests {
         let [link, other, target] = ["link", "other", "target"].map(|name| place.path().join(name));
         std::os::unix::fs::symlink("target", &other).unwrap();
         std::os::unix::fs::symlink(&other, &link).unwrap();
-        // Also where nothing is yet.
+        // Even if the target does not exist yet.
         for text in ["first", "second"] {
             OutputFile::create(&link).unwrap().finish(text.as_bytes()).unwrap();
             assert!(link.is_symlink() && other.is_symlink() && !target.is_symlink());
@@ -345,7 +344,7 @@ mod tests {
         OutputFile::replacing(&link).unwrap().finish(b"third").unwrap();
         assert!(
             !link.is_symlink() && content(&target) == "second",
-            "a place of the program's own is not written through"
+            "the program's own files are not written through links"
         );
         std::os::unix::fs::symlink("circle", place.path().join("circle")).unwrap();
         assert!(OutputFile::create(&place.path().join("circle")).is_err());

@@ -1,4 +1,4 @@
-//! Fetches wheels with pip, by package name and hash. Apart because the build script uses it too: it knows only the standard
+//! Fetches wheels with pip, by package name and hash. The build script includes this file too, so it uses only the standard
 //! library.
 
 use std::os::unix::process::CommandExt;
@@ -7,13 +7,14 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::{fs, io};
 
-/// Downloads the wheel `package` (as `name==version`) with this sha256 and unpacks it into `folder`, which is made anew.
+/// Downloads the wheel `package` (as `name==version`) with this sha256 and unpacks it into `folder`, which is recreated.
 ///
-/// `selection` are pip's options that choose between the wheels of a package.
+/// `selection` holds pip's options that choose between the wheels of a package.
 ///
 /// # Errors
-/// No python3 or pip, a package that cannot be reached or has another hash, a folder that cannot be written to.
-pub fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder: &Path) -> Result<(), String> {
+/// Fails if python3 or pip is missing, if the package cannot be reached or has another hash, or if the folder cannot be written
+/// to.
+pub(crate) fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder: &Path) -> Result<(), String> {
     let told = |error: io::Error| format!("{}: {error}", folder.display());
     let _ = fs::remove_dir_all(folder);
     fs::create_dir_all(folder).map_err(told)?;
@@ -38,12 +39,12 @@ pub fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder: &Path
     python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(folder))
 }
 
-/// The process that is at work, first of a group of its own (python3 may be a script that starts another), or 0.
+/// The id of the running process, or 0. It leads its own process group, since python3 may be a script that starts another one.
 static AT_WORK: AtomicU32 = AtomicU32::new(0);
 
-/// Ends the processes that are at work, if there are any: they would go on to write into their folder when this program has ended.
+/// Kills the running processes, if any: they would keep writing to their folder after this program has ended.
 #[allow(dead_code)]
-pub fn stop() {
+pub(crate) fn stop() {
     let id = AT_WORK.load(Ordering::Relaxed);
     if id != 0 {
         let _ = Command::new("kill").args(["-KILL", "--", &format!("-{id}")]).status();
@@ -69,5 +70,5 @@ fn python(command: &mut Command) -> Result<(), String> {
     let said = String::from_utf8_lossy(&output.stderr);
     let last: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).rev().take(3).collect();
     let last: Vec<&str> = last.into_iter().rev().collect();
-    Err(format!("python3 -m pip said: {}", last.join(" / ")))
+    Err(format!("python3 failed: {}", last.join(" / ")))
 }

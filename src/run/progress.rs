@@ -1,4 +1,4 @@
-//! How far a job has come, on the terminal: a line that is drawn again and again, or where that cannot be, plain lines.
+//! Progress on the terminal: a line that is redrawn in place, or plain lines if that is impossible.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -8,58 +8,60 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::say;
 
-/// Time between two plain lines.
+/// The time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
-/// Share of the newest value in the moving averages that are shown (not in what is logged).
+/// The weight of the newest value in the moving averages that are shown (logged values are not averaged).
 const SHOWN_SHARE: f64 = 0.1;
 
-/// Columns of a terminal that a line needs to be drawn again and again.
+/// The fewest columns of a terminal in which a line is redrawn.
 const NARROWEST: usize = 60;
 
-/// What is shown of an iteration; `NaN` where nothing is known.
+/// The values shown for an iteration; `NaN` if unknown.
 #[derive(Clone, Copy, Debug)]
 pub struct Status {
-    /// Control steps made.
+    /// Control steps so far.
     pub env_steps: u64,
     /// Control steps per second.
     pub steps_per_s: f64,
-    /// Goals of the lesson per episode that ended: those that training asks for.
+    /// Goals of the lesson, which are those that training sets, per episode that ended.
     pub goals: f64,
-    /// Fraction of the episodes that ended with a drop.
+    /// The fraction of episodes that ended with a drop.
     pub drop_rate: f64,
     /// Goals per episode of an evaluation.
     pub evaluation: f64,
 }
 
-/// How far a training has come.
-pub struct Progress {
+/// The progress of a training run.
+pub struct StatusLine {
     bar: Option<ProgressBar>,
     quiet: bool,
     last_line: Option<Instant>,
-    /// Moving averages, and the last evaluation.
+    /// Moving averages, and the latest evaluation.
     shown: Status,
     total_steps: u64,
-    /// When this session began, and the steps made before it.
-    begun: (Instant, u64),
+    /// The time when this session began.
+    begun: Instant,
+    /// Steps made before this session.
+    steps_before: u64,
 }
 
-impl Progress {
-    /// Of a training that has made so many of its steps. One that is to be `quiet` shows nothing of it.
+impl StatusLine {
+    /// Creates the line of a training run that has made `env_steps` of its steps. If `quiet`, no progress is shown.
     pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
         let bar = (!quiet && is_drawn_on()).then(|| {
-            // What does not fit is cut off, however the terminal is resized.
-            let style = ProgressStyle::with_template("{wide_msg}").expect("a template that indicatif knows");
+            // Cuts off what does not fit, even after the terminal is resized.
+            let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
             let bar = ProgressBar::no_length().with_style(style);
             bar.enable_steady_tick(Duration::from_secs(1));
             bar
         });
         let unknown = f64::NAN;
         let shown = Status { env_steps, steps_per_s: unknown, goals: unknown, drop_rate: unknown, evaluation: unknown };
-        Self { bar, quiet, last_line: None, shown, total_steps, begun: (Instant::now(), env_steps) }
+        Self { bar, quiet, last_line: None, shown, total_steps, begun: Instant::now(), steps_before: env_steps }
     }
 
-    /// Shows what an iteration came to.
+    /// Shows the values of an iteration.
     pub fn show(&mut self, status: &Status) {
         self.shown.take(status);
         let left = self.time_left();
@@ -75,15 +77,15 @@ impl Progress {
         }
     }
 
-    /// At the pace of this session, evaluations included.
+    /// Estimates the time left at the pace of this session, including evaluations.
     fn time_left(&self) -> Duration {
-        let (start, before) = self.begun;
-        let pace = start.elapsed().as_secs_f64() / self.shown.env_steps.saturating_sub(before).max(1) as f64;
+        let made = self.shown.env_steps.saturating_sub(self.steps_before).max(1);
+        let pace = self.begun.elapsed().as_secs_f64() / made as f64;
         let left = pace * self.total_steps.saturating_sub(self.shown.env_steps) as f64;
         Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
     }
 
-    /// Prints a line above it.
+    /// Prints a line above the progress line.
     pub fn say(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| say(line)),
@@ -91,17 +93,17 @@ impl Progress {
         }
     }
 
-    /// Leaves it as it is.
+    /// Ends the line and leaves it on the terminal.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.abandon();
-            // It is left at its end.
+            // The cursor is left at the end of the line.
             say("");
         }
     }
 }
 
-/// Whether stderr is a terminal on which a line can be drawn again in its place.
+/// Whether stderr is a terminal on which a line can be redrawn in place.
 fn is_drawn_on() -> bool {
     let dumb = std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb");
     let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
@@ -127,7 +129,7 @@ impl Status {
         }
     }
 
-    /// What there is to show, the most important first.
+    /// Returns the parts of the line, the most important first.
     fn parts(&self, left: Duration) -> Vec<String> {
         let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
         let mut parts = vec![
@@ -140,7 +142,7 @@ impl Status {
         parts
     }
 
-    /// As many parts as fit into so many columns.
+    /// Returns the line with the parts that fit into `width` columns.
     fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
         let mut line = match total_steps {
             0..10_000 => format!("{}/{total_steps}", self.env_steps),
@@ -157,30 +159,30 @@ impl Status {
     }
 }
 
-/// How far a job of many things has come; on a terminal only.
+/// The progress bar of a job with many items; shown on a terminal only.
 pub struct Bar {
     bar: ProgressBar,
 }
 
 impl Bar {
-    /// A bar at zero of `total` things of this name.
-    pub fn new(total: u64, name: &str) -> Self {
-        let style = format!("{{elapsed_precise}} [{{bar:12}}] {{human_pos}}/{{human_len}} {name}  {{wide_msg}}");
-        let style = ProgressStyle::with_template(&style).expect("a template that indicatif knows");
+    /// Creates a bar at zero of `total` items, e.g. frames; `job` says which of several it is, e.g. which policy plays.
+    pub fn new(total: u64, items: &str, job: &str) -> Self {
+        let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");
+        let style = ProgressStyle::with_template(&style).expect("the template is valid");
         Self { bar: ProgressBar::new(total).with_style(style.progress_chars("=> ")) }
     }
 
-    /// Counts one.
+    /// Counts one item.
     pub fn count(&self) {
         self.bar.inc(1);
     }
 
-    /// So many of them will not come.
+    /// Reduces the total by the number of items that will not come.
     pub fn shorten(&self, by: u64) {
         self.bar.dec_length(by);
     }
 
-    /// Says something beside it.
+    /// Shows a message beside the bar.
     pub fn say(&self, message: String) {
         self.bar.set_message(message);
     }

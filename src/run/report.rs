@@ -1,7 +1,7 @@
-//! What a training tells: event file, `metrics.csv`, and a progress line.
+//! The output of a training run: event file, `metrics.csv`, and a progress line.
 //!
-//! A log that cannot be written is a warning, never the end of a training: what is lost is counted, and at the next checkpoint
-//! it is tried again.
+//! A log that cannot be written causes a warning and never ends the training. Lost iterations are counted, and the log is
+//! opened again at the next checkpoint.
 
 use std::fs;
 use std::ops::Range;
@@ -12,9 +12,12 @@ use anyhow::Result;
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
-use super::progress::{Progress, Status};
+use super::progress::{Status, StatusLine};
 
-/// Where a training tells how it goes.
+/// The columns before the tags.
+const FIXED: [&str; 2] = ["iteration", "env_steps"];
+
+/// The logs and the progress line of a training run.
 pub struct Report {
     folder: PathBuf,
     header: String,
@@ -22,21 +25,22 @@ pub struct Report {
     metrics: Log<Metrics>,
     /// The iteration before the first one of the run.
     first: u64,
-    /// Of the last iteration that was logged.
+    /// The last iteration that was logged.
     iteration: u64,
+    /// Control steps up to its end.
     env_steps: u64,
-    progress: Progress,
+    progress: StatusLine,
 }
 
-/// A log, or none while it cannot be written.
+/// A log, which has no writer while it cannot be written.
 struct Log<W> {
     name: &'static str,
     writer: Option<W>,
-    /// The last iteration could not be written.
+    /// Whether the last iteration could not be written.
     failing: bool,
-    /// Iterations that it lacks.
+    /// Iterations missing from the log.
     lost: u64,
-    /// Iterations written since it was last known to be on the disk.
+    /// Iterations written since the log was last known to be on the disk.
     unsynced: u64,
 }
 
@@ -45,7 +49,7 @@ impl<W> Log<W> {
         Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
     }
 
-    /// Writes an iteration if it can; what there is to say of it.
+    /// Writes an iteration if possible; returns a warning if the log fails or recovers.
     fn write(&mut self, write: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
         let Some(writer) = &mut self.writer else {
             self.lost += 1;
@@ -57,10 +61,10 @@ impl<W> Log<W> {
         }
         self.unsynced += 1;
         let again = std::mem::take(&mut self.failing);
-        again.then(|| format!("{} is written again; it lacks {} iterations so far", self.name, self.lost))
+        again.then(|| format!("logging to {} has resumed; it lacks {} iterations so far", self.name, self.lost))
     }
 
-    /// Makes sure that all is on the disk; a warning where it is not.
+    /// Ensures that everything is on the disk; returns a warning if it is not.
     fn sync(&mut self, sync: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
         let result = sync(self.writer.as_mut()?);
         let unsynced = std::mem::take(&mut self.unsynced);
@@ -72,14 +76,14 @@ impl<W> Log<W> {
     fn give_up(&mut self, error: &anyhow::Error) -> Option<String> {
         self.writer = None;
         let known = std::mem::replace(&mut self.failing, true);
-        (!known).then(|| format!("{} is not written for now: {error:#}", self.name))
+        (!known).then(|| format!("logging to {} is suspended: {error:#}", self.name))
     }
 }
 
 impl Report {
-    /// Of a run in `folder`, for metrics with these names; nothing is written yet.
-    pub fn new(folder: &Path, tags: &[impl AsRef<str>], progress: Progress) -> Self {
-        let columns: Vec<&str> = ["iteration", "env_steps"].into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
+    /// Creates the report of a run in `folder`, for metrics with these names. Writes nothing yet.
+    pub fn new(folder: &Path, tags: &[impl AsRef<str>], progress: StatusLine) -> Self {
+        let columns: Vec<&str> = FIXED.into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
         Self {
             folder: folder.to_owned(),
             header: columns.join(","),
@@ -92,10 +96,10 @@ impl Report {
         }
     }
 
-    /// Opens the logs behind what was logged of these iterations, which ended after `env_steps` steps.
+    /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
     pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
         (self.first, self.iteration, self.env_steps) = (iterations.start, iterations.end, env_steps);
-        // Later steps of a session that did not come to its checkpoint are made again.
+        // A session that ended before its next checkpoint may have logged later steps; these are made again.
         match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
             Ok(events) => self.events.writer = Some(events),
             Err(error) => self.events.give_up(&error).into_iter().for_each(|warning| self.warn(&warning)),
@@ -117,9 +121,11 @@ impl Report {
         Metrics::open(&self.folder.join(METRICS), &self.header, self.first..self.iteration)
     }
 
-    /// Logs the values of an iteration, in the order of the tags, and shows the status.
+    /// Logs the values of an iteration, whose names and order are those of the tags, and shows the status.
     pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], status: &Status) {
         (self.iteration, self.env_steps) = (iteration, status.env_steps);
+        let names = values.iter().map(|(name, _)| name.as_ref());
+        assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
         let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };
         let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
@@ -131,8 +137,7 @@ impl Report {
         self.progress.show(status);
     }
 
-    /// Brings all that was logged onto the disk, before a checkpoint says that it is there; opens again what could not be
-    /// written.
+    /// Brings everything that was logged onto the disk, before a checkpoint relies on it. Reopens logs that could not be written.
     pub fn sync(&mut self) {
         let warnings = [self.metrics.sync(Metrics::sync), self.events.sync(|events| events.sync())];
         warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
@@ -146,7 +151,7 @@ impl Report {
         }
     }
 
-    /// Says what the logs lack, and ends the progress bar as it is.
+    /// Ends the progress line, and reports the iterations that the logs lack.
     pub fn finish(&self) {
         self.progress.end();
         for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
@@ -178,7 +183,7 @@ mod tests {
     }
 
     fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64) -> Report {
-        let mut report = Report::new(folder, tags, Progress::new(env_steps, 100, true));
+        let mut report = Report::new(folder, tags, StatusLine::new(env_steps, 100, true));
         report.open_logs(0..iteration, env_steps);
         report
     }
@@ -208,11 +213,11 @@ mod tests {
         report.sync();
         report.iteration(2, &[("a", 2.0)], &status(20));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
-        // Deleted in the middle: found at the next checkpoint.
+        // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
         report.iteration(3, &[("a", 3.0)], &status(30));
         report.sync();
-        assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "what was logged and deleted unseen is lost too");
+        assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
         report.iteration(4, &[("a", 4.0)], &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);

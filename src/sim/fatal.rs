@@ -1,5 +1,7 @@
-//! What happens when MuJoCo finds that it cannot go on, for instance because a scene needs more memory than it has reserved: it
-//! ends the process. Before that, what must not be lost can be saved.
+//! Fatal errors of MuJoCo, e.g. when a scene needs more memory than it has reserved: MuJoCo ends the process, but the program
+//! can save what must not be lost first.
+
+#![expect(unsafe_code, reason = "MuJoCo takes a C function")]
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, Once};
@@ -10,34 +12,35 @@ type Rescue = Box<dyn FnOnce(&str) + Send>;
 
 static RESCUE: Mutex<Option<Rescue>> = Mutex::new(None);
 
-/// Has `rescue` called before MuJoCo ends the process, with what it says, on the thread that it failed on, in place of what was
-/// to be called so far. The other threads go on meanwhile, and none of them ends the process before it returns.
+/// Registers `rescue` to be called with MuJoCo's message, on the thread that failed, before MuJoCo ends the process. It
+/// replaces any function registered before. Other threads keep running meanwhile; if MuJoCo fails on one of them too, that
+/// thread waits until `rescue` has returned.
 pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
     *RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner()) = Some(Box::new(rescue));
 }
 
-/// Sends MuJoCo's messages nowhere but for its fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
-/// [`super::Simulation::step`] reports as a value.
-pub fn quieten_mujoco() {
+/// Discards MuJoCo's messages except for fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
+/// [`super::Simulation::step`] returns as a value.
+pub(super) fn quieten_mujoco() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        // SAFETY: every use of MuJoCo in this program begins with a loaded scene, so no other thread can be inside it.
+        // SAFETY: every use of MuJoCo in this program starts with loading a scene, so no other thread can be inside MuJoCo.
         unsafe { mujoco_rs::logging::set_log_handler(report_fatal) };
     });
 }
 
-/// MuJoCo ends the process with code 1 after this returns from an error.
+/// Reports a fatal error. MuJoCo ends the process with code 1 after this returns.
 fn report_fatal(message: &MjLogMessage) {
     if message.level() != MjtLogLevel::mjLOG_ERROR {
         return;
     }
     let said = message.subject().to_string();
     let mut rescue = RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-    // A panic must not cross MuJoCo's frames.
+    // A panic must not unwind through MuJoCo's frames.
     let _ = catch_unwind(AssertUnwindSafe(|| match rescue.take() {
         Some(rescue) => rescue(&said),
         None => {
-            let text = format!("error: MuJoCo cannot go on: {said}\n");
+            let text = format!("error: MuJoCo cannot continue: {said}\n");
             let _ = std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes());
         }
     }));

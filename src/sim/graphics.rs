@@ -1,4 +1,4 @@
-//! What the window and the renderer share: the libraries below them fail in their own ways.
+//! Error handling shared by the window and the renderer, whose underlying libraries fail in their own ways.
 
 use std::error::Error;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -7,9 +7,9 @@ use anyhow::{Result, anyhow};
 
 use crate::schedule::panic_message;
 
-/// The result of `f`, in which a panic is an error too and is not printed: the windowing libraries panic where, for instance,
-/// a shared library is missing.
-pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
+/// Runs `f` and turns a panic into an error without printing it: the windowing libraries panic e.g. if a shared library is
+/// missing.
+pub(super) fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let result = catch_unwind(AssertUnwindSafe(f));
@@ -20,8 +20,8 @@ pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Resul
     }
 }
 
-/// An error with its causes, in one line, each said once.
-pub fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
+/// Formats an error and its causes on one line, without consecutive duplicates.
+pub(super) fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
     let mut causes = vec![error.to_string()];
     let mut cause = error.source();
     while let Some(error) = cause {
@@ -32,7 +32,7 @@ pub fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
     anyhow!("{}", without_place(&causes.join(": ")))
 }
 
-/// Leaves out where in winit's source an error arose, which winit writes before what it is.
+/// Removes the location in winit's source code that winit puts before an error's description.
 fn without_place(text: &str) -> String {
     let place = text.split_once("os error at ").and_then(|(before, rest)| Some((before, rest.split_once(".rs:")?.1)));
     match place.and_then(|(before, rest)| Some((before, rest.split_once(": ")?.1))) {

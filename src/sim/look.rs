@@ -1,20 +1,20 @@
-//! How a scene looks: the real hand's meshes over the primitives that collide, the size and quality of pictures.
+//! The look of a scene: the real hand's meshes over the colliding primitives, and the size and quality of pictures.
 //!
-//! Nothing here changes the physics: meshes have no mass and touch nothing, and what is added comes after what was there.
+//! Nothing here changes the physics: meshes have no mass and collide with nothing, and they come after the existing objects.
 
 use anyhow::{Result, anyhow};
 use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
-/// Geoms of this group are not drawn.
+/// The group of geoms that are not drawn.
 const HIDDEN: i32 = 3;
-/// Geoms of this group are, and by convention collide with nothing.
-const VISUAL: i32 = 2;
-/// MuJoCo Menagerie's meshes are in millimetres.
+/// The group of geoms that are drawn and by convention collide with nothing.
+pub(super) const VISUAL: i32 = 2;
+/// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 
-/// The parts of the hand: body, mesh file, material of the built-in scene, height above the body's origin in m. The figures
+/// The parts of the hand: body, mesh file, material in the built-in scene, height above the body's origin in m. The values
 /// are those of MuJoCo Menagerie's Shadow Hand.
 const PARTS: [(&str, &str, &str, f64); 24] = [
     ("rh_forearm", "forearm_0.obj", "metal", 0.0),
@@ -43,7 +43,7 @@ const PARTS: [(&str, &str, &str, f64); 24] = [
     ("rh_thdistal", "th_distal_pst.obj", "rubber", 0.0),
 ];
 
-/// The mesh files of the hand, each once.
+/// Returns the mesh files of the hand, sorted and without duplicates.
 pub fn mesh_files() -> Vec<&'static str> {
     let mut files: Vec<&str> = PARTS.iter().map(|(_, file, ..)| *file).collect();
     files.sort_unstable();
@@ -51,36 +51,36 @@ pub fn mesh_files() -> Vec<&'static str> {
     files
 }
 
-/// How much is spent on a picture.
+/// The rendering quality of pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quality {
-    /// No shadows, no reflections, no anti-aliasing: many pictures a second without a graphics card.
+    /// No shadows, reflections or anti-aliasing: many pictures per second even without a graphics card.
     Fast,
-    /// All of them.
+    /// Shadows, reflections and anti-aliasing.
     High,
 }
 
-/// From where a scene is seen: a point on a sphere around its middle.
+/// The position of a camera on a sphere around the scene's centre, which it looks at.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Degrees around the vertical; the direction of view, 0 along +x.
+    /// Viewing direction around the vertical, degrees; 0 is along +x.
     pub azimuth: f64,
-    /// Degrees; below 0 it looks down.
+    /// Viewing direction above the horizontal, degrees; negative looks down.
     pub elevation: f64,
-    /// m from the middle.
+    /// Distance from the scene's centre, m.
     pub distance: f64,
 }
 
-/// How a scene is to look.
+/// The look of a scene.
 #[derive(Clone, Debug)]
 pub struct Look {
-    /// The contents of [`mesh_files`], in their order, that the built-in hand wears; empty: its primitives are shown.
+    /// The contents of [`mesh_files`], in that order, for the built-in hand; if empty, its primitives are shown.
     pub meshes: Vec<Vec<u8>>,
     /// Width and height of pictures in pixels.
     pub size: [u32; 2],
-    /// Instead of the one that the scene says.
+    /// A camera that replaces the scene's own.
     pub camera: Option<Camera>,
-    /// Of the pictures.
+    /// The quality of pictures.
     pub quality: Quality,
 }
 
@@ -90,7 +90,7 @@ impl Look {
         if let Some(camera) = self.camera {
             let global = &mut model.vis_mut().global;
             (global.azimuth, global.elevation) = (camera.azimuth as f32, camera.elevation as f32);
-            // MuJoCo's free camera begins so many extents away.
+            // MuJoCo's free camera starts 1.5 extents away.
             model.stat_mut().extent = camera.distance / 1.5;
         }
         let [width, height] = self.size.map(|pixels| pixels as i32);
@@ -108,7 +108,7 @@ impl Look {
     /// Compiles the built-in scene with the meshes on its hand.
     ///
     /// # Errors
-    /// Files that MuJoCo cannot read as meshes.
+    /// Fails if MuJoCo cannot read a file as a mesh.
     pub(super) fn dress(&self, scene: &str) -> Result<MjModel> {
         let mut spec = MjSpec::from_xml_string(scene).map_err(|error| anyhow!("{error}"))?;
         let mut files = MjVfs::new();
@@ -117,7 +117,7 @@ impl Look {
             spec.add_mesh().with_name(name).with_file(name).with_scale([MILLIMETRE; 3]);
         }
         for (body, mesh, material, height) in PARTS {
-            let body = spec.body_mut(body).ok_or_else(|| anyhow!("there is no body {body} to wear {mesh}"))?;
+            let body = spec.body_mut(body).ok_or_else(|| anyhow!("there is no body {body} for the mesh {mesh}"))?;
             body.add_geom()
                 .with_type(MjtGeomBase::mjGEOM_MESH)
                 .with_meshname(mesh)

@@ -1,9 +1,10 @@
-//! The fence around MuJoCo: loads a scene, finds things in it by name, steps it, tells when it diverged.
+//! The wrapper around MuJoCo: loads a scene, finds objects in it by name, steps it and reports divergence.
 //!
-//! Nothing outside this folder names `mujoco_rs`; nothing inside knows the task. Angles rad, lengths m, world frame.
+//! Nothing outside this folder names `mujoco_rs`; nothing inside it knows the task. Angles in rad, lengths in m, world frame.
 
 mod fatal;
 mod finite;
+mod furnish;
 #[cfg(any(feature = "video", feature = "viewer"))]
 mod graphics;
 mod look;
@@ -20,10 +21,10 @@ pub use fatal::before_fatal_error;
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene, Variation};
-pub use simulation::{BareSimulation, Physics, Simulation, SimulationState};
+pub use simulation::{BareSimulation, Physics, Pose, Simulation, SimulationState, Velocity};
 
 #[cfg(feature = "viewer")]
-pub use panel::{Bar, Controls, Curve, Readout, SPEEDS};
+pub use panel::{Controls, Gauge, Readout, SPEEDS, Trend};
 #[cfg(feature = "video")]
 pub use renderer::Renderer;
 #[cfg(feature = "viewer")]

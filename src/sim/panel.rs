@@ -1,81 +1,83 @@
-//! The panel beside the scene in the window: what is shown there, and what the user asks for.
+//! The panel beside the scene in the window: its readout and its controls.
 //!
-//! It knows names, numbers, bars and curves, not what they mean.
+//! It knows names, values, bars and curves, but not what they mean.
 
 use std::collections::VecDeque;
 
 use egui_plot::{HLine, Line, Plot, PlotPoints};
-use mujoco_rs::viewer::egui::{self, Key, ProgressBar, RichText, Slider, Ui};
+use mujoco_rs::viewer::egui::{self, Align2, Color32, FontId, Key, Rect, RichText, Sense, Slider, Ui, pos2, vec2};
 
-/// The slowest and the fastest pace, as multiples of real time.
+/// The range of playback speeds, as multiples of real time.
 pub const SPEEDS: std::ops::RangeInclusive<f64> = 0.05..=4.0;
 
-/// A quantity as a bar.
+/// A quantity shown as a bar.
 #[derive(Clone, Debug, Default)]
-pub struct Bar {
-    /// Its name.
+pub struct Gauge {
+    /// The name of the quantity.
     pub name: &'static str,
-    /// How much of the bar is filled, in [0, 1].
-    pub share: f32,
-    /// Its value in words.
+    /// The length of the bar: from 0 to 1, or from -1 if it has a sign, with zero in the middle.
+    pub fraction: f32,
+    /// Whether values below zero are possible.
+    pub signed: bool,
+    /// The value as text.
     pub text: String,
 }
 
-/// The recent course of a quantity.
+/// The recent history of a quantity.
 #[derive(Clone, Debug, Default)]
-pub struct Curve {
-    /// Its name and unit.
+pub struct Trend {
+    /// The name and unit of the quantity.
     pub name: &'static str,
-    /// Points of time (s) and value, the oldest first.
+    /// Points of time (s) and value, oldest first.
     pub points: VecDeque<[f64; 2]>,
-    /// A value to compare with, drawn as a line.
+    /// A reference value, drawn as a line.
     pub level: Option<f64>,
 }
 
-/// What the panel shows.
+/// The contents of the panel.
 #[derive(Clone, Debug, Default)]
 pub struct Readout {
-    /// Names and values.
+    /// Rows of a name and a value.
     pub rows: Vec<(&'static str, String)>,
-    /// Bars, below a heading each group.
-    pub bars: Vec<(&'static str, Vec<Bar>)>,
+    /// Groups of bars, each under a heading.
+    pub bars: Vec<(&'static str, Vec<Gauge>)>,
     /// Curves.
-    pub curves: Vec<Curve>,
+    pub curves: Vec<Trend>,
 }
 
-/// What the user has asked for.
+/// The user's input.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Controls {
-    /// Time stands still, but for single steps.
+    /// Whether time is stopped except for single steps.
     pub paused: bool,
-    /// The pace, as a multiple of real time.
+    /// The playback speed, as a multiple of real time.
     pub speed: f64,
-    /// Which of the choices moves the hand.
+    /// The index of the choice that moves the hand.
     pub choice: usize,
-    /// Single steps asked for since the last look.
+    /// Single steps requested since the input was last read.
     pub steps: u32,
-    /// A new episode was asked for.
+    /// Whether a new episode was requested.
     pub reset: bool,
-    /// A new goal was asked for.
+    /// Whether a new goal was requested.
     pub new_goal: bool,
 }
 
-/// The panel's state between two pictures.
-pub struct Panel {
-    /// Names of the choices.
+/// The state of the panel between two frames.
+pub(super) struct Panel {
+    /// The names of the choices.
     choices: Vec<&'static str>,
     pub readout: Readout,
     pub controls: Controls,
 }
 
 impl Panel {
-    pub fn new(choices: Vec<&'static str>, choice: usize) -> Self {
+    pub(super) fn new(choices: Vec<&'static str>, choice: usize) -> Self {
         let controls = Controls { paused: false, speed: 1.0, choice, steps: 0, reset: false, new_goal: false };
         Self { choices, readout: Readout::default(), controls }
     }
 
-    /// Draws the panel at the right of the window and takes in what is clicked and pressed.
-    pub fn show(&mut self, ui: &mut Ui) {
+    /// Draws the panel at the right of the window and handles clicks and key presses.
+    pub(super) fn show(&mut self, ui: &mut Ui) {
         if !ui.egui_wants_keyboard_input() {
             self.take_keys(ui);
         }
@@ -90,7 +92,7 @@ impl Panel {
     fn take_keys(&mut self, ui: &Ui) {
         let controls = &mut self.controls;
         ui.input(|input| {
-            // A slow machine sees several presses at once.
+            // On a slow machine, one frame may contain several presses.
             let odd = |key| input.num_presses(key) % 2 == 1;
             controls.paused ^= odd(Key::Space);
             controls.steps += input.num_presses(Key::ArrowRight) as u32;
@@ -100,7 +102,7 @@ impl Panel {
             controls.speed = (controls.speed * 2f64.powi(doublings)).clamp(*SPEEDS.start(), *SPEEDS.end());
             controls.choice = (controls.choice + input.num_presses(Key::P)) % self.choices.len();
         });
-        // A single step of a scene that runs would not be seen.
+        // A single step would not be visible while the scene runs.
         controls.paused |= controls.steps > 0;
     }
 
@@ -108,7 +110,7 @@ impl Panel {
         let controls = &mut self.controls;
         ui.add_space(4.0);
         ui.horizontal(|ui| {
-            let pause = if controls.paused { "Go on (Space)" } else { "Pause (Space)" };
+            let pause = if controls.paused { "Resume (Space)" } else { "Pause (Space)" };
             controls.paused ^= ui.button(pause).clicked();
             if ui.button("Step (Right)").clicked() {
                 controls.steps += 1;
@@ -129,9 +131,11 @@ impl Panel {
             }
             ui.label("(P)");
         });
-        let help = "Drag turns the view, the right button moves it, the wheel zooms. Double-click the cube, then drag with Ctrl \
-                    and Alt to pull it, with Ctrl to twist it.";
-        ui.label(RichText::new(help).small().weak());
+        egui::CollapsingHeader::new("Mouse and keys").default_open(true).show(ui, |ui| {
+            ui.label("Drag: turn the view. Right-drag: move it. Scroll: zoom.");
+            ui.label("Double-click the cube, then Ctrl + Alt + drag: pull it. Ctrl + drag: twist it.");
+            ui.label("X: MuJoCo's own panel. Ctrl+Q: close.");
+        });
         ui.separator();
     }
 
@@ -149,19 +153,15 @@ impl Panel {
             for bar in bars {
                 ui.horizontal(|ui| {
                     ui.add_sized([70.0, 16.0], egui::Label::new(bar.name));
-                    ui.add(
-                        ProgressBar::new(bar.share.clamp(0.0, 1.0))
-                            .desired_height(14.0)
-                            .corner_radius(2)
-                            .text(&bar.text),
-                    );
+                    draw_gauge(ui, bar);
                 });
             }
         }
         for curve in &self.readout.curves {
             ui.separator();
             ui.label(curve.name);
-            let plot = Plot::new(curve.name).height(90.0).show_x(false).include_y(0.0);
+            let seconds = |mark: egui_plot::GridMark, _: &_| format!("{} s", mark.value);
+            let plot = Plot::new(curve.name).height(100.0).show_x(false).include_y(0.0).x_axis_formatter(seconds);
             plot.allow_drag(false).allow_zoom(false).allow_scroll(false).show(ui, |plot| {
                 plot.line(Line::new(curve.name, PlotPoints::from_iter(curve.points.iter().copied())));
                 if let Some(level) = curve.level {
@@ -169,5 +169,70 @@ impl Panel {
                 }
             });
         }
+    }
+}
+
+/// Draws a bar with its value beside it. A signed bar grows from the middle: green to the right, orange to the left.
+fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
+    const POSITIVE: Color32 = Color32::from_rgb(60, 150, 90);
+    const NEGATIVE: Color32 = Color32::from_rgb(205, 110, 40);
+    let (rect, _) = ui.allocate_exact_size(vec2(ui.available_width(), 16.0), Sense::hover());
+    let fraction = gauge.fraction.clamp(-1.0, 1.0);
+    let zero = if gauge.signed { rect.center().x } else { rect.left() };
+    let end = zero + fraction * if gauge.signed { rect.width() / 2.0 } else { rect.width() };
+    let painter = ui.painter();
+    painter.rect_filled(rect, 2.0, ui.visuals().extreme_bg_color);
+    let bar = Rect::from_min_max(pos2(zero.min(end), rect.top()), pos2(zero.max(end), rect.bottom()));
+    painter.rect_filled(bar, 0.0, if fraction < 0.0 { NEGATIVE } else { POSITIVE });
+    if gauge.signed {
+        painter.vline(zero, rect.y_range(), ui.visuals().widgets.noninteractive.fg_stroke);
+    }
+    let colour = ui.visuals().strong_text_color();
+    painter.text(
+        rect.right_center() - vec2(4.0, 0.0),
+        Align2::RIGHT_CENTER,
+        &gauge.text,
+        FontId::monospace(12.0),
+        colour,
+    );
+}
+
+/// Closes MuJoCo's own panel at the left when the window opens: its second reset and its physics options are not of the task,
+/// and it takes a third of a small window. mujoco-rs has no setting for that, so this drags its edge to the window's side, as
+/// a user could; the key X opens it again.
+#[derive(Default)]
+pub(super) struct CloseLeftPanel {
+    frame: u32,
+}
+
+impl egui::Plugin for CloseLeftPanel {
+    fn debug_name(&self) -> &'static str {
+        "close the left panel"
+    }
+
+    fn input_hook(&mut self, context: &egui::Context, input: &mut egui::RawInput) {
+        // The panel is laid out in the first frames.
+        let Some(panel) = egui::containers::panel::PanelState::load(context, egui::Id::new("interface_panel")) else {
+            return;
+        };
+        let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
+        let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
+        let button = |pos, pressed| egui::Event::PointerButton {
+            pos,
+            button: egui::PointerButton::Primary,
+            pressed,
+            modifiers: egui::Modifiers::NONE,
+        };
+        let event = match self.frame {
+            0 => egui::Event::PointerMoved(edge),
+            1 => button(edge, true),
+            2 => egui::Event::PointerMoved(side),
+            3 => button(side, false),
+            4 => egui::Event::PointerGone,
+            _ => return,
+        };
+        self.frame += 1;
+        // Nothing else may come between.
+        input.events = vec![event];
     }
 }

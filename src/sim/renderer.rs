@@ -1,4 +1,4 @@
-//! Pictures of a scene, drawn by OpenGL into memory: no display is needed, and no graphics card.
+//! Pictures of a scene, drawn by OpenGL into memory without a display or a graphics card.
 
 use std::sync::Arc;
 
@@ -9,48 +9,48 @@ use mujoco_rs::renderer::MjRenderer;
 use super::graphics::{attempt, described};
 use super::{Scene, Simulation};
 
-/// What to do about a renderer that cannot be had.
+/// The advice printed if there is no renderer.
 const HELP: &str = "
-  Pictures are drawn with EGL, which needs no display and no graphics card.
+  Pictures are drawn with EGL, which needs neither a display nor a graphics card.
   On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri
-  Without pictures: `play --headless` scores.";
+  Without pictures: `play --headless` to score.";
 
-/// Draws simulations of one scene. It belongs to the thread that made it.
+/// A renderer for simulations of one scene. It belongs to the thread that created it.
 pub struct Renderer {
     renderer: MjRenderer,
     data: MjData<Arc<MjModel>>,
 }
 
 impl Renderer {
-    /// A renderer of pictures as the look of the scene says.
+    /// Creates a renderer that draws `scene` with its look.
     ///
     /// # Errors
-    /// No EGL, with the packages that bring it.
+    /// Fails if there is no EGL; the message names the packages that provide it.
     pub fn new(scene: &Scene) -> Result<Self> {
         let build = || MjRenderer::builder().camera(MjvCamera::new_free(&scene.model)).build(&scene.model);
         let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?;
         Ok(Self { renderer, data: MjData::new(scene.model.clone()) })
     }
 
-    /// Width and height of its pictures in pixels.
+    /// Returns the width and height of pictures in pixels.
     pub fn size(&self) -> [u32; 2] {
         let global = &self.data.model().vis().global;
         [global.offwidth as u32, global.offheight as u32]
     }
 
-    /// The picture `[height, width, 3]` of the present state.
+    /// Draws the current state and returns the picture `[height, width, 3]`.
     ///
     /// # Errors
-    /// OpenGL's.
+    /// Fails if OpenGL does.
     ///
     /// # Panics
-    /// A simulation of another scene.
+    /// Panics if the simulation is of another scene.
     pub fn draw(&mut self, simulation: &Simulation) -> Result<&[u8]> {
         simulation.data.copy_visual_to(&mut self.data).expect("a simulation of the same scene");
-        // A mocap body that was put elsewhere after the step, the next goal, is not there yet.
+        // A mocap body that was moved after the step (the next goal) is not at its new pose yet.
         self.data.kinematics();
         self.renderer.sync_data(&mut self.data).map_err(|error| described(&error))?;
         self.renderer.render().map_err(|error| described(&error))?;
-        Ok(self.renderer.rgb_flat().expect("colours are switched on"))
+        Ok(self.renderer.rgb_flat().expect("colour rendering is enabled"))
     }
 }

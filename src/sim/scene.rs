@@ -1,4 +1,4 @@
-//! A loaded scene and its names: each lookup gives an index that stays valid, or an error with file and name.
+//! A loaded scene and its names. Each lookup returns an index that stays valid, or an error with the file and the name.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,30 +11,31 @@ use mujoco_rs::prelude::{
 use super::Look;
 use super::fatal::quieten_mujoco;
 use super::finite::not_finite;
+use super::furnish::furnished;
 
-/// The scene that is built into the program.
+/// The scene built into the program.
 const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
-/// A compiled MuJoCo model that any number of simulations share.
+/// A compiled MuJoCo model that any number of simulations can share.
 #[derive(Clone)]
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
     origin: String,
 }
 
-/// What of the physics is set from outside; the rest is said by the scene.
+/// The physics parameters that are set from outside; all others come from the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Variation {
     /// The physics timestep, s.
     pub timestep: f64,
-    /// The coefficients of friction of every geom and every pair of them are multiplied by it.
+    /// The factor on the friction coefficients of every geom and every pair of geoms.
     pub friction: f64,
-    /// The mass and the inertia of this body, with all that hangs on it, are multiplied by this.
+    /// The name of a body, and the factor on the mass and inertia of it and its descendants.
     pub load: (&'static str, f64),
 }
 
 impl Variation {
-    /// The scene's own physics, with this timestep in s.
+    /// Returns the variation that keeps the scene's own physics, with a timestep in s.
     pub fn none(timestep: f64) -> Self {
         Self { timestep, friction: 1.0, load: ("", 1.0) }
     }
@@ -46,7 +47,7 @@ impl Variation {
         scale(model.pair_friction_mut().as_flattened_mut());
         let (name, load) = self.load;
         if load != 1.0 {
-            // Bodies are numbered so that each comes after the one that it hangs on.
+            // Every body has a higher number than its parent.
             let mut loaded = vec![false; model.nbody() as usize];
             for body in 0..loaded.len() {
                 let named = model.id_to_name(MjtObjBase::mjOBJ_BODY, body) == Some(name);
@@ -56,7 +57,7 @@ impl Variation {
                     model.body_inertia_mut()[body].iter_mut().for_each(|x| *x *= load);
                 }
             }
-            // What MuJoCo works out from the masses once, as the scale of contact forces, must follow them.
+            // Update what MuJoCo derives from the masses at compile time, such as the scale of contact forces.
             let mut data = MjData::new(Box::new(model.clone()));
             data.set_const();
             *model = data.model().clone();
@@ -78,9 +79,9 @@ pub struct Hinge {
 /// A free joint: position and orientation w,x,y,z from `qpos`, linear (world) and angular (body frame) velocity from `dof`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FreeJoint {
-    /// First of its seven numbers in `qpos`.
+    /// Index of the first of its seven values in `qpos`.
     pub qpos: usize,
-    /// First of its six numbers in `qvel`.
+    /// Index of the first of its six values in `qvel`.
     pub dof: usize,
 }
 
@@ -88,7 +89,7 @@ pub struct FreeJoint {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Body(pub(super) usize);
 
-/// A mocap body, which is drawn where it is put.
+/// A mocap body, whose pose is set directly.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mocap(pub(super) usize);
 
@@ -102,10 +103,10 @@ pub struct Actuator {
 }
 
 impl Scene {
-    /// Loads the built-in scene (`None`) or a user's MJCF file, with this variation of its physics.
+    /// Loads the built-in scene (`None`) or a user's MJCF file, and applies `variation` to its physics.
     ///
     /// # Errors
-    /// MuJoCo's own message, with the file's name, where it refuses the scene.
+    /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, variation: Variation) -> Result<Self> {
         quieten_mujoco();
         let model = match file {
@@ -124,14 +125,20 @@ impl Scene {
         Self::of(model, origin, variation)
     }
 
-    /// The same scene, with the same physics, to be looked at.
+    /// Loads the same scene, with the same physics, for display.
     ///
     /// # Errors
-    /// As [`Scene::load`], and meshes that cannot be read.
+    /// Fails like [`Scene::load`], or if meshes cannot be read.
     pub fn load_to_see(file: Option<&Path>, variation: Variation, look: &Look) -> Result<Self> {
         let mut scene = Self::load(file, variation)?;
         if file.is_none() && !look.meshes.is_empty() {
             scene = Self::of(look.dress(BUILTIN)?, scene.origin, variation)?;
+        }
+        // A scene that cannot be given more is shown as it is.
+        if let Some(file) = file
+            && let Ok(Some(model)) = furnished(file, &scene.model)
+        {
+            scene = Self::of(model, scene.origin, variation)?;
         }
         look.set_up(Arc::get_mut(&mut scene.model).expect("a new scene is not shared"));
         Ok(scene)
@@ -147,33 +154,35 @@ impl Scene {
             bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);
         }
         if scene.model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 != 0 {
-            bail!(
-                "{}: what sleeps is not part of the state that MuJoCo can save; leave sleep switched off",
-                scene.origin
-            );
+            bail!("{}: sleep is not part of the state that MuJoCo can save; leave sleep switched off", scene.origin);
         }
         Ok(scene)
     }
 
-    /// A number that is another one for a scene that differs in anything.
+    /// Returns a checksum of the whole compiled scene.
     ///
     /// # Errors
-    /// Only if MuJoCo cannot write the scene into memory.
+    /// Fails only if MuJoCo cannot write the scene to memory.
     pub fn fingerprint(&self) -> Result<u64> {
         let mut bytes = vec![0; self.model.size()];
         self.model.save_to_buffer(&mut bytes)?;
         Ok(crc32fast::hash(&bytes).into())
     }
 
-    /// Number of controls.
+    /// Returns the number of geoms.
+    pub fn geoms(&self) -> usize {
+        self.model.ngeom() as usize
+    }
+
+    /// Returns the number of controls.
     pub fn controls(&self) -> usize {
         self.model.nu() as usize
     }
 
-    /// The limited hinge joint `name`.
+    /// Finds the limited hinge joint `name`.
     ///
     /// # Errors
-    /// No such joint, another kind of joint, or no limits.
+    /// Fails if there is no such joint, it is not a hinge, or it has no limits.
     pub fn hinge(&self, name: &str) -> Result<Hinge> {
         let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
         let kind = self.model.jnt_type()[id];
@@ -186,10 +195,10 @@ impl Scene {
         })
     }
 
-    /// The free joint of body `name`.
+    /// Finds the free joint of body `name`.
     ///
     /// # Errors
-    /// No such body, or its only joint is not a free joint.
+    /// Fails if there is no such body or its first joint is not a free joint.
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
         let Body(body) = self.body(name)?;
         let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
@@ -198,29 +207,29 @@ impl Scene {
         Ok(FreeJoint { qpos: self.model.jnt_qposadr()[joint] as usize, dof: self.model.jnt_dofadr()[joint] as usize })
     }
 
-    /// The body `name`.
+    /// Finds the body `name`.
     ///
     /// # Errors
-    /// No such body.
+    /// Fails if there is no such body.
     pub fn body(&self, name: &str) -> Result<Body> {
         Ok(Body(self.find(MjtObjBase::mjOBJ_BODY, "body", name)?))
     }
 
-    /// The mocap body `name`.
+    /// Finds the mocap body `name`.
     ///
     /// # Errors
-    /// No such body, or no mocap body.
+    /// Fails if there is no such body or it is not a mocap body.
     pub fn mocap(&self, name: &str) -> Result<Mocap> {
         let Body(body) = self.body(name)?;
         let id = usize::try_from(self.model.body_mocapid()[body]).ok();
         Ok(Mocap(id.ok_or_else(|| anyhow!("{}: body `{name}` must have mocap=\"true\"", self.origin))?))
     }
 
-    /// The actuator `name`, which must be a position servo with one limited control and drive the joint `target`, or the fixed
-    /// tendon `target` that is the sum of the joints `summed`.
+    /// Finds the actuator `name`, which must be a position servo with one limited control. It must drive the joint `target` or,
+    /// if `summed` is not empty, the fixed tendon `target` that is the sum of the joints `summed`.
     ///
     /// # Errors
-    /// No such actuator or target, or an actuator of another kind or that drives something else.
+    /// Fails if there is no such actuator or target, or if the actuator is of another kind or drives something else.
     pub fn actuator(&self, name: &str, target: &str, summed: &[String]) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
         let (kind, transmission) = match summed {
@@ -250,16 +259,16 @@ impl Scene {
         Ok(Actuator { ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
     }
 
-    /// The file of the scene, for messages.
+    /// Returns the scene's file, for messages.
     pub fn origin(&self) -> &str {
         &self.origin
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
-        self.model.name_to_id(kind, name).ok_or_else(|| anyhow!("{}: there is no {what} `{name}` in it", self.origin))
+        self.model.name_to_id(kind, name).ok_or_else(|| anyhow!("{}: has no {what} `{name}`", self.origin))
     }
 
-    /// Whether the force is kp · (control - length), with or without damping.
+    /// Returns whether the force is kp · (control - length), with or without damping.
     fn is_position_servo(&self, id: usize) -> bool {
         let kp = self.model.actuator_gainprm()[id][0];
         self.model.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED

@@ -1,4 +1,4 @@
-//! One simulated world that steps on its own.
+//! One simulated world, stepped independently of others.
 
 use std::sync::Arc;
 
@@ -8,55 +8,55 @@ use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
 use super::{Body, Mocap, Scene};
 use crate::quat::Quat;
 
-/// Whether the state after a step can be used.
+/// The validity of the state after a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
 pub enum Physics {
-    /// It can.
+    /// The state can be used.
     Sound,
-    /// The state or a control was not finite or far too large; MuJoCo has reset what it could not use.
+    /// The state or a control was not finite or was far too large; MuJoCo has reset what it could not use.
     Diverged,
 }
 
-/// All that the next step depends on, in the order of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION`.
+/// Everything that the next step depends on, in the order of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulationState(Box<[f64]>);
 
 impl SimulationState {
-    /// As numbers.
+    /// Returns the values of the state.
     pub fn numbers(&self) -> &[f64] {
         &self.0
     }
 }
 
-/// MuJoCo's name for that.
+/// MuJoCo's name for the components of a [`SimulationState`].
 const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 
-/// The state of one world. Positions of bodies, velocities and joints are always those of the same instant.
+/// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
     pub(super) data: MjData<Arc<MjModel>>,
 }
 
 impl Simulation {
-    /// A simulation of this scene, in its default state.
+    /// Creates a simulation of `scene` in its default state.
     pub fn new(scene: &Scene) -> Self {
         Self { data: MjData::new(scene.model.clone()) }
     }
 
-    /// The default state, without warm start and warnings; call [`Simulation::refresh`] after changing it.
+    /// Resets to the default state and clears warm start and warnings; call [`Simulation::refresh`] after changing the state.
     pub fn reset(&mut self) {
         self.data.reset();
     }
 
-    /// Brings body positions and velocities up to date with `qpos` and `qvel`.
+    /// Updates body positions and velocities to `qpos` and `qvel`.
     pub fn refresh(&mut self) {
         self.data.step1();
     }
 
-    /// Takes `substeps` physics steps with the controls held.
+    /// Takes `substeps` physics steps with constant controls.
     ///
-    /// `mj_step` would leave the bodies one substep behind the joints. Its two halves in the other order are the same
-    /// computation, bit for bit, and end with both at the same instant.
+    /// `mj_step` would leave the bodies one substep behind the joints. Its two halves in the opposite order are bit for bit the
+    /// same computation and end with both at the same instant.
     pub fn step(&mut self, substeps: usize) -> Physics {
         for _ in 0..substeps {
             self.data.step2();
@@ -68,7 +68,7 @@ impl Simulation {
         Physics::Sound
     }
 
-    /// MuJoCo resets a diverged state silently inside the step: only its warning counters tell.
+    /// Returns whether the state diverged. MuJoCo resets it silently within the step; only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
         [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC, MjtWarning::mjWARN_BADCTRL]
@@ -76,95 +76,113 @@ impl Simulation {
             .any(|&kind| warnings[kind as usize].number > 0)
     }
 
-    /// Generalised positions.
+    /// Returns the generalised positions.
     pub fn qpos(&self) -> &[f64] {
         self.data.qpos()
     }
 
-    /// Generalised positions, to be changed.
+    /// Returns the generalised positions for modification.
     pub fn qpos_mut(&mut self) -> &mut [f64] {
         self.data.qpos_mut()
     }
 
-    /// Generalised velocities.
+    /// Returns the generalised velocities.
     pub fn qvel(&self) -> &[f64] {
         self.data.qvel()
     }
 
-    /// Generalised velocities, to be changed.
+    /// Returns the generalised velocities for modification.
     pub fn qvel_mut(&mut self) -> &mut [f64] {
         self.data.qvel_mut()
     }
 
-    /// Controls in the model's order.
+    /// Returns the controls in the model's order.
     pub fn ctrl(&self) -> &[f64] {
         self.data.ctrl()
     }
 
-    /// Controls, to be changed.
+    /// Returns the controls for modification.
     pub fn ctrl_mut(&mut self) -> &mut [f64] {
         self.data.ctrl_mut()
     }
 
-    /// A copy of the state.
+    /// Returns a copy of the state.
     pub fn state(&self) -> SimulationState {
         SimulationState(self.data.state(EVERYTHING))
     }
 
-    /// Goes on from the numbers of a state, with bodies up to date: the next step is bit for bit that of the simulation that
+    /// Resumes from the values of a state, with bodies up to date: the next step is bit for bit that of the simulation that
     /// the state was taken from.
     ///
     /// # Errors
-    /// A state of another scene.
+    /// Fails if the state is of another scene or has diverged.
     pub fn restore(&mut self, numbers: &[f64]) -> Result<()> {
         let size = self.data.model().state_size(EVERYTHING);
-        ensure!(numbers.len() == size, "a state of {} numbers, but the scene's has {size}", numbers.len());
+        ensure!(numbers.len() == size, "the state has {} values, but this scene needs {size}", numbers.len());
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
         self.refresh();
-        ensure!(!self.diverged(), "a state that MuJoCo cannot go on from");
+        ensure!(!self.diverged(), "MuJoCo cannot resume from this state");
         Ok(())
     }
 
-    /// Position (m) and orientation of a body's frame in the world.
-    pub fn pose(&self, Body(id): Body) -> ([f64; 3], Quat) {
-        (self.data.xpos()[id], self.data.xquat()[id])
+    /// Returns the pose of a body's frame.
+    pub fn pose(&self, Body(id): Body) -> Pose {
+        Pose { position: self.data.xpos()[id], orientation: self.data.xquat()[id] }
     }
 
-    /// Linear (m/s) and angular (rad/s) velocity of a body's frame origin, both in the world frame.
-    pub fn velocity(&self, Body(id): Body) -> ([f64; 3], [f64; 3]) {
+    /// Returns the velocity of a body's frame at its origin.
+    pub fn velocity(&self, Body(id): Body) -> Velocity {
         // XBODY is the frame's origin; BODY would be the centre of mass.
         let [wx, wy, wz, x, y, z] = self.data.object_velocity(MjtObjBase::mjOBJ_XBODY, id, false);
-        ([x, y, z], [wx, wy, wz])
+        Velocity { linear: [x, y, z], angular: [wx, wy, wz] }
     }
 
-    /// Draws a mocap body at a position (m) and orientation.
-    pub fn place(&mut self, Mocap(id): Mocap, position: [f64; 3], orientation: Quat) {
+    /// Sets the pose of a mocap body.
+    pub fn place(&mut self, Mocap(id): Mocap, Pose { position, orientation }: Pose) {
         self.data.mocap_pos_mut()[id] = position;
         self.data.mocap_quat_mut()[id] = orientation;
     }
 }
 
-/// A world that is only stepped, with plain `mj_step`: what the physics alone can do, for comparison.
+/// The pose of a frame in the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    /// Position, m.
+    pub position: [f64; 3],
+    /// Orientation, w,x,y,z.
+    pub orientation: Quat,
+}
+
+/// The velocity of a point of a body, in the world frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Velocity {
+    /// Linear velocity, m/s.
+    pub linear: [f64; 3],
+    /// Angular velocity, rad/s.
+    pub angular: [f64; 3],
+}
+
+/// A world that is only stepped, with plain `mj_step`: the physics alone, for comparison.
 pub struct BareSimulation {
     data: MjData<Arc<MjModel>>,
 }
 
 impl BareSimulation {
-    /// A world of `scene` in its default state.
+    /// Creates a world of `scene` in its default state.
     pub fn new(scene: &Scene) -> Self {
         Self { data: MjData::new(scene.model.clone()) }
     }
 
-    /// Starts from a state of a simulation of the same scene.
+    /// Starts from the state of a simulation of the same scene.
     ///
     /// # Panics
-    /// A state of another scene.
+    /// Panics if the state is of another scene.
     pub fn start(&mut self, state: &SimulationState) {
         self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
     }
 
-    /// Takes `substeps` physics steps with these controls.
+    /// Takes `substeps` physics steps with the controls `ctrl`.
     pub fn step(&mut self, ctrl: &[f64], substeps: usize) {
         self.data.ctrl_mut().copy_from_slice(ctrl);
         for _ in 0..substeps {
@@ -172,7 +190,7 @@ impl BareSimulation {
         }
     }
 
-    /// Generalised positions.
+    /// Returns the generalised positions.
     pub fn qpos(&self) -> &[f64] {
         self.data.qpos()
     }

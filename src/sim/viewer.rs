@@ -1,4 +1,4 @@
-//! The window: the scene, to be orbited and pulled at with the mouse, and a panel beside it. Its caller owns time.
+//! The window: the scene, which the mouse can orbit and pull at, and a panel beside it. The caller controls time.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -7,14 +7,14 @@ use anyhow::{Result, anyhow};
 use mujoco_rs::viewer::MjViewer;
 
 use super::graphics::{attempt, described};
-use super::panel::Panel;
+use super::panel::{CloseLeftPanel, Panel};
 use super::{Controls, Readout, Scene, Simulation};
 
-/// What to do about a window that cannot be had.
+/// The advice printed if no window can be opened.
 const HELP: &str = "
   A window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL.
   On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0
-  Without a window: `play --headless` scores, `play --video film.mp4` films, `view --screenshot picture.png` draws.";
+  Without a window: `play --headless` to score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw.";
 
 /// An open window.
 pub struct Viewer {
@@ -23,39 +23,40 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// Opens a window on `scene` with this title; `choices` are what the user may let move the hand, the one at `first` to
-    /// begin with.
+    /// Opens a window on `scene` with the given title. The user chooses which of `choices` moves the hand, initially the one
+    /// at `first`.
     ///
     /// # Errors
-    /// No display or a missing library, with the packages that bring them.
+    /// Fails if there is no display or a library is missing; the message names the packages that provide it.
     pub fn open(scene: &Scene, title: &str, choices: Vec<&'static str>, first: usize) -> Result<Self> {
         let build = || MjViewer::builder().window_name(title.to_owned()).build_passive(&scene.model);
         let mut viewer = attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
         let panel = Rc::new(RefCell::new(Panel::new(choices, first)));
         let shown = panel.clone();
         viewer.add_ui_callback(move |ui, _| shown.borrow_mut().show(ui));
+        viewer.with_ui_egui_ctx(|context| context.add_plugin(CloseLeftPanel::default()));
         Ok(Self { viewer, panel })
     }
 
-    /// Whether the user has not closed it.
+    /// Returns whether the window is still open.
     pub fn is_open(&self) -> bool {
         self.viewer.running()
     }
 
-    /// Draws the present state and the panel, and returns what the user asks for. Where the user pulls at something, the
-    /// simulation feels it in its next steps.
+    /// Draws the current state and the panel, and returns the user's input. If the user pulls at something, the force acts in
+    /// the next steps of the simulation.
     ///
     /// # Errors
-    /// OpenGL's.
+    /// Fails if OpenGL does.
     pub fn show(&mut self, simulation: &mut Simulation, readout: Readout) -> Result<Controls> {
         let data = &mut simulation.data;
-        // A mocap body that was put elsewhere after the step, the next goal, is not there yet.
+        // A mocap body that was moved after the step (the next goal) is not at its new pose yet.
         data.step1();
         let (time, goals) = (data.time(), data.mocap_quat().to_vec());
         self.viewer.sync_data(data);
-        // The window's own reset goes back to the model's defaults, of which the task knows nothing.
+        // The window's own reset restores the model's defaults without the task's knowledge.
         let was_reset = data.time() < time || data.mocap_quat() != goals;
-        // What was moved by hand brings its bodies along.
+        // Update the bodies to what the user has moved.
         data.step1();
         self.panel.borrow_mut().readout = readout;
         self.viewer.render().map_err(|error| described(&error))?;

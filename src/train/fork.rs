@@ -1,29 +1,29 @@
-//! A training that leaves another one: with all that its checkpoint holds, in a folder of its own, under other settings.
+//! Forks: new runs in their own folder that start from the full state of another run's checkpoint, with changed settings.
 
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 
 use super::saver::{Begin, Saver};
-use super::session::{SCENE, Session, overrides, settle_model, user_file};
+use super::session::{SCENE, Session, overrides, settle_model};
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::Config;
+use crate::config::{Config, user_file};
 use crate::env::{SPACES, Task};
 use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Checkpoint, Fork};
 use crate::run::{self, RunFolder};
 
 impl Session {
-    /// A new run that begins with the newest sound checkpoint of another, or with the one that is named. Settings may
-    /// change unless they size its state or say what its policy is; nets may become wider.
+    /// Sets up a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
+    /// change unless they determine the size of the state or the kind of policy; nets may become wider.
     ///
     /// # Errors
-    /// A checkpoint that cannot be gone on from; settings that it cannot take; a folder that cannot be made.
-    pub fn fork(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
+    /// Fails if the checkpoint cannot be resumed from, if the settings do not fit it, or if the folder cannot be created.
+    pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
         if matches!(Origin::of(place), Ok(Origin::BuiltIn)) {
             bail!(
-                "--fork builtin: a policy alone, without what a training goes on from; --init builtin begins with it"
+                "--fork builtin: a policy alone, without the state of a training; use --init builtin to start from it"
             );
         }
         let places = if place.is_dir() {
@@ -41,7 +41,7 @@ impl Session {
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
-        let user = user_file(&args.settings)?;
+        let user = user_file(args.settings.config.as_deref())?;
         let (parent, mut config) = load::for_fork(&checkpoint, path, user.as_ref(), &overrides(args))?;
         expect_states(&checkpoint, &parent)?;
         expect_kept(&parent, &config)?;
@@ -55,11 +55,11 @@ impl Session {
         agent.restore(&mut checkpoint)?;
         checkpoint.finish()?;
         agent.ppo.settle_learning_rate(&parent.ppo);
-        // Scores under other settings are not compared: the best is found anew.
+        // Scores under different settings are not comparable, so the best one is not kept.
         agent.fork = Some(Fork { from, iteration: agent.iteration, env_steps: agent.env_steps });
         ensure!(
             !session.finished(),
-            "run.total_steps = {}: it has made {} already; --total-steps says how far the fork is to go",
+            "run.total_steps = {}: the checkpoint has made {} already; set the new total with --total-steps",
             session.config.run.total_steps,
             session.agent.env_steps
         );
@@ -67,7 +67,7 @@ impl Session {
     }
 }
 
-/// Makes sure that the settings which size the state, or say what its policy is, are those of before.
+/// Checks that the settings that determine the size of the state or the kind of policy are unchanged.
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     let of = |config: &Config| {
         let net = config.ppo.net();
@@ -76,16 +76,16 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     };
     let keys = ["env.num_envs", "ppo.symmetry", "ppo.activation"];
     for (key, (before, now)) in keys.into_iter().zip(of(parent).into_iter().zip(of(config))) {
-        ensure!(before == now, "{key} = {now}: a fork keeps {before}, which its checkpoint was made with");
+        ensure!(before == now, "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
     }
     Ok(())
 }
 
-/// Makes sure that the scene is the one of the checkpoint, whatever its friction, masses and timestep are to be now.
+/// Checks that the scene is that of the checkpoint. Its friction, masses and timestep may change.
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &mut Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
     let same = checkpoint.take_counters(SCENE)? == [Task::new(&before)?.scene().fingerprint()?];
-    ensure!(same, "{MODEL} = {}: another scene than the one of the checkpoint, which a fork keeps", config.env.model);
+    ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork keeps", config.env.model);
     Ok(())
 }

@@ -1,15 +1,15 @@
-//! Settings that are allowed but rarely meant: a line for each, before a training begins.
+//! Notes about settings that are valid but rarely intended, printed before a training starts.
 
 use crate::config::Config;
 
-/// Samples under which a minibatch makes a noisy gradient, and its step a short one for what it costs.
+/// The number of samples below which a minibatch gives a noisy gradient and a step that is short for its cost.
 const SMALL_MINIBATCH: usize = 1024;
 
-/// The least weight of the task's reward at which its scales matter.
+/// The smallest weight of the task's reward at which its scales matter.
 const LITTLE: f64 = 0.1;
 
-/// What there is to say of these settings, beside the `default`.
-pub fn hints(config: &Config, default: &Config) -> Vec<String> {
+/// Returns the notes about these settings, compared with the `default`.
+pub(super) fn hints(config: &Config, default: &Config) -> Vec<String> {
     let mut hints = Vec::new();
     let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
     let ramps = [
@@ -23,13 +23,13 @@ pub fn hints(config: &Config, default: &Config) -> Vec<String> {
     if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.steps).max() {
         let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
         hints.push(format!(
-            "run.total_steps = {total} ends inside the ramps of {}, up to {longest} steps",
+            "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
             names.join(", ")
         ));
     }
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
-        hints.push(format!("minibatches of {samples} samples: under {SMALL_MINIBATCH} gradients are noisy"));
+        hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
     }
     let scales = |of: &Config| {
         let env = &of.env;
@@ -42,7 +42,7 @@ pub fn hints(config: &Config, default: &Config) -> Vec<String> {
     let weight = training.task_reward.to;
     for ((key, value), (_, usual)) in scales(config).into_iter().zip(scales(default)) {
         if value != usual && weight < LITTLE {
-            hints.push(format!("{key} = {value}: training.task_reward weighs it with only {weight} in the end"));
+            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight} at the end"));
         }
     }
     hints
@@ -64,13 +64,16 @@ mod tests {
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &of(&["run.total_steps=20000000"])[..] else { panic!("one line") };
-        assert!(line.contains("training.tolerance, training.hold, ppo.max_std, up to 25000000 steps"), "{line}");
+        assert!(
+            line.contains("training.tolerance, training.hold, ppo.max_std, which last up to 25000000 steps"),
+            "{line}"
+        );
         assert!(!line.contains("task_reward"), "its ramp ends in time: {line}");
         let [line] = &of(&["ppo.minibatches=32"])[..] else { panic!("one line") };
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
         let [line] = &of(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
         assert!(
-            line.starts_with("env.dist_reward_scale = -20: training.task_reward weighs it with only 0.03"),
+            line.starts_with("env.dist_reward_scale = -20: training.task_reward multiplies it by only 0.03"),
             "{line}"
         );
         assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());

@@ -1,42 +1,90 @@
-//! The row of the log that an iteration makes: each value with its name, from where it is known.
+//! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
 
 use crate::agent::Iteration;
 use crate::env::{Lesson, Recent, Score};
 use crate::ppo::UpdateStats;
 
-/// The values of an iteration by name, always the same names in the same order: of the episodes that ended in it, of all its steps,
-/// of what was trained, of its evaluation (a score of no episodes where there was none), and of what was learnt.
-pub fn row(iteration: &Iteration<Lesson>, ended: &Score, recent: &Recent, evaluation: &Score) -> Vec<(String, f64)> {
+/// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
+/// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings.
+pub(super) fn row(
+    iteration: &Iteration<Lesson>,
+    ended: &Score,
+    recent: &Recent,
+    evaluation: &Score,
+) -> Vec<(String, f64)> {
     let mut row = Vec::new();
     let mut put = |group: &str, values: &[(&str, f64)]| {
-        row.extend(values.iter().map(|(name, value)| (format!("{group}/{name}"), *value)));
+        row.extend(values.iter().map(|(name, value)| (format!("{group}{name}"), *value)));
     };
-    let per_step = |(name, sum): (&'static str, f64)| (name, sum / recent.steps as f64);
-    let Score { length, goals, in_tolerance, drop_rate, rot_dist, steps_per_goal, .. } = *ended;
-    put("episode", &[("return", ended.episode_return), ("length", length), ("goals", goals)]);
-    put("episode", &[("in_tolerance", in_tolerance), ("drop_rate", drop_rate), ("rot_dist", rot_dist)]);
-    put("episode", &[("steps_per_goal", steps_per_goal)]);
-    put("reward", &recent.reward.named().map(per_step));
-    put("training", &recent.shaping.named().map(per_step));
-    put("training", &iteration.lesson.named());
-    let Score { goals, drop_rate, rot_dist, episode_return, .. } = *evaluation;
-    put("eval", &[("goals", goals), ("drop_rate", drop_rate), ("rot_dist", rot_dist), ("return", episode_return)]);
-    let UpdateStats { entropy, kl, first_kl, clip_fraction, std, excess, .. } = iteration.update;
-    let UpdateStats { policy_loss, value_loss, explained_variance, learning_rate, grad_norm, .. } = iteration.update;
-    put("loss", &[("policy", policy_loss), ("value", value_loss)]);
-    put("policy", &[("entropy", entropy), ("kl", kl), ("first_kl", first_kl), ("clip_fraction", clip_fraction)]);
-    put("policy", &[("std", std), ("excess", excess)]);
-    put("value", &[("explained_variance", explained_variance)]);
-    put("optim", &[("learning_rate", learning_rate), ("grad_norm", grad_norm)]);
-    put("time", &[("collect_s", iteration.collect_s), ("update_s", iteration.update_s)]);
-    put("time", &[("steps_per_s", iteration.steps_per_s())]);
-    put("sim", &[("diverged", recent.diverged as f64)]);
+    put("episode/", &ended.named());
+    put("reward/", &recent.reward_named());
+    put("training/", &recent.shaping_named());
+    put("training/", &iteration.lesson.named());
+    put("eval/", &evaluation.headline());
+    put("", &iteration.update.named());
+    put("time/", &iteration.time_named());
+    put("sim/", &[("diverged", recent.diverged as f64)]);
     row
 }
 
-/// The names of the values of any iteration.
-pub fn tags(lesson: Lesson) -> Vec<String> {
+/// Returns the names of the values of any iteration.
+pub(super) fn tags(lesson: Lesson) -> Vec<String> {
     let iteration = Iteration { lesson, update: UpdateStats::default(), steps: 0, collect_s: 0.0, update_s: 0.0 };
     let empty = row(&iteration, &Score::of(&[]), &Recent::default(), &Score::of(&[]));
     empty.into_iter().map(|(name, _)| name).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::env::{EpisodeStats, RewardTerms, Shaping};
+
+    /// All logged values are different, so that swapped values are detected.
+    #[test]
+    fn each_value_of_a_row_stands_beside_its_own_name() {
+        let lesson = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
+        let update = UpdateStats {
+            policy_loss: 1.0,
+            value_loss: 2.0,
+            excess: 3.0,
+            entropy: 4.0,
+            kl: 5.0,
+            first_kl: 6.0,
+            first_ratio_error: 7.0,
+            clip_fraction: 8.0,
+            grad_norm: 9.0,
+            std: 10.0,
+            explained_variance: 11.0,
+            learning_rate: 12.0,
+        };
+        let iteration = Iteration { lesson, update, steps: 60, collect_s: 13.0, update_s: 17.0 };
+        let reward = RewardTerms { rotation: 20.0, distance: 21.0, action: 22.0, bonus: 23.0, fall: 24.0 };
+        let shaping = Shaping { progress: 25.0, within: 26.0, drop: 27.0 };
+        let recent = Recent { steps: 1, reward, shaping, diverged: 28 };
+        let episode = |reward, length, goals| EpisodeStats {
+            length,
+            goals,
+            in_tolerance: length / 4,
+            rot_dist_sum: 1.5 * f64::from(length),
+            reward,
+            dropped: length < 100,
+            diverged: false,
+        };
+        let ended = Score::of(&[episode(reward, 80, 2)]);
+        let evaluation = Score::of(&[episode(RewardTerms::default(), 1000, 5), episode(reward, 50, 0)]);
+        let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
+            episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
+            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/within 26, training/drop 27, \
+            training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, eval/goals 2.5, \
+            eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, loss/policy 1, loss/value 2, policy/entropy 4, \
+            policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \
+            value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, \
+            time/steps_per_s 2, sim/diverged 28";
+        let found = row(&iteration, &ended, &recent, &evaluation);
+        let found: Vec<String> = found.iter().map(|(name, value)| format!("{name} {value}")).collect();
+        assert_eq!(found.join(", "), expected);
+        let names: Vec<&str> = expected.split(", ").map(|cell| cell.split_once(' ').unwrap().0).collect();
+        assert_eq!(tags(lesson), names);
+    }
 }

@@ -1,4 +1,4 @@
-//! Training, from top to bottom: collect, learn, evaluate, report, save.
+//! The training loop: collect, learn, evaluate, report, save.
 
 mod fork;
 mod hints;
@@ -7,6 +7,8 @@ mod saver;
 mod session;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, Error, Result, anyhow};
@@ -17,39 +19,25 @@ use crate::config::Config;
 use crate::dump;
 use crate::env::{Lesson, Recent, Score, divergence};
 use crate::evaluate::{Actor, Episodes, evaluate};
-use crate::run::{self, Progress, Report, Requests, RunFolder, Status};
+use crate::ppo::Evaluation;
+use crate::run::{self, Report, Requests, RunFolder, Status, StatusLine};
 use crate::schedule::panic_message;
 use hints::hints;
 use log::{row, tags};
 use saver::Saver;
 use session::Session;
 
-pub use session::user_file;
-
-/// How a command ended that was not stopped by an error.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// All that it was to do is done.
-    Finished,
-    /// It was asked to stop, and has saved; with the exit code that says so.
-    Stopped(u8),
-}
-
-/// Trains as asked, until all steps are made or it is requested to stop.
+/// Trains until all steps are made or a stop is requested, and returns the exit code of the program.
 ///
 /// # Errors
-/// Settings, files or a scene that cannot be used; a run folder that cannot be written to at the beginning or in the end; a
-/// loss that is not finite; a panic.
-pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
-    let (mut session, mut saver) = match (&args.resume, &args.fork) {
-        (Some(place), _) => Session::resume(place, args)?,
-        (None, Some(place)) => Session::fork(place, args)?,
-        (None, None) => Session::begin(args)?,
-    };
+/// Fails if settings, files or the scene cannot be used, if the run folder cannot be written to at the start or at the end, if a
+/// loss is not finite, or after a panic.
+pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
+    let (mut session, mut saver) = Session::of(args)?;
     let place = saver.folder().path().display().to_string();
     if session.finished() {
-        run::say(&format!("{place} is finished: {}", saver.steps_made()));
-        return Ok(Outcome::Finished);
+        run::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.steps_made()));
+        return Ok(ExitCode::SUCCESS);
     }
     if let Some(limit) = args.stop_after {
         requests.stop_after(limit)?;
@@ -93,21 +81,31 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<Outcome> {
             && !session.finished()
             && let Err(error) = saver.save(&mut report)
         {
-            report.warn(&format!("{error:#}; it is tried again at the next checkpoint"));
+            report.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
         }
     }
     saver.save_at_last(&mut report)?;
     session.count_divergence();
     run::say(&format!("finished: {}; {place}", saver.steps_made()));
-    Ok(Outcome::Finished)
+    if !args.quiet {
+        say_what_next(saver.folder().path());
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
-/// An iteration, and the score of its evaluation: of no episodes where there was none.
+/// Prints how to look at a run that has finished.
+fn say_what_next(run: &Path) {
+    let (program, run_word) = (run::called_as(), run::quoted_path(run));
+    let all = run::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
+    run::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
+}
+
+/// An iteration, and the score of its evaluation, which has no episodes if there was none.
 type Made = (Iteration<Lesson>, Score);
 
 impl Session {
-    /// One iteration, whatever happens in it; `None` if `stop` was set meanwhile. Where it does not come to its end, only the end of
-    /// the one before can be used.
+    /// Runs one iteration and turns a panic into an error. Returns `None` if `stop` was set meanwhile. If the iteration does not
+    /// complete, only the state at the end of the previous one can be used.
     fn iterate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
         let number = self.agent.iteration + 1;
         let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report)));
@@ -118,16 +116,16 @@ impl Session {
     fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
         let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
         let mut evaluation = Score::of(&[]);
-        if self.agent.iteration.is_multiple_of(self.config.run.eval_every) {
+        if evaluates(self.agent.iteration, self.config.run.eval_every) {
             let Some(score) = self.evaluate(stop, report)? else { return Ok(None) };
-            let found = [score.goals, score.rot_dist];
-            self.best = if is_better(found, self.best) { Some(found) } else { self.best };
+            let found = Evaluation { goals: score.goals, rot_dist: score.rot_dist };
+            self.best = if found.beats(self.best) { Some(found) } else { self.best };
             evaluation = score;
         }
         Ok(Some((iteration, evaluation)))
     }
 
-    /// Plays the evaluation episodes.
+    /// Plays the evaluation episodes; returns `None` if `stop` was set meanwhile.
     fn evaluate(&self, stop: &AtomicBool, report: &Report) -> Result<Option<Score>> {
         let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
         let episodes = Episodes { seed, purpose: "evaluation", first: 0, count };
@@ -159,21 +157,21 @@ impl Session {
         self.diverged += recent.diverged;
         let warning = divergence(recent.diverged, recent.steps).or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
-            // Once; how often it came to it stands at the end.
+            // Warn once; the total is printed at the end.
             self.warned = true;
             report.warn(&warning);
         }
         report.iteration(self.agent.iteration, &row(iteration, &episodes, &recent, evaluation), &status);
     }
 
-    /// Says at the end how many steps diverged, if they were warned of.
+    /// Prints the total number of diverged steps at the end, if there was a warning.
     fn count_divergence(&self) {
         if self.warned {
             run::say(&format!("warning: {} steps of this session diverged", self.diverged));
         }
     }
 
-    /// Writes what led to each episode that diverged.
+    /// Writes the steps that led to each divergence.
     fn dump_diverged(&mut self, folder: &RunFolder, report: &Report) {
         let iteration = self.agent.iteration;
         for (env, repose) in self.agent.pool.envs_mut().enumerate() {
@@ -186,39 +184,40 @@ impl Session {
     }
 }
 
+/// The iteration after which there is an early evaluation where the next one would come much later.
+const EARLY: u64 = 50;
+
+/// Returns whether there is an evaluation after this iteration. It depends on nothing else, so that a stop leaves no trace.
+fn evaluates(iteration: u64, every: u64) -> bool {
+    iteration.is_multiple_of(every) || iteration == EARLY && every > EARLY
+}
+
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(Lesson::task(&session.config.env));
-    let progress = Progress::new(session.agent.env_steps, session.config.run.total_steps, quiet);
+    let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
     Report::new(saver.folder().path(), &tags, progress)
 }
 
-/// Saves the end of the last iteration, when it was asked to stop.
-fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<Outcome> {
+/// Saves the state at the end of the last complete iteration after a request to stop.
+fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
     saver.save_at_last(report)?;
     if saver.has_begun() {
-        run::say(&format!("stopped after {}; go on with", saver.steps_made()));
+        run::say(&format!("stopped after {}; resume with", saver.steps_made()));
         run::say(&format!("  {}", saver.how_to_resume()));
     } else {
-        run::say("stopped before its first iteration: the run is as it was; the same command goes on");
+        run::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
     }
-    Ok(Outcome::Stopped(requests.exit_code()))
+    Ok(requests.exit_code())
 }
 
-/// Saves the end of the last iteration before the one that failed.
+/// Saves the state at the end of the last complete iteration after a failure, and returns the error.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
     match saver.save_at_last(report) {
         Ok(()) if saver.has_begun() => run::say(&format!("saved the state after {}", saver.steps_made())),
-        Ok(()) => run::say("nothing was changed in the folder of the run"),
+        Ok(()) => run::say("the run folder was not changed"),
         Err(error) => run::say(&format!("error: {error:#}")),
     }
     error
-}
-
-/// Whether an evaluation (goals per episode, rotation error in rad) is the best so far: more goals, then less error.
-fn is_better(found: [f64; 2], best: Option<[f64; 2]>) -> bool {
-    let rank = |[goals, rot_dist]: [f64; 2]| (goals, -rot_dist);
-    // Where every episode diverged at once there is no rotation error to speak of.
-    found.iter().all(|x| x.is_finite()) && best.is_none_or(|best| rank(found) > rank(best))
 }
 
 #[cfg(test)]
@@ -227,6 +226,15 @@ mod tests {
     use crate::config::Override;
     use crate::ppo::Checkpoint;
     use crate::train::saver::Begin;
+
+    #[test]
+    fn evaluations_come_at_the_multiples_and_once_early_where_they_are_rare() {
+        let after = |every| (1..=310).filter(|&iteration| evaluates(iteration, every)).collect::<Vec<u64>>();
+        assert_eq!(after(150), [50, 150, 300]);
+        assert_eq!(after(50), [50, 100, 150, 200, 250, 300]);
+        assert_eq!(after(100), [50, 100, 200, 300]);
+        assert_eq!(after(20)[..4], [20, 40, 60, 80]);
+    }
 
     #[test]
     fn a_panic_on_a_worker_thread_is_an_error_and_the_iteration_before_is_saved() {
@@ -240,7 +248,7 @@ mod tests {
         saver.begin(&mut report).unwrap();
         assert!(session.iterate(&never, &report).unwrap().is_some(), "nothing stops it");
         saver.take(session.checkpoint());
-        // Room for fewer environments than there are.
+        // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
         let error = session.iterate(&never, &report).unwrap_err();
         let latest = saver.folder().checkpoints().latest();
@@ -269,15 +277,5 @@ mod tests {
         let other = begin();
         lost.give_back();
         assert!(other.folder().checkpoints().latest().exists());
-    }
-
-    #[test]
-    fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
-        assert!(is_better([0.0, 2.0], None));
-        assert!(is_better([1.0, 2.0], Some([0.5, 0.1])));
-        assert!(!is_better([0.5, 0.1], Some([1.0, 2.0])));
-        assert!(is_better([1.0, 1.9], Some([1.0, 2.0])));
-        assert!(!is_better([1.0, 2.0], Some([1.0, 2.0])));
-        assert!(!is_better([0.0, f64::NAN], None));
     }
 }

@@ -1,4 +1,4 @@
-//! How a training comes to be: from settings, or from the checkpoint of another one.
+//! Setting up a training: from settings, or from a checkpoint.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -7,41 +7,53 @@ use anyhow::{Context, Result, bail, ensure};
 
 use super::saver::{Begin, Saver, best_so_far};
 use crate::agent::{Agent, expect_states};
-use crate::cli::{Settings, TrainArgs};
-use crate::config::{BUILTIN_MODEL, Config, Override, Source};
+use crate::cli::TrainArgs;
+use crate::config::{BUILTIN_MODEL, Config, Override, user_file};
 use crate::env::{Repose, SPACES, Task};
 use crate::load::{self, MODEL, Origin};
-use crate::ppo::{Array, Checkpoint};
+use crate::ppo::{Array, Checkpoint, Evaluation};
 use crate::run::{self, Locked, RunFolder};
 
-/// Where a checkpoint keeps the fingerprint of the scene that its environments live in.
-pub const SCENE: &str = "scene";
+/// The name under which a checkpoint stores the fingerprint of its environments' scene.
+pub(super) const SCENE: &str = "scene";
 
-/// All that a training owns, but for what saves it.
-pub struct Session {
+/// Everything that a training owns, except its saver.
+pub(super) struct Session {
     /// The settings of the run.
     pub config: Config,
-    /// What is trained.
+    /// The task that is trained.
     pub task: Arc<Task>,
-    /// What learns.
+    /// The environments and the learner.
     pub agent: Agent<Repose>,
-    /// Goals per episode and rotation error (rad) of the best evaluation.
-    pub best: Option<[f64; 2]>,
-    /// Steps of this session on which the physics diverged.
+    /// The best evaluation so far.
+    pub best: Option<Evaluation>,
+    /// The number of steps of this session on which the physics diverged.
     pub diverged: u64,
-    /// That they are many was said.
+    /// Whether the warning about them was printed.
     pub warned: bool,
     /// The fingerprint of the scene.
     scene: u64,
 }
 
 impl Session {
-    /// A new training, whose folder comes last: it is not touched by one that cannot be set up.
+    /// Sets up the requested training and its saver.
     ///
     /// # Errors
-    /// Settings, a policy to begin with or a scene that cannot be used; a folder that cannot be made.
-    pub fn begin(args: &TrainArgs) -> Result<(Self, Saver)> {
-        let mut config = Config::resolve(user_file(&args.settings)?.as_ref(), &overrides(args))?;
+    /// Fails as [`Session::begin`], [`Session::resume`] and [`Session::fork`] do.
+    pub(crate) fn of(args: &TrainArgs) -> Result<(Self, Saver)> {
+        match (&args.resume, &args.fork) {
+            (Some(place), _) => Self::resume(&run_to_resume(place.as_deref())?, args),
+            (None, Some(place)) => Self::fork(place, args),
+            (None, None) => Self::begin(args),
+        }
+    }
+
+    /// Sets up a new training. The folder is created last, so that a training that cannot be set up leaves none behind.
+    ///
+    /// # Errors
+    /// Fails if the settings, the initial policy or the scene cannot be used, or if the folder cannot be created.
+    pub(super) fn begin(args: &TrainArgs) -> Result<(Self, Saver)> {
+        let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &overrides(args))?;
         settle_model(&mut config)?;
         run::start_threads(config.run.threads)?;
         let init = args.init.as_deref().map(|place| policy_to_begin_with(place, &config)).transpose()?;
@@ -54,14 +66,14 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Goes on with a training from the newest checkpoint of a run that is not damaged, or from the one that is named.
+    /// Resumes a training from the newest undamaged checkpoint of a run, or from the given one.
     ///
     /// # Errors
-    /// Settings that cannot be changed; a run that cannot be gone on with.
-    pub fn resume(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
+    /// Fails if a setting is given that cannot be changed, or if the run cannot be resumed.
+    pub(super) fn resume(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
         if let Some(set) = args.settings.set.iter().find(|set| set.key != MODEL) {
             bail!(
-                "--set {}: of a run that is resumed only {MODEL} can be given again, and --total-steps and --threads; --fork changes settings",
+                "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
                 set.key
             );
         }
@@ -81,51 +93,51 @@ impl Session {
         run::start_threads(config.run.threads)?;
         if config.run.shards == 0 {
             run::say(&format!(
-                "note: {} was made before trainings had shards: what follows is another sequence than before",
+                "note: {} was made before trainings had shards: the resumed run is not the same bit for bit",
                 path.display()
             ));
         }
         let mut session = Self::new(config)?;
         let restored = session.agent.restore(&mut checkpoint).and_then(|()| checkpoint.take_counters(SCENE));
         if restored.with_context(context)? != [session.scene] {
-            run::say("warning: the scene is not the one of the checkpoint: what follows is another training");
+            run::say("warning: the scene is not the one of the checkpoint: the resumed run is a different training");
         }
         let checkpoint_best = checkpoint.progress.best;
         checkpoint.finish().with_context(context)?;
-        // The best is what is in the folder. It may have been saved after the checkpoint that is resumed from, and is not given up
-        // for a worse one.
+        // The best is the one in the folder. It may have been saved after the checkpoint that is resumed, and a worse one must
+        // not replace it.
         session.best = best_so_far(&folder, checkpoint_best);
         let begin = if run::same_file(&path, &newest[0]) { Begin::FromNewest } else { Begin::FromOlder };
         let saver = session.saver(folder, lock, args, begin);
         Ok((session, saver))
     }
 
-    /// A training at its beginning.
+    /// Creates a training at its beginning.
     ///
     /// # Errors
-    /// A scene or a precision that cannot be used.
-    pub fn new(mut config: Config) -> Result<Self> {
-        // What is written says how it was divided.
+    /// Fails if the scene or the precision cannot be used.
+    pub(super) fn new(mut config: Config) -> Result<Self> {
+        // The saved configuration contains the actual number of shards.
         config.run.shards = config.shards();
         let task = Task::new(&config.env)?;
         let (agent, scene) = (Agent::of_task(&task, &config)?, task.scene().fingerprint()?);
         Ok(Self { config, task, agent, best: None, diverged: 0, warned: false, scene })
     }
 
-    /// The end of the last iteration, whole.
-    pub fn checkpoint(&self) -> Checkpoint {
+    /// Returns the complete state at the end of the last iteration.
+    pub(super) fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
         checkpoint.insert(SCENE, Array::U64(vec![1], vec![self.scene]));
         checkpoint
     }
 
-    /// Whether all steps are made.
-    pub fn finished(&self) -> bool {
+    /// Returns whether all steps are made.
+    pub(super) fn finished(&self) -> bool {
         self.agent.env_steps >= self.config.run.total_steps
     }
 
-    /// What saves it in this folder.
-    pub fn saver(&self, folder: RunFolder, lock: Locked, args: &TrainArgs, begin: Begin) -> Saver {
+    /// Returns the saver of this training for `folder`.
+    pub(super) fn saver(&self, folder: RunFolder, lock: Locked, args: &TrainArgs, begin: Begin) -> Saver {
         let model = self.config.env.model_file().map(|model| run::quoted(&format!("{MODEL}={}", model.display())));
         let model = model.map_or(String::new(), |set| format!(" --set {set}"));
         let options = format!("{model}{}", if args.dump_diverged { " --dump-diverged" } else { "" });
@@ -133,17 +145,17 @@ impl Session {
     }
 }
 
-/// The user's file of settings, if one was named.
+/// Returns the run or checkpoint to resume: the given one, or the newest run.
 ///
 /// # Errors
-/// A file that cannot be read.
-pub fn user_file(settings: &Settings) -> Result<Option<Source>> {
-    let read = |path: &PathBuf| Ok(Source { path: path.clone(), text: run::read_text(path)? });
-    settings.config.as_ref().map(read).transpose()
+/// Fails if there is no run.
+fn run_to_resume(place: Option<&Path>) -> Result<PathBuf> {
+    let place = place.map(Path::to_owned).or_else(run::newest_run);
+    place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")
 }
 
-/// The single settings, with those that have options of their own.
-pub fn overrides(args: &TrainArgs) -> Vec<Override> {
+/// Returns the single settings, including those that have their own options.
+pub(super) fn overrides(args: &TrainArgs) -> Vec<Override> {
     let options = [
         ("run.seed", args.seed),
         ("run.threads", args.threads.map(|n| n as u64)),
@@ -154,11 +166,11 @@ pub fn overrides(args: &TrainArgs) -> Vec<Override> {
     args.settings.set.iter().cloned().chain(given).collect()
 }
 
-/// Makes the run independent of the folder that it was begun in.
+/// Makes the path of the scene absolute, so that the run does not depend on the folder in which it was started.
 ///
 /// # Errors
-/// A scene that is not there.
-pub fn settle_model(config: &mut Config) -> Result<()> {
+/// Fails if the scene does not exist.
+pub(super) fn settle_model(config: &mut Config) -> Result<()> {
     if let Some(model) = config.env.model_file() {
         let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
         config.env.model = model.display().to_string();
@@ -166,35 +178,32 @@ pub fn settle_model(config: &mut Config) -> Result<()> {
     Ok(())
 }
 
-/// Makes sure that the settings in the folder are those of the checkpoint: whoever has edited them would be ignored.
+/// Checks that the settings in the folder are those of the checkpoint, because edits to them would be ignored.
 fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     let Some((path, text)) = folder.config()? else { return Ok(()) };
-    let advice =
-        format!("put {} back as it was, or delete it; --fork begins a run with other settings", path.display());
+    let advice = format!("restore {} or delete it; to change settings, start a new run with --fork", path.display());
     let found = Config::from_text(&path, &text, &[]).with_context(|| advice.clone())?;
     let differing = config.differences(&found);
-    ensure!(
-        differing.is_empty(),
-        "{} says something else than the checkpoint: {}\n{advice}",
-        path.display(),
-        differing.join("; ")
-    );
+    ensure!(differing.is_empty(), "{} differs from the checkpoint: {}\n{advice}", path.display(), differing.join("; "));
     Ok(())
 }
 
-/// The policy of a checkpoint or run, for a training with this configuration to begin with.
+/// Loads the policy of a checkpoint or run for a training with this configuration to begin with.
 fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Checkpoint> {
     let origin = Origin::of(place)?;
-    // Which scene it was trained in does not matter.
+    // The scene in which it was trained does not matter.
     let any_scene = Override { key: MODEL.into(), value: BUILTIN_MODEL.into() };
     let (checkpoint, of_it) = origin.load(&[any_scene])?;
     let fitting = || {
         let net = config.ppo.net();
         checkpoint.expect_policy(&net, &SPACES)?;
         let (found, expected) = ((of_it.net.activation, of_it.net.symmetry), (net.activation, net.symmetry));
-        ensure!(found == expected, "its activation and symmetry are {found:?}, those of this training {expected:?}");
+        ensure!(
+            found == expected,
+            "its activation and symmetry are {found:?}, but those of this training are {expected:?}"
+        );
         Ok(())
     };
-    fitting().with_context(|| format!("cannot begin with the policy {origin}"))?;
+    fitting().with_context(|| format!("cannot start from the policy {origin}"))?;
     Ok(checkpoint)
 }

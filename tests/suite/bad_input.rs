@@ -1,4 +1,4 @@
-//! What users get wrong: one clear message, exit code 1 (2 for the command line itself), nothing overwritten.
+//! User errors: one clear message, exit code 1 (2 for the command line itself), nothing overwritten.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -8,7 +8,7 @@ use shadow_repose::ppo::{Array, Checkpoint};
 
 use crate::support::{program, stderr, succeeded, train};
 
-/// Fails unless the program exits with `code` and says each of `parts` on stderr.
+/// Fails unless the program exits with `code` and prints each of `parts` on stderr.
 #[track_caller]
 fn refused(folder: &Path, args: &[&str], code: i32, parts: &[&str]) {
     let output = program(folder, args);
@@ -47,7 +47,7 @@ fn settings_that_cannot_be_are_named_all_at_once() {
     refused(folder.path(), &words, 1, &parts);
     let deep = format!("{}=1", ["a"; 60_000].join("."));
     refused(folder.path(), &["train", "--set", &deep], 1, &["unknown key"]);
-    assert!(!folder.path().join("runs").exists(), "nothing is begun");
+    assert!(!folder.path().join("runs").exists(), "nothing is started");
 }
 
 #[test]
@@ -58,7 +58,7 @@ fn tiles_that_the_processor_lacks_are_refused_before_anything_is_begun() {
     if !output.status.success() {
         assert!(stderr(&output).contains("(AMX)"), "{}", stderr(&output));
         refused(folder.path(), &[&["train"], &bf16[..]].concat(), 1, &["ppo.precision = \"bf16\"", "\"f32\"", "(AMX)"]);
-        assert!(!folder.path().join("runs").exists(), "nothing is begun");
+        assert!(!folder.path().join("runs").exists(), "nothing is started");
     }
     let both = ["train", "--set", "ppo.precision=bf16-rounded", "--set", "ppo.backend=candle"];
     refused(folder.path(), &both, 1, &["ppo.precision = \"bf16-rounded\": must be \"f32\" with ppo.backend"]);
@@ -91,7 +91,7 @@ fn checkpoints_that_are_damaged_or_of_something_else_are_refused() {
     let mut flipped = good.clone();
     flipped[good.len() - 77] ^= 4;
     write("flipped.safetensors", &flipped);
-    // Whole, but its configuration asks for a wider net.
+    // Intact, but its configuration describes a wider net.
     let mut wider = Checkpoint::parse(&good).unwrap();
     wider.config = wider.config.replace("hidden = [16, 8]", "hidden = [17, 8]");
     write("wider.safetensors", &wider.to_bytes().unwrap());
@@ -139,13 +139,13 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
         (set("adam.steps", &Array::U64(vec![1], vec![u64::MAX])), "`adam.steps`"),
         (set("normalizer.variance", &Array::F64(vec![157], vec![-1.0; 157])), "`normalizer.variance`"),
         (set("log_std", &Array::F64(vec![20], vec![1.0; 20])), "`log_std` must be of type F32"),
-        (set("extra", &Array::U64(vec![1], vec![1])), "`extra` is not one of this policy"),
+        (set("extra", &Array::U64(vec![1], vec![1])), "`extra` is not part of this policy"),
         (config("num_envs = 16", "num_envs = 32"), "cannot have made 128 steps"),
         (config("hidden = [16, 8]", "hidden = [16384, 16384, 8]"), "at most 2^25 weights"),
         (config("model = \"builtin\"", "model = \"/etc/passwd\""), "no path in a file is followed"),
         (config("ctrl_dt = 0.01", "ctrl_dt = 1e300"), "ctrl_dt"),
         (behind, "cannot have made"),
-        (alone, "a policy alone, which can be played but not trained on"),
+        (alone, "a policy alone, which can be played but not resumed"),
     ] {
         fs::write(&path, bad.to_bytes().unwrap()).unwrap();
         let checkpoint = path.display().to_string();
@@ -203,7 +203,7 @@ fn a_run_folder_that_cannot_be_written_to_is_an_error_before_anything_is_trained
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("file"), "").unwrap();
     refused(folder.path(), &train(&["--run-dir", "file/run"]), 1, &["cannot create the run folder"]);
-    // Where the tests run as root, permissions stop nobody.
+    // Permissions do not stop root, who may be running the tests.
     let locked = folder.path().join("locked");
     fs::create_dir(&locked).unwrap();
     fs::set_permissions(&locked, fs::Permissions::from_mode(0o555)).unwrap();
@@ -233,21 +233,21 @@ fn usage_errors_exit_with_2() {
     ] {
         refused(folder.path(), args, 2, &["--help"]);
     }
-    // Nothing would be seen of it.
+    // Options that would have no effect.
     refused(
         folder.path(),
         &["play", "--policy", "zero", "--headless", "--size", "64x64"],
         2,
-        &["--size is for a film"],
+        &["--size applies only to a film"],
     );
-    refused(folder.path(), &["play", "--policy", "zero", "--json", "--plain"], 2, &["--plain is for a film"]);
+    refused(folder.path(), &["play", "--policy", "zero", "--json", "--plain"], 2, &["--plain applies only to a film"]);
     refused(
         folder.path(),
         &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"],
         1,
         &["`play` does not use ppo.gamma"],
     );
-    refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["only env.model"]);
+    refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["accepts only env.model"]);
     refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }

@@ -1,4 +1,4 @@
-//! The instrument that compares ways of learning (benches/learning).
+//! The script that compares ways of learning (benches/learning).
 
 use std::fs;
 use std::path::Path;
@@ -57,7 +57,7 @@ fn an_experiment_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     let row = said.lines().skip_while(|line| *line != "at 1,280 steps:").find(|line| line.starts_with("| same"));
     assert!(row.is_some_and(|row| row.contains("(+0.000 ± 0.000, up in 0 of 2)")), "{said}");
     assert!(runs.join("picture.svg").exists());
-    // Other settings do not go on in the same folder.
+    // Other settings are refused in the same folder.
     let changed = fs::read_to_string(folder.join("what.toml")).unwrap().replace("0.8", "0.9");
     fs::write(folder.join("what.toml"), changed).unwrap();
     let refused = experiment(folder).output().unwrap();

@@ -1,4 +1,4 @@
-//! A training that leaves another one.
+//! `train --fork`: a new run that continues from the checkpoint of another one.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::support::{SCENE, metrics, program, stderr, succeeded, train, weights};
 
-/// A run of this name of 256 steps, which are two iterations.
+/// Trains a run of this name for 256 steps, which are two iterations.
 fn parent(folder: &Path, name: &str, more: &[&str]) {
     succeeded(program(folder, &train(&[&["--total-steps", "256", "--run-dir", name], more].concat())));
 }
@@ -31,13 +31,13 @@ fn a_fork_that_changes_nothing_continues_bit_for_bit() {
     assert_eq!(
         fs::read(folder.join("run/checkpoints/latest.safetensors")).unwrap(),
         before,
-        "the other run is left alone"
+        "the other run is unchanged"
     );
     succeeded(program(folder, &["train", "--resume", "run", "--total-steps", "640"]));
     let latest = |run: &str| weights(folder.join(run).join("checkpoints/latest.safetensors"));
     assert_eq!(latest("fork"), latest("run"));
     let [fork, run] = ["fork", "run"].map(|name| metrics(&folder.join(name)));
-    assert_eq!((&fork[0], &fork[1..]), (&run[0], &run[3..]), "its rows are those that follow");
+    assert_eq!((&fork[0], &fork[1..]), (&run[0], &run[3..]), "its rows are those after the fork");
 }
 
 #[test]
@@ -47,7 +47,7 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
     parent(folder, "run", &[]);
     fs::write(folder.join("own.toml"), "[ppo]\nhorizon = 4\ngamma = 0.9\n[training]\ntolerance.to = 0.2").unwrap();
     let mut sets = vec!["--config", "own.toml", "--total-steps", "384"];
-    // Shorter than the episodes that are under way.
+    // Shorter than the episodes in progress.
     sets.extend(
         ["env.max_episode_seconds=0.05", "env.sim_dt=0.005", "env.friction_scale=0.9"]
             .iter()
@@ -66,18 +66,18 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
     for set in ["horizon = 4", "gamma = 0.9\n", "tolerance = { from = 0.4, to = 0.2, steps = 25000000 }", "seed = 7"] {
         assert!(own.contains(set) && !parent.contains(set), "{own}");
     }
-    assert!(own.contains("num_envs = 16") && own.contains("hidden = [16, 8]"), "the rest is as it was: {own}");
+    assert!(own.contains("num_envs = 16") && own.contains("hidden = [16, 8]"), "the rest is unchanged: {own}");
     let rows = metrics(&folder.join("fork"));
     let rate = rows[0].iter().position(|name| name == "optim/learning_rate").unwrap();
-    assert_eq!(rows[1][..2], ["3", "320"], "both counters go on");
+    assert_eq!(rows[1][..2], ["3", "320"], "both counters continue");
     assert_eq!(rows[1][rate].parse::<f64>().unwrap() as f32, 2e-5);
-    // What it leaves is a run as any other.
+    // The result is a run like any other.
     succeeded(program(folder, &["train", "--resume", "fork", "--total-steps", "512"]));
     assert_eq!(config(folder, "fork").lines().next().unwrap(), first);
     succeeded(fork(folder, "fork", "next", &["--total-steps", "640"]));
     let again = config(folder, "next");
     assert!(again.starts_with("# Forked from") && again.contains("after 6 iterations, 512 env steps"), "{again}");
-    // As settings of a new training the file says nothing of it.
+    // A new training with these settings does not mention the fork.
     let args = ["train", "--config", "next/config.toml", "--total-steps", "64", "--run-dir", "new"];
     succeeded(program(folder, &args));
     assert!(!config(folder, "new").contains("Forked"));
@@ -116,15 +116,15 @@ fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
         ("env.num_envs=8", "env.num_envs = 8: a fork keeps 16"),
         ("ppo.symmetry=none", "ppo.symmetry = none: a fork keeps cube"),
         ("ppo.activation=tanh", "ppo.activation = tanh: a fork keeps elu"),
-        ("env.model=other.xml", "another scene than the one of the checkpoint"),
+        ("env.model=other.xml", "not the scene of the checkpoint"),
         ("ppo.hidden=[16,4]", "ppo.hidden = [16, 4]: nets of [16, 8] can only be made wider"),
-        ("run.total_steps=256", "run.total_steps = 256: it has made 256 already"),
+        ("run.total_steps=256", "run.total_steps = 256: the checkpoint has made 256 already"),
         ("ppo.horizont=4", "did you mean ppo.horizon?"),
     ] {
         let refused = fork(folder, "run", "fork", &["--set", "run.total_steps=512", "--set", set]);
         assert_eq!(refused.status.code(), Some(1), "{set}");
         assert!(stderr(&refused).contains(reason), "{set}: {}", stderr(&refused));
-        assert!(!folder.join("fork").exists(), "{set}: nothing is left of it");
+        assert!(!folder.join("fork").exists(), "{set}: nothing is left behind");
     }
     for (from, reason) in
         [("builtin", "--init builtin"), ("run/policy.safetensors", "a policy alone"), ("nowhere", "nowhere")]
@@ -133,7 +133,7 @@ fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
         assert_eq!(refused.status.code(), Some(1), "{from}");
         assert!(stderr(&refused).contains(reason), "{from}: {}", stderr(&refused));
     }
-    // The same scene by another name is the same scene.
+    // The same scene under another name is still the same scene.
     parent(folder, "own-run", &["--set", "env.model=own.xml"]);
     let unnamed = fork(folder, "own-run", "fork", &["--total-steps", "512"]);
     assert!(stderr(&unnamed).contains("no path in a file is followed"), "{}", stderr(&unnamed));

@@ -1,11 +1,14 @@
-//! The behaviours of the whole: each test says one in a sentence.
+//! Tests of the whole program; the name of each states the behaviour that it checks.
 
-// The limits of the model are decimal numbers near multiples of π, and are meant so.
+// Some limits of the model are decimal numbers near multiples of π, on purpose.
 #![allow(clippy::approx_constant)]
+// A panic in a test or its helpers is a failure, as it should be.
+#![allow(clippy::unwrap_used)]
 
 mod architecture;
 mod bad_input;
 mod binary;
+mod docs;
 mod experiment;
 mod fork;
 mod outputs;
@@ -24,3 +27,4 @@ mod task;
 mod training;
 #[cfg(feature = "viewer")]
 mod window;
+mod words;

@@ -1,4 +1,4 @@
-//! What the program writes where the user says, and what it says on the terminal.
+//! Output files that the user names, and messages on the terminal.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 
 use crate::support::{SCENE, command, names, program, stderr, succeeded, train};
 
-/// Episodes of a moment.
+/// The arguments for very short episodes.
 const SHORT: [&str; 6] = ["play", "--policy", "zero", "--set", "env.max_episode_seconds=0.1", "--headless"];
 
-/// The program's command line behind a shell's words.
+/// Runs the program in a shell, with `before` and `after` around its command line.
 fn shell(folder: &Path, before: &str, args: &[&str], after: &str) -> Output {
     let program = env!("CARGO_BIN_EXE_shadow-repose");
     let args: Vec<String> = args.iter().map(|arg| format!("'{arg}'")).collect();
@@ -30,7 +30,7 @@ fn m3_what_a_link_leads_to_is_written_and_the_link_stays() {
     succeeded(program(folder, &[&SHORT[..], &["--episodes", "1", "--trace", "link"]].concat()));
     assert!(folder.join("link").is_symlink());
     assert!(fs::read_to_string(folder.join("target")).unwrap().starts_with("{\"sim_dt\""));
-    // A link to what is written into anyway, as /dev/stdout is: the trace, then the table.
+    // A link to stdout, as /dev/stdout is: it gets the trace, then the table.
     let to_stdout = folder.join("stdout");
     std::os::unix::fs::symlink("/proc/self/fd/1", &to_stdout).unwrap();
     let args = [&SHORT[..], &["--episodes", "1", "--trace", "stdout"]].concat();
@@ -51,7 +51,7 @@ fn m6_a_result_that_cannot_be_printed_is_an_error() {
         let output = shell(folder, "", args, "> /dev/full");
         assert_eq!(output.status.code(), Some(1), "{args:?}");
         assert!(stderr(&output).contains("cannot write to stdout"), "{args:?}: {}", stderr(&output));
-        // A reader that has seen enough is none.
+        // A reader that closes the pipe is no error.
         let output = shell(folder, "{ ", args, "; echo $? > code; } | true");
         assert!(stderr(&output).is_empty(), "{args:?}: {}", stderr(&output));
         assert_eq!(fs::read_to_string(folder.join("code")).unwrap(), "0\n", "{args:?}");
@@ -104,7 +104,7 @@ fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
         assert!(
             Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
         );
-        // As a program that catches nothing; a shell calls it 128 and the signal's number.
+        // As for a program without handlers; a shell reports 128 plus the signal's number.
         assert_eq!(child.wait().unwrap().signal(), Some(number));
         assert_eq!(names(folder), [""; 0], "{signal}");
     }
@@ -152,20 +152,19 @@ fn l25_a_name_that_is_no_text_is_resumed_as_the_program_says() {
     let mut command = command(folder, &train(&["--total-steps", "100000000", "--stop-after", "50ms", "--run-dir"]));
     let output = succeeded(command.arg(odd).output().unwrap());
     let said = stderr(&output);
-    let advice = said.lines().last().unwrap().trim().strip_prefix("shadow-repose ").unwrap();
-    let program = env!("CARGO_BIN_EXE_shadow-repose");
-    // $'…' is bash's.
+    let advice = said.lines().last().unwrap().trim();
+    // $'…' needs bash.
     let steps: u64 = said.split(" env steps").next().unwrap().rsplit(' ').next().unwrap().parse().unwrap();
-    let text = format!("'{program}' {advice} --total-steps {}", steps + 128);
+    let text = format!("{advice} --total-steps {}", steps + 128);
     succeeded(Command::new("bash").args(["-c", &text]).current_dir(folder).output().unwrap());
-    // Its curve is a picture that readers take.
+    // The plot of such a run is an SVG without control characters.
     let plot = crate::support::command(folder, &["plot"]).arg(odd).output().unwrap();
     succeeded(plot);
     let svg = fs::read_to_string(folder.join("learning.svg")).unwrap();
     assert!(svg.contains("a \u{fffd}\u{fffd}") && !svg.chars().any(|c| c.is_control() && c != '\n'));
 }
 
-/// What a program says on a terminal of this kind and width; `None` where there is no Python to make one.
+/// Returns what the program prints on a terminal of this type and width, or `None` if there is no Python to create one.
 fn on_a_terminal(folder: &Path, kind: &str, columns: u32, args: &[&str]) -> Option<String> {
     let script = "import fcntl, os, pty, struct, sys, termios\n\
         pid, fd = pty.fork()\n\
@@ -198,13 +197,13 @@ fn m10_plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it
         let run = format!("run-{run}");
         let args = train(&["--total-steps", "25600", "--run-dir", &run, "--set", "run.eval_every=20"]);
         let Some(said) = on_a_terminal(folder, kind, *columns, &args) else {
-            eprintln!("not tested: there is no Python to make a terminal");
+            eprintln!("not tested: there is no Python to create a terminal");
             return;
         };
         assert!(said.contains("steps/s") && said.contains("lesson goals"), "{kind} {columns}: {said}");
         assert_eq!(said.contains("25600 of 25600 steps"), !drawn, "{kind} {columns}: {said}");
         if *drawn {
-            // Between what moves the cursor.
+            // The text between control sequences that move the cursor.
             let lines =
                 said.split(['\r', '\n', '\u{1b}']).map(|line| line.split_once('K').map_or(line, |(_, rest)| rest));
             let lines: Vec<&str> = lines.filter(|line| line.contains("steps/s")).collect();

@@ -1,4 +1,4 @@
-//! What `play --json` says of how long goals take is what the trace of the same episodes shows.
+//! The times that goals take in `play --json` agree with the trace of the same episodes.
 
 use std::fs;
 
@@ -19,7 +19,7 @@ fn how_long_goals_take_is_what_the_trace_shows() {
     let cube = task(&[]).scene().free_body("cube").unwrap().qpos;
     let orientation = |of: &Value| -> Quat { std::array::from_fn(|i| of[i].as_f64().unwrap()) };
 
-    // Step and angle at which the goal in force was given; episode, steps and angle of each that was reached.
+    // Step and angle at which the goal in force was given; then episode, steps and angle of each goal that was reached.
     let (mut given, mut early) = ((0, 0.0), 0);
     let mut reached: Vec<(&Value, i64, f64)> = Vec::new();
     for (record, next) in records.iter().zip(records[1..].iter().chain([&Value::Null])) {
@@ -46,7 +46,7 @@ fn how_long_goals_take_is_what_the_trace_shows() {
     let middle = [(steps.len() - 1) / 2, steps.len() / 2].map(|i| steps[i] as f64);
     close(number("steps_to_goal", "p50"), (middle[0] + middle[1]) / 2.0);
     close(score["drops_first_second"].as_f64().unwrap(), early as f64 / 12.0);
-    // The residuals of the best line are 0 together, and 0 weighted by the angle.
+    // The residuals of the least-squares line sum to 0, also when weighted by the angle.
     let [settle, per_rad] = ["settle", "per_rad"].map(|key| number("steps_fit", key));
     let residual = |(_, steps, angle): &(&Value, i64, f64)| (*steps - 5) as f64 - settle - per_rad * angle;
     close(reached.iter().map(residual).sum::<f64>() / count, 0.0);

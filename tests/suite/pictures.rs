@@ -1,9 +1,10 @@
-//! Pictures and films, as a user asks for them. All are drawn without a display.
+//! Pictures and films that the program makes, all without a display.
 
 use std::fs::{self, File};
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use openh264::decoder::Decoder;
@@ -16,7 +17,7 @@ use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
 use crate::support::{colours_of_the_cube, command, env_config, must_be_possible, program, started, stderr, succeeded};
 
-/// Whether pictures can be drawn here: a machine without EGL is told of, and where CI has installed it that is a failure.
+/// Returns whether pictures can be drawn here. Without EGL it prints a note, or fails if CI has installed EGL.
 fn can_draw() -> bool {
     let folder = tempfile::tempdir().unwrap();
     let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--screenshot", "x.png"];
@@ -26,7 +27,7 @@ fn can_draw() -> bool {
     output.status.success() || must_be_possible("pictures: EGL is missing")
 }
 
-/// Width, height and pixels of a PNG file.
+/// Returns the width and height, and the pixels, of a PNG file.
 fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
     let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
     let mut rgb = vec![0; reader.output_buffer_size().unwrap()];
@@ -35,7 +36,7 @@ fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
     ([info.width, info.height], rgb)
 }
 
-/// Two seconds of a hand that moves, as a film of this name.
+/// Films an episode of two seconds, with `more` arguments.
 fn film(folder: &Path, more: &[&str]) {
     let mut args =
         vec!["play", "--policy", "zero", "--set", "env.max_episode_seconds=2", "--plain", "--size", "160x120"];
@@ -44,10 +45,10 @@ fn film(folder: &Path, more: &[&str]) {
     let leftovers =
         fs::read_dir(folder).unwrap().filter(|e| e.as_ref().unwrap().path().extension().unwrap() == "partial");
     assert_eq!(leftovers.count(), 0);
-    assert!(!stderr(&output).contains("Warning"), "the encoder does not talk: {}", stderr(&output));
+    assert!(!stderr(&output).contains("Warning"), "the encoder prints nothing: {}", stderr(&output));
 }
 
-/// Luminance of every frame of an MP4 file, its size, and its duration in seconds.
+/// Returns the luminance of every frame of an MP4 file, the size of the frames, and the duration in seconds.
 fn decode_mp4(path: &Path) -> (Vec<Vec<u8>>, [usize; 2], f64) {
     let bytes = fs::read(path).unwrap();
     let at = |name: &[u8]| bytes.windows(4).position(|window| window == name).unwrap();
@@ -92,7 +93,7 @@ fn a_picture_needs_no_display_and_shows_the_cube_in_its_colours() {
         assert!(near.iter().map(|&c| u64::from(c)).sum::<u64>() / near.len() as u64 > 60, "not black");
         assert!(colours_of_the_cube(&near) >= 3, "{}", colours_of_the_cube(&near));
         let (_, far) = picture(&folder.path().join("far.png"));
-        assert_eq!(colours_of_the_cube(&far), 0, "from far away there is hardly a cube");
+        assert_eq!(colours_of_the_cube(&far), 0, "from far away the cube is hardly visible");
     }
 }
 
@@ -164,10 +165,10 @@ fn an_interrupted_film_shows_what_was_played() {
         files.into_iter().find(|path| path.extension().unwrap() == "partial")
     };
     let begun = Instant::now();
-    // Frames come after the space that is kept for the index.
+    // Frames follow the space that is reserved for the index.
     while unfinished().and_then(|path| fs::metadata(path).ok()).map_or(0, |facts| facts.len()) < 200 * 501 * 16 + 20_000
     {
-        assert!(begun.elapsed() < Duration::from_secs(120), "the film grows");
+        assert!(begun.elapsed() < Duration::from_secs(120), "the film does not grow");
         std::thread::sleep(Duration::from_millis(20));
     }
     assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
@@ -189,7 +190,12 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
     };
     let config = env_config(&[]);
     let (plain, dressed) = (Task::new(&config).unwrap(), Task::new_to_see(&config, &look).unwrap());
-    let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) = (started(&plain), started(&dressed));
+    same_physics(&plain, &dressed);
+}
+
+/// Steps both tasks under the same actions, and compares every bit.
+fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
+    let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) = (started(plain), started(dressed));
     for step in 0..400 {
         let action: Vec<f32> = (0..ACTION_SIZE).map(|i| ((step * (i + 3)) as f32 * 0.07).sin()).collect();
         let transitions = [&mut plain, &mut dressed].map(|(env, observation)| env.step(&action, observation));
@@ -197,6 +203,32 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
         assert_eq!(plain.1, dressed.1);
     }
     assert_eq!(plain.0.simulation().qpos(), dressed.0.simulation().qpos());
+}
+
+#[test]
+fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit() {
+    // The built-in scene without lights, sky and the plates on the cubes.
+    let words = ["<light ", "castshadow=\"false\"/>", "type=\"skybox\"", "size=\".0005", "size=\".022"];
+    let text = include_str!("../../assets/shadow_hand/scene.xml");
+    let bare: Vec<&str> = text.lines().filter(|line| !words.iter().any(|word| line.contains(word))).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bare.xml");
+    // What a class says of the mass of its geoms must not make the plates heavy.
+    let bare = bare.join("\n").replace("<default>\n", "<default>\n    <geom mass=\".02\"/>\n");
+    assert!(bare.contains("<geom mass="));
+    std::fs::write(&path, bare).unwrap();
+    let config = env_config(&[&format!("env.model={}", path.display())]);
+    let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
+    let (plain, furnished) = (Task::new(&config).unwrap(), Task::new_to_see(&config, &look).unwrap());
+    let geoms = [&plain, &furnished].map(|task| task.scene().geoms());
+    assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
+    same_physics(&plain, &furnished);
+    if can_draw() {
+        let args = ["view", "--quality", "fast", "--size", "320x240", "--screenshot", "x.png", "--set"];
+        succeeded(program(folder.path(), &[&args[..], &[&format!("env.model={}", path.display())]].concat()));
+        let (_, rgb) = picture(&folder.path().join("x.png"));
+        assert!(colours_of_the_cube(&rgb) >= 2, "the faces of the cube can be told apart");
+    }
 }
 
 #[test]
@@ -226,7 +258,7 @@ fn without_the_network_the_primitives_are_shown_and_it_is_said() {
     assert!(said.contains("primitives are shown instead") && said.contains("python3 could not be started"), "{said}");
     assert!(folder.path().join("x.png").exists());
     let cache: Vec<_> = fs::read_dir(folder.path().join("cache/shadow-repose")).into_iter().flatten().collect();
-    assert!(cache.is_empty(), "nothing half is left");
+    assert!(cache.is_empty(), "no unfinished file is left");
 }
 
 #[test]
@@ -273,7 +305,7 @@ fn pictures_and_films_that_cannot_be_are_refused() {
         assert_eq!(output.status.code(), Some(code), "{args:?} {said}");
         assert!(said.contains(part) && !said.contains("panicked"), "{args:?} {said}");
     };
-    refused(&["view", "--screenshot", "x.png", "--size", "640"], 2, "as 640x480");
+    refused(&["view", "--screenshot", "x.png", "--size", "640"], 2, "e.g. 640x480");
     refused(&["view", "--screenshot", "x.png", "--size", "8x8"], 2, "from 16 to 3840");
     refused(&["view", "--screenshot", "x.png", "--camera", "1,2"], 2, "three numbers");
     refused(&["view", "--screenshot", "x.png", "--camera", "1,2,-3"], 2, "from 0.05 to 10");

@@ -1,4 +1,4 @@
-//! The learner on a task without physics: learning can be tested in seconds.
+//! The learner on a task without physics, where learning can be tested in seconds.
 
 use std::sync::atomic::AtomicBool;
 
@@ -16,13 +16,13 @@ const STEPS: u32 = 20;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// A point in the plane that is moved by up to 0.2 a step and should come to the origin.
-pub struct PointMass {
+/// A point in the plane that moves by up to 0.2 per step and axis and should reach the origin.
+pub(crate) struct PointMass {
     position: [f64; 2],
     age: u32,
-    /// Where it panics.
+    /// The age at which it panics.
     trap: Option<u32>,
-    /// The steps after which its goal is replaced, by the same one.
+    /// The number of steps after which the goal is replaced by the same one.
     redirects: u32,
 }
 
@@ -37,7 +37,7 @@ impl PointMass {
 }
 
 impl Env for PointMass {
-    /// The distance at the end.
+    /// The distance at the end of the episode.
     type Episode = f64;
     type Lesson = ();
     const SPACES: Spaces = Spaces {
@@ -91,18 +91,18 @@ fn agent_of(envs: usize, settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
     divided(envs, settings, seed, Division::alone(1))
 }
 
-/// The agent of one rank, for so many points of its own.
-pub fn divided(envs: usize, settings: &PpoConfig, seed: u64, division: Division) -> Agent<PointMass> {
+/// Returns the agent of one rank, with this number of its own points.
+pub(crate) fn divided(envs: usize, settings: &PpoConfig, seed: u64, division: Division) -> Agent<PointMass> {
     let point = |_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS };
     Agent::new((0..envs).map(point).collect(), settings, seed, division, |_| ()).unwrap()
 }
 
-pub fn settings() -> PpoConfig {
+pub(crate) fn settings() -> PpoConfig {
     let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.max_std.from=0.5", "ppo.gamma=0.9"];
     config(&[&settings[..], &["ppo.symmetry=none"]].concat()).ppo
 }
 
-/// Mean distances at the end of the episodes of the first and of the last of 60 iterations.
+/// Trains for 60 iterations; returns the mean distance at the end of episodes, for the first and the last iteration with any.
 fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
     let mut agent = agent(settings, seed);
     let mut distances = Vec::new();
@@ -132,7 +132,7 @@ fn ppo_learns_with_candles_tensors_too() {
     assert!(first > 0.5 && last < 0.15, "{first} → {last}");
 }
 
-/// On a processor with tiles for bf16; elsewhere the refusal is tested with the program.
+/// Only on a processor with bf16 tiles; on others, the tests of the program check the refusal.
 #[test]
 fn ppo_learns_on_tiles_where_there_are_any() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
@@ -154,7 +154,7 @@ fn a_policy_starts_with_the_upper_bound_of_its_standard_deviations_which_then_fa
     }
     let at_once = PpoConfig { max_std: Ramp { steps: 0, ..max_std }, ..settings };
     let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Division::alone(1)).unwrap();
-    assert!(ppo.policy().std().iter().all(|std| (std - 0.125).abs() < 1e-6), "no steps: the end at once");
+    assert!(ppo.policy().std().iter().all(|std| (std - 0.125).abs() < 1e-6), "0 steps: the final value from the start");
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
             let stats = agent.iterate(&NEVER).unwrap().expect("nothing stops it").update;
             assert!(stats.first_kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first_kl);
             assert!(stats.first_ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first_ratio_error);
-            assert!(stats.kl > 1e-4, "later minibatches must have moved on: {}", stats.kl);
+            assert!(stats.kl > 1e-4, "the policy must have changed in later minibatches: {}", stats.kl);
         }
     }
 }
@@ -195,10 +195,10 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
     assert_eq!(before, answer(&ppo), "nothing is learnt from it");
 }
 
-/// What the policy does somewhere.
+/// Returns the mean action of the policy for one observation.
 fn answer(ppo: &Ppo) -> [f32; 2] {
     let (policy, mut means) = (ppo.policy().freeze(), [0.0; 2]);
-    policy.forward(&[0.3, -0.4], Some(&mut means), None, &mut policy.workspace(1));
+    policy.mean_actions(&[0.3, -0.4], &mut means, &mut policy.workspace(1));
     means
 }
 
@@ -219,7 +219,7 @@ fn a_panic_in_an_environment_is_an_error_with_its_number_on_any_number_of_thread
 #[test]
 fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_termination_does_not() {
     let mut agent = agent(&settings(), 1);
-    // One point starts so far out that it is lost at once.
+    // One point starts so far out that its episode terminates at once.
     agent.rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
     agent.pool.envs_mut().next().unwrap().position = [5.0, 5.0];
     agent.pool.envs_mut().skip(1).step_by(2).for_each(|env| env.redirects = 7);
@@ -235,7 +235,7 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
         let mut expected = -0.2 * distance;
         if block.dones[i] && distance <= 3.0 {
             let mut value = [0.0];
-            policy.forward(&moved, None, Some(&mut value), &mut work);
+            policy.values(&moved, &mut value, &mut work);
             expected += 0.9 * value[0];
             let next = 2 * (i + block.step(0, 1).len());
             let goes_on = (0..2).all(|axis| (block.observations[next + axis] - moved[axis]).abs() < 1e-5);
@@ -268,7 +268,7 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
             })
         };
         let one = learn(1);
-        assert!(one.1.len() >= 3 * envs, "episodes must end meanwhile");
+        assert!(one.1.len() >= 3 * envs, "episodes must end during the test");
         assert!(one == learn(2) && one == learn(8), "{envs} environments");
     }
 }
@@ -279,5 +279,5 @@ fn iterations_and_steps_are_counted_where_they_are_made() {
     let made = agent.iterate(&NEVER).unwrap().expect("nothing stops it");
     assert_eq!((agent.iteration, agent.env_steps, made.steps), (1, 72, 72));
     assert!(agent.iterate(&AtomicBool::new(true)).unwrap().is_none());
-    assert_eq!((agent.iteration, agent.env_steps), (1, 72), "one that was stopped is not counted");
+    assert_eq!((agent.iteration, agent.env_steps), (1, 72), "an iteration that was stopped is not counted");
 }

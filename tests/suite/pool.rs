@@ -1,4 +1,4 @@
-//! Many environments at once.
+//! Pools of many environments.
 
 use rand::RngExt;
 use shadow_repose::env::{ACTION_SIZE, End, EnvBlock, EnvPool, OBSERVATION_SIZE, Repose, StepBuffers};
@@ -8,13 +8,13 @@ use shadow_repose::schedule::in_rounds;
 use crate::support::task;
 
 struct Played {
-    /// After each step, of all environments.
+    /// Observations of all environments after each step.
     observations: Vec<f32>,
     rewards: Vec<f32>,
     lengths: Vec<u32>,
 }
 
-/// A block of environments and all that it reads and writes.
+/// A block of environments with the buffers that it reads and writes.
 struct Block<'a> {
     envs: &'a mut EnvBlock<Repose>,
     first: usize,
@@ -27,7 +27,7 @@ struct Block<'a> {
 }
 
 impl Block<'_> {
-    /// Steps with these actions of all environments.
+    /// Steps the block; `actions` are those of all environments.
     fn step(&mut self, actions: &[f32]) {
         let actions = &actions[self.first * ACTION_SIZE..][..self.envs.count() * ACTION_SIZE];
         let buffers = StepBuffers {
@@ -41,10 +41,10 @@ impl Block<'_> {
         for (i, end) in self.ends.iter().enumerate() {
             let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
             let previous_action = &self.observations[rows.clone()][137..];
-            // A new episode has begun where one ended: it has no previous action, its predecessor's end has.
+            // Where an episode ended, a new one has begun: only there is the previous action zero.
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
             if *end == Some(End::Truncated) {
-                // The final observation is that of this environment: it shows the action that was its last.
+                // The final observation is that of this environment: it shows its last action.
                 let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
                 assert_eq!(self.final_observations[rows][137..], last);
@@ -93,7 +93,7 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: im
     })
 }
 
-/// Random actions, always the same.
+/// Returns a function of step and index that gives random actions, always the same.
 fn noise() -> impl Fn(usize, usize) -> f32 {
     let mut noise = rng::stream(0, "test", 0);
     let numbers: Vec<f32> = (0..10_007).map(|_| 3.0 * noise.random::<f32>() - 1.5).collect();
@@ -180,6 +180,6 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
         assert!(ended == expected && ended.len() > 24, "{} episodes ended", ended.len());
         let other = EnvPool::new(5, (0..23).map(|_| Repose::new(&task)).collect::<Vec<_>>()).save();
         let rows = restored.iter_mut().map(|rows| &mut rows[..]).collect();
-        assert!(again.restore(&other, rows).is_err(), "a state of fewer environments");
+        assert!(again.restore(&other, rows).is_err(), "the state of fewer environments must be refused");
     });
 }

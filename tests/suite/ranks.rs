@@ -1,4 +1,4 @@
-//! A training that is divided computes the same, however it is divided.
+//! A divided training computes the same bits, however it is divided.
 
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Barrier, Mutex};
@@ -10,7 +10,7 @@ use shadow_repose::ranks::{Division, Ranks, tree_sum};
 use crate::point_mass::{divided, settings};
 use crate::support::config;
 
-/// Ranks that are threads of one process.
+/// A rank that is a thread of this process.
 struct Seat {
     rank: usize,
     table: Arc<Table>,
@@ -48,7 +48,7 @@ impl Ranks for Seat {
     }
 }
 
-/// What so many ranks come to, each with a share of `shards`, and with threads of its own.
+/// Returns the results of this number of ranks, each with its part of the `shards` and with its own threads.
 fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Division) -> T + Sync) -> Vec<T> {
     let (floats, doubles) = (Mutex::new(vec![Vec::new(); ranks]), Mutex::new(vec![Vec::new(); ranks]));
     let table = Arc::new(Table { barrier: Barrier::new(ranks), floats, doubles });
@@ -65,7 +65,7 @@ fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Division)
     })
 }
 
-/// Weights, statistics of the normaliser, and a figure of each update, as bits; and the episodes that ended.
+/// The weights as bits; figures of each update and the statistics of the normaliser, as bits; and the episodes that ended.
 type Learnt<T> = (Vec<u32>, Vec<u64>, Vec<T>);
 
 fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode> {
@@ -81,7 +81,7 @@ fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode>
     (weights, figures.into_iter().map(f64::to_bits).collect(), agent.pool.take_finished())
 }
 
-/// Fails unless all ranks hold the same weights and figures as one, and together its episodes.
+/// Fails unless all ranks hold the weights and figures of a single one, and together its episodes.
 fn assert_same<T: PartialEq>(one: Learnt<T>, ranks: Vec<Learnt<T>>, what: &str, order: impl Fn(&mut Vec<T>)) {
     let (weights, figures, mut episodes) = one;
     let mut together = Vec::new();
@@ -91,7 +91,7 @@ fn assert_same<T: PartialEq>(one: Learnt<T>, ranks: Vec<Learnt<T>>, what: &str, 
     }
     order(&mut episodes);
     order(&mut together);
-    assert!(together == episodes && !episodes.is_empty(), "{what}: the episodes");
+    assert!(together == episodes && !episodes.is_empty(), "{what}: the episodes differ");
 }
 
 #[test]
@@ -144,7 +144,7 @@ fn the_number_of_shards_is_the_largest_power_of_two_that_fits_or_the_one_that_is
         config(&[&[hands.as_str(), "ppo.horizon=16", "ppo.minibatches=4"], more].concat()).shards()
     };
     assert_eq!([1024, 1, 7, 16, 100].map(|hands| shards(hands, &[])), [16, 1, 1, 16, 4]);
-    // 24 samples a minibatch.
+    // 24 samples per minibatch.
     assert_eq!(shards(16, &["ppo.horizon=6"]), 8);
     assert_eq!(shards(1024, &["run.shards=64"]), 64);
     for wrong in ["run.shards=3", "run.shards=2048"] {

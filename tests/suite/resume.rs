@@ -1,4 +1,4 @@
-//! What `--resume` finds, and what it may change.
+//! `--resume`: which files it uses, and what may change.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,18 +7,18 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::Stdio;
 
-use shadow_repose::ppo::Checkpoint;
+use shadow_repose::ppo::{Checkpoint, Evaluation};
 
 use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train};
 use crate::survival::{iterations, result, resume};
 
-/// A run in `run` of ten iterations with all of these checkpoints.
+/// Trains a run of ten iterations in `run` and keeps all its checkpoints.
 fn run_of_ten(folder: &Path, more: &[&str]) {
     let args = ["--total-steps", "1280", "--run-dir", "run", "--keep", "9", "--set", "run.checkpoint_every=2"];
     succeeded(program(folder, &train(&[&args, more].concat())));
 }
 
-/// Every file in a folder and below with its bytes, by name; two names of one file are told by its number.
+/// Returns the inode number and the bytes of every file in a folder and below, by name; two names of one file share the inode.
 fn everything(folder: &Path) -> BTreeMap<String, (u64, Vec<u8>)> {
     let mut found = BTreeMap::new();
     for name in names(folder) {
@@ -68,7 +68,7 @@ fn a_run_that_is_resumed_is_left_as_it_was_until_an_iteration_is_done() {
         child.wait().unwrap();
         assert!(everything(&folder.join("run")) == before, "{place}, killed");
     }
-    // Once an iteration is done, the run goes on from the older one, and nothing is thrown away.
+    // Once an iteration is done, the run continues from the older checkpoint, and nothing is deleted.
     let output = succeeded(program(folder, &["train", "--resume", &older, "--total-steps", "32768", "--keep", "9"]));
     assert!(stderr(&output).contains("2 rows of metrics.csv after iteration 1 are dropped"), "{}", stderr(&output));
     assert_eq!(iterations(folder), 2);
@@ -103,7 +103,7 @@ fn m1_a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
     run_of_ten(folder, &[]);
     succeeded(resume(folder, &["--total-steps", "1536", "--set", "env.model=own.xml"]));
     refused(folder, &["--resume", "run", "--total-steps", "1792"], &["no path in a file is followed", "env.model="]);
-    // Of another version.
+    // A checkpoint of another version.
     let newest = folder.join(checkpoint(12));
     let whole = fs::read(&newest).unwrap();
     let text = String::from_utf8_lossy(&whole).replacen("shadow-repose checkpoint 3", "shadow-repose checkpoint 9", 1);
@@ -113,7 +113,7 @@ fn m1_a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
     assert!(text.contains("checkpoint 9"));
     fs::write(&newest, shadow_repose::ppo::sealed(&newer).unwrap()).unwrap();
     refused(folder, &["--resume", "run", "--total-steps", "1792"], &["its format is `shadow-repose checkpoint 9`"]);
-    // One that cannot be read: a folder in its place, whoever the user is.
+    // A checkpoint that no user can read: a folder in its place.
     fs::remove_file(&newest).unwrap();
     fs::remove_file(folder.join("run/checkpoints/latest.safetensors")).unwrap();
     fs::create_dir(folder.join("run/checkpoints/latest.safetensors")).unwrap();
@@ -127,9 +127,9 @@ fn m4_a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
     run_of_ten(folder, &["--set", "run.eval_every=3"]);
     let best = folder.join("run/checkpoints/best.safetensors");
     let policy = folder.join("run/policy.safetensors");
-    // One that nothing beats.
+    // A best checkpoint that nothing can beat.
     let mut unbeatable = Checkpoint::parse(&fs::read(&best).unwrap()).unwrap();
-    unbeatable.progress.best = Some([9.0, 0.0]);
+    unbeatable.progress.best = Some(Evaluation { goals: 9.0, rot_dist: 0.0 });
     fs::write(&best, unbeatable.to_bytes().unwrap()).unwrap();
     for lose in [true, false] {
         if lose {
@@ -139,7 +139,7 @@ fn m4_a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
         succeeded(resume(folder, &["--total-steps", total]));
         assert!(fs::read(&policy).unwrap() == unbeatable.policy_alone().to_bytes().unwrap(), "lost: {lose}");
     }
-    // Both lost: the latest policy, without the score of another.
+    // If both are lost, it is the latest policy, without another policy's score.
     fs::remove_file(&policy).unwrap();
     fs::remove_file(&best).unwrap();
     succeeded(resume(folder, &["--total-steps", "1920"]));
@@ -155,7 +155,7 @@ fn m5_a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_b
     let best = folder.join("run/checkpoints/best.safetensors");
     let policy = folder.join("run/policy.safetensors");
     let mut unbeatable = Checkpoint::parse(&fs::read(&policy).unwrap()).unwrap();
-    unbeatable.progress.best = Some([9.0, 0.0]);
+    unbeatable.progress.best = Some(Evaluation { goals: 9.0, rot_dist: 0.0 });
     let unbeatable = unbeatable.to_bytes().unwrap();
     fs::write(&policy, &unbeatable).unwrap();
     let mut bytes = fs::read(&best).unwrap();
@@ -163,7 +163,7 @@ fn m5_a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_b
     bytes[middle] ^= 1;
     fs::write(&best, &bytes).unwrap();
     let output = succeeded(resume(folder, &["--total-steps", "1920"]));
-    assert!(stderr(&output).contains("best.safetensors is damaged; it is now"), "{}", stderr(&output));
+    assert!(stderr(&output).contains("best.safetensors is damaged; renamed to"), "{}", stderr(&output));
     assert_eq!(fs::read(folder.join("run/checkpoints/best.damaged")).unwrap(), bytes);
     assert!(fs::read(&policy).unwrap() == unbeatable && !best.exists());
 }
@@ -201,10 +201,10 @@ fn l12_settings_that_were_edited_in_a_run_folder_are_refused_by_name() {
         refused(
             folder,
             &["--resume", "run", "--total-steps", "1408"],
-            &[reason, "put run/config.toml back", "delete it"],
+            &[reason, "restore run/config.toml", "delete it"],
         );
     }
-    // What does not change the training does not count, nor does what every run of before had.
+    // Edits that do not affect the training are accepted, and so are files from before there were shards.
     let mut sections: Vec<&str> = text.split("\n\n").collect();
     sections.reverse();
     let same = format!("# mine\n{}", sections.join("\n\n")).replace("total_steps = 1280", "total_steps = 9");
@@ -228,7 +228,7 @@ fn l22_rows_that_are_missing_are_named() {
     fs::write(&path, fewer).unwrap();
     let output = succeeded(resume(folder, &["--total-steps", "1408"]));
     assert!(stderr(&output).contains("metrics.csv lacks 3 of the 10 rows up to iteration 10"), "{}", stderr(&output));
-    // A fork lacks none.
+    // A fork lacks no rows.
     let output = succeeded(program(folder, &["train", "--fork", "run", "--total-steps", "1536", "--run-dir", "fork"]));
     assert!(!stderr(&output).contains("lacks"), "{}", stderr(&output));
     let output = succeeded(program(folder, &["train", "--resume", "fork", "--total-steps", "1664"]));

@@ -1,4 +1,4 @@
-//! What happens to the run folder while a training writes into it: it is damaged, deleted, replaced, or its disk is full.
+//! Run folders that are damaged, deleted or replaced while a training writes into them, or whose disk is full.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +15,7 @@ fn the_newest_checkpoints_are_kept_as_many_as_asked_for() {
     succeeded(program(folder.path(), &args));
     let expected = ["best", "iteration-00000008", "iteration-00000009", "iteration-00000010", "latest"];
     assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
-    // As many in a resumed run, where nothing else is said.
+    // A resumed run keeps the same number by default.
     succeeded(resume(folder.path(), &["--total-steps", "1408"]));
     let expected = ["best", "iteration-00000009", "iteration-00000010", "iteration-00000011", "latest"];
     assert_eq!(names(&folder.path().join("run/checkpoints")), expected.map(|name| format!("{name}.safetensors")));
@@ -28,7 +28,7 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
     succeeded(program(folder.path(), &args));
     let expected = result(folder.path(), "run");
     let latest = folder.path().join("run/checkpoints/latest.safetensors");
-    // In place, as a disk does it: the same file under both its names.
+    // Changed in place, as a disk would: both names are the same file.
     let mut bytes = fs::read(&latest).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -70,11 +70,11 @@ fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
 fn a_file_that_may_not_grow_any_more_costs_rows_but_not_the_training() {
     let folder = tempfile::tempdir().unwrap();
     let settings = train(&["--total-steps", "64000", "--run-dir", "run", "--set", "run.checkpoint_every=5"]).join(" ");
-    // In blocks of 512 bytes: room for a checkpoint of 124 KB, not for 500 rows. Writes beyond it fail as on a full disk.
+    // In blocks of 512 bytes: enough for a checkpoint of 124 KB, not for 500 rows. Writes beyond that fail as on a full disk.
     let script = format!("trap '' XFSZ; ulimit -f 280; exec {} {settings}", env!("CARGO_BIN_EXE_shadow-repose"));
     let output = Command::new("sh").args(["-c", &script]).current_dir(folder.path()).output().unwrap();
     let said = stderr(&succeeded(output));
-    assert!(said.contains("metrics.csv is not written for now") && said.contains("metrics.csv lacks"), "{said}");
+    assert!(said.contains("logging to metrics.csv is suspended") && said.contains("metrics.csv lacks"), "{said}");
     let rows = iterations(folder.path());
     assert!((100..500).contains(&rows), "{rows} rows");
     succeeded(program(folder.path(), &["play", "--ckpt", "run", "--episodes", "2", "--json"]));
@@ -101,7 +101,7 @@ fn a_folder_that_is_deleted_meanwhile_is_made_anew() {
     let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "run.checkpoint_every=1"]);
     let (child, lines) = begun(command(folder.path(), &args));
     let run = folder.path().join("run");
-    // The training may be writing into it at this very moment.
+    // The training may be writing into it at the same time.
     let patience = Instant::now();
     while fs::remove_dir_all(&run).is_err() && run.exists() {
         assert!(patience.elapsed() < Duration::from_secs(30));
@@ -125,7 +125,7 @@ fn a_state_that_cannot_be_saved_in_its_place_in_the_end_is_saved_elsewhere() {
     let mut training = command(folder.path(), &args);
     training.env("TMPDIR", folder.path().join("tmp"));
     let (child, lines) = begun(training);
-    // A file where a folder should be stops everybody, root too.
+    // A file in place of a folder stops every user, even root.
     let checkpoints = folder.path().join("run/checkpoints");
     fs::remove_dir_all(&checkpoints).unwrap();
     fs::write(&checkpoints, "in the way").unwrap();
@@ -137,8 +137,8 @@ fn a_state_that_cannot_be_saved_in_its_place_in_the_end_is_saved_elsewhere() {
     assert!(stderr(&succeeded(resumed)).contains("stopped after"));
 }
 
-/// Runs a shell script with a file system of `size` at `small` in `folder`, of its own and gone with it; none where the
-/// system does not let us.
+/// Runs a shell script in `folder` with a temporary file system of `size` mounted at `small`. Returns `None` if the system does
+/// not permit this.
 fn with_small_disk(folder: &Path, size: &str, script: &str) -> Option<Output> {
     fs::create_dir(folder.join("small")).unwrap();
     let unshared = |script: &str| {
@@ -160,7 +160,7 @@ fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
     let folder = tempfile::tempdir().unwrap();
     let settings =
         train(&["--total-steps", "100000", "--run-dir", "small/run", "--set", "run.checkpoint_every=5"]).join(" ");
-    // The disk is full from early on, and is given room again before a second one comes to its end.
+    // The disk is full soon after the start. Space is freed before the run is resumed.
     let script = format!(
         "($PROGRAM {settings} 2> said & train=$!
           until grep -q steps/s said || ! kill -0 $train; do sleep 0.01; done
@@ -174,11 +174,11 @@ fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
     let said = fs::read_to_string(folder.path().join("said")).unwrap();
     let printed = String::from_utf8_lossy(&output.stdout);
     let lines: Vec<&str> = printed.lines().collect();
-    // Full in the end too: that is an error, and the state is elsewhere.
+    // It is still full at the end: that is an error, and the state is saved elsewhere.
     assert_eq!(lines[0], "code 1", "{said}");
     assert!(said.contains("tried again at the next checkpoint") && said.contains("No space left"), "{said}");
     assert!(said.contains("99968 of 100000") || said.contains("100096 of 100000"), "all steps were made: {said}");
-    assert!(said.contains("instead; go on with"), "{said}");
+    assert!(said.contains("instead; resume with"), "{said}");
     assert!(said.contains("metrics.csv lacks"), "what was lost is counted: {said}");
     assert!(lines[1].contains("\"episodes\":2"), "the last whole checkpoint plays: {printed}");
     assert_eq!(lines[2], "code 0", "{}", stderr(&output));

@@ -1,4 +1,4 @@
-//! The built-in model, and scenes of a user's own.
+//! The built-in scene and custom scenes.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use shadow_repose::sim::{BareSimulation, Physics, Scene, Simulation, Variation};
 
 use crate::support::{SCENE, env_config, started, task};
 
-/// Writes `text` as a scene and tries to make a task of it; the message of the refusal.
+/// Writes `text` as a scene, tries to create a task from it, and returns the error message.
 fn refusal(text: &str) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = write(&folder, text);
@@ -52,7 +52,7 @@ fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
     ] {
         assert_range(scene.hinge(name).unwrap().range, range);
     }
-    // THJ5 … THJ1, FFJ4, FFJ3, FFJ0: a coupled actuator has the sum of two ranges.
+    // THJ5 … THJ1, FFJ4, FFJ3, FFJ0: the range of a coupled actuator is the sum of two ranges.
     assert_range(hand.actuators[0].range, [-1.0472, 1.0472]);
     assert_range(hand.actuators[7].range, [0.0, 3.1415]);
     assert_range(hand.actuators[18].range, [-0.523599, 0.174533]);
@@ -78,7 +78,7 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
     let task = task(&[]);
     let (mut env, mut observation) = started(&task);
     for _ in 0..40 {
-        // Until the cube lies in the hand: steps with contacts.
+        // Until the cube lies in the hand, so that the steps have contacts.
         let _ = env.step(&[0.3; 20], &mut observation);
     }
     let mut bare = BareSimulation::new(task.scene());
@@ -100,7 +100,7 @@ fn bodies_are_of_the_same_instant_as_joints() {
     for _ in 0..25 {
         let _ = env.step(&[0.5; 20], &mut observation);
     }
-    // The same joints and velocities in another simulation, whose bodies are computed from them alone.
+    // Another simulation with the same joint positions and velocities, whose bodies are computed from these alone.
     let tip = task.scene().body("rh_ffdistal").unwrap();
     let mut other = Simulation::new(task.scene());
     other.qpos_mut().copy_from_slice(env.simulation().qpos());
@@ -108,15 +108,15 @@ fn bodies_are_of_the_same_instant_as_joints() {
     other.refresh();
     assert_eq!(other.pose(tip), env.simulation().pose(tip));
     assert_eq!(other.velocity(tip), env.simulation().velocity(tip));
-    let position: Vec<f32> = other.pose(tip).0.iter().map(|&x| x as f32).collect();
+    let position: Vec<f32> = other.pose(tip).position.iter().map(|&x| x as f32).collect();
     assert_eq!(observation[72..75], position);
-    let linear: Vec<f32> = other.velocity(tip).0.iter().map(|&x| x as f32).collect();
+    let linear: Vec<f32> = other.velocity(tip).linear.iter().map(|&x| x as f32).collect();
     assert_eq!(observation[79..82], linear);
 }
 
 #[test]
 fn an_own_scene_may_list_its_parts_in_any_order() {
-    // The actuators the other way round: controls are found by name, so the hand does the same.
+    // The actuators in reverse order: controls are found by name, so the hand behaves the same.
     let start = SCENE.find("    <position name=\"rh_A_WRJ2\"").unwrap();
     let end = SCENE.find("  </actuator>").unwrap();
     let reversed: Vec<&str> = SCENE[start..end].lines().rev().collect();
@@ -188,11 +188,11 @@ fn the_program_decides_the_timestep() {
     let before = env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
     let _ = env.step(&[0.0; 20], &mut observation);
     let fallen = before - env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
-    // Five steps of 2 ms fall g · dt² · (1 + 2 + 3 + 4 + 5).
+    // In five steps of 2 ms the cube falls by g · dt² · (1 + 2 + 3 + 4 + 5).
     assert!((fallen - 9.81 * 0.002 * 0.002 * 15.0).abs() < 1e-6, "fell by {fallen}");
 }
 
-/// But for the pairs that the scene excludes by name.
+/// Except for the pairs that the scene excludes by name.
 #[test]
 fn everything_solid_can_touch_everything_else() {
     use mujoco_rs::prelude::MjModel;

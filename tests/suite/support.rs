@@ -1,4 +1,4 @@
-//! What several tests need.
+//! Helpers shared by several tests.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,10 +10,10 @@ use shadow_repose::env::{Env, OBSERVATION_SIZE, Repose, Task};
 use shadow_repose::rng;
 
 /// The built-in scene as text.
-pub const SCENE: &str = include_str!("../../assets/shadow_hand/scene.xml");
+pub(crate) const SCENE: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
-/// Settings of a training that takes a second: 2 iterations are 256 steps.
-pub const SMALL: &[&str] = &[
+/// The settings of a training that takes a second: 2 iterations are 256 steps.
+pub(crate) const SMALL: &[&str] = &[
     "env.num_envs=16",
     "ppo.horizon=8",
     "ppo.hidden=[16,8]",
@@ -25,24 +25,24 @@ pub const SMALL: &[&str] = &[
     "run.eval_every=1",
 ];
 
-/// The default configuration with these settings on top.
-pub fn config(settings: &[&str]) -> Config {
+/// Returns the default configuration with these settings applied over it.
+pub(crate) fn config(settings: &[&str]) -> Config {
     let settings: Vec<Override> = settings.iter().map(|s| s.parse().unwrap()).collect();
     Config::resolve(None, &settings).unwrap()
 }
 
-/// The task with these settings.
-pub fn task(settings: &[&str]) -> Arc<Task> {
+/// Returns the task with these settings.
+pub(crate) fn task(settings: &[&str]) -> Arc<Task> {
     Task::new(&config(settings).env).unwrap()
 }
 
-/// The settings of the task.
-pub fn env_config(settings: &[&str]) -> EnvConfig {
+/// Returns the `[env]` settings of the default configuration with these settings applied over it.
+pub(crate) fn env_config(settings: &[&str]) -> EnvConfig {
     config(settings).env
 }
 
-/// An environment of `task` at the start of episode 0, and its observation.
-pub fn started(task: &Arc<Task>) -> (Repose, Vec<f32>) {
+/// Returns an environment of `task` at the start of episode 0, and its observation.
+pub(crate) fn started(task: &Arc<Task>) -> (Repose, Vec<f32>) {
     let mut env = Repose::new(task);
     let mut observation = vec![0.0; OBSERVATION_SIZE];
     env.reset(rng::stream(7, "test", 0), &mut observation);
@@ -50,49 +50,52 @@ pub fn started(task: &Arc<Task>) -> (Repose, Vec<f32>) {
 }
 
 /// Runs the program in `folder`.
-pub fn program(folder: &Path, args: &[&str]) -> Output {
+pub(crate) fn program(folder: &Path, args: &[&str]) -> Output {
     command(folder, args).output().expect("the program starts")
 }
 
-/// The program in `folder`, not started yet.
-pub fn command(folder: &Path, args: &[&str]) -> Command {
+/// Returns the command that runs the program in `folder`.
+pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_shadow-repose"));
-    // A window of a test would open on the user's own display.
+    // Otherwise the window of a test would open on the user's own display.
     command.current_dir(folder).args(args).env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY");
+    // Commands that it prints depend on whether cargo has called it.
+    command.env_remove("CARGO_PKG_NAME");
     command
 }
 
-/// `train` with the settings of [`SMALL`] and more arguments.
-pub fn train<'a>(more: &[&'a str]) -> Vec<&'a str> {
+/// Returns the arguments of `train` with the settings of [`SMALL`] and `more` arguments.
+pub(crate) fn train<'a>(more: &[&'a str]) -> Vec<&'a str> {
     let mut args = vec!["train"];
     SMALL.iter().for_each(|setting| args.extend(["--set", setting]));
     args.extend(more);
     args
 }
 
-/// What a program said on stderr.
-pub fn stderr(output: &Output) -> String {
+/// Returns what a program printed on stderr.
+pub(crate) fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Fails with what the program said unless it exited with 0.
+/// Fails with what the program printed on stderr unless it exited with 0.
 #[track_caller]
-pub fn succeeded(output: Output) -> Output {
+pub(crate) fn succeeded(output: Output) -> Output {
     assert!(output.status.success(), "{:?}\n{}", output.status, stderr(&output));
     output
 }
 
-/// Says that something cannot be tested here; where CI has installed what it needs, that is a failure. Always false.
+/// Prints that something cannot be tested here and returns false. Fails if CI has installed what the test needs.
 #[cfg(any(feature = "video", feature = "viewer"))]
-pub fn must_be_possible(what: &str) -> bool {
+pub(crate) fn must_be_possible(what: &str) -> bool {
     assert!(std::env::var_os("SHADOW_REPOSE_SEES").is_none(), "not possible here: {what}");
     eprintln!("not tested: {what}");
     false
 }
 
-/// How many of the cube's colours (red, orange, yellow, green, blue) a picture `[height, width, 3]` has in plenty.
+/// Returns how many of the cube's colours (red, orange, yellow, green, blue) cover more than 0.2 % each of a picture
+/// `[height, width, 3]`.
 #[cfg(any(feature = "video", feature = "viewer"))]
-pub fn colours_of_the_cube(rgb: &[u8]) -> usize {
+pub(crate) fn colours_of_the_cube(rgb: &[u8]) -> usize {
     let mut found = [0; 5];
     for pixel in rgb.chunks_exact(3) {
         let [r, g, b] = [0, 1, 2].map(|i| f64::from(pixel[i]));
@@ -116,16 +119,16 @@ pub fn colours_of_the_cube(rgb: &[u8]) -> usize {
     found.iter().filter(|&&pixels| pixels * 500 > rgb.len() / 3).count()
 }
 
-/// The names in a folder, sorted.
-pub fn names(folder: &Path) -> Vec<String> {
+/// Returns the names in a folder, sorted.
+pub(crate) fn names(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
     names
 }
 
-/// The metrics without the columns of times.
-pub fn metrics(run: &Path) -> Vec<Vec<String>> {
+/// Returns the rows of the metrics, with the header, without the `time/` columns.
+pub(crate) fn metrics(run: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(run.join("metrics.csv")).unwrap();
     let header: Vec<&str> = text.lines().next().unwrap().split(',').collect();
     let kept = |row: &str| {
@@ -135,8 +138,8 @@ pub fn metrics(run: &Path) -> Vec<Vec<String>> {
     text.lines().map(kept).collect()
 }
 
-/// The tensors of a checkpoint.
-pub fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
+/// Returns the tensors of a checkpoint, sorted by name.
+pub(crate) fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
     let bytes = fs::read(path).unwrap();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let mut found: Vec<_> = tensors.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();

@@ -1,4 +1,4 @@
-//! One environment: what it observes, pays, and when it ends.
+//! One environment: its observations, its rewards and its ends.
 
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
@@ -7,6 +7,7 @@ use shadow_repose::agent::Agent;
 use shadow_repose::env::{End, Env, Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::rng;
+use shadow_repose::sim::{Pose, Velocity};
 
 use crate::support::{config, env_config, started, task};
 
@@ -39,7 +40,7 @@ fn observations_land_at_their_indices() {
     let (mut env, mut observation) = started(&task);
     let hand = Hand::bind(task.scene()).unwrap();
     let cube = hand.cube;
-    // About z by a quarter turn, and with w < 0: the observation shows the other sign.
+    // A quarter turn about z, with w < 0: the observation shows the opposite sign.
     let orientation = [-FRAC_1_SQRT_2, 0.0, 0.0, -FRAC_1_SQRT_2];
     put_cube(&mut env, &task, orientation);
     for i in 0..24 {
@@ -71,8 +72,8 @@ fn observations_land_at_their_indices() {
     assert_close(&observation[68..72], &relative);
     for (i, name) in ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"].iter().enumerate() {
         let body = task.scene().body(name).unwrap();
-        let (position, turned) = env.simulation().pose(body);
-        let (linear, angular) = env.simulation().velocity(body);
+        let Pose { position, orientation: turned } = env.simulation().pose(body);
+        let Velocity { linear, angular } = env.simulation().velocity(body);
         let expected: Vec<f64> = position.into_iter().chain(turned).chain(linear).chain(angular).collect();
         assert_close(&observation[72 + 13 * i..85 + 13 * i], &expected);
         assert!(linear.iter().any(|v| v.abs() > 1e-3), "{name} moves");
@@ -90,12 +91,12 @@ fn fingertip_velocities_are_those_of_the_frames_origin() {
     simulation.qvel_mut().fill(0.0);
     simulation.qvel_mut()[joint.dof] = 2.0;
     simulation.refresh();
-    let (linear, angular) = simulation.velocity(tip);
-    let before = simulation.pose(tip).0;
+    let Velocity { linear, angular } = simulation.velocity(tip);
+    let before = simulation.pose(tip).position;
     let step = 1e-6;
     simulation.qpos_mut()[joint.qpos] += 2.0 * step;
     simulation.refresh();
-    let after = simulation.pose(tip).0;
+    let after = simulation.pose(tip).position;
     for axis in 0..3 {
         assert!((linear[axis] - (after[axis] - before[axis]) / step).abs() < 1e-4);
     }
@@ -120,7 +121,7 @@ fn actions_are_clipped_and_scaled_to_the_control_ranges() {
         (expected[0], expected[7], expected[19]) = (1.0, -1.0, 0.5);
         expected
     });
-    // The penalty is that of the clipped action.
+    // The penalty is computed from the clipped action.
     assert!((env.last_step().reward.action - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
 }
 
@@ -152,7 +153,7 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
         let details = *env.last_step();
         assert_eq!((details.goal, details.reward.bonus, transition.end), (goal, 2.0, None));
         assert!(details.rot_dist < 0.1);
-        // The reward is that against the goal in force.
+        // The reward is computed against the goal in force.
         let rotation = 1.0 / (details.rot_dist + 0.1);
         assert!((details.reward.rotation - rotation).abs() < 1e-12);
         assert!((f64::from(transition.reward) - details.reward.total()).abs() < 1e-5);
@@ -160,7 +161,7 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
     }
     assert_eq!((env.episode().goals, env.episode().in_tolerance), (1, 3));
     assert_ne!(env.goal(), goal);
-    // The observation already shows the goal in force next.
+    // The observation already shows the next goal.
     assert_close(&observation[64..68], &quat::canonical(env.goal()));
 }
 
@@ -296,7 +297,8 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
 
 #[test]
 fn every_scale_of_the_reward_is_a_setting() {
-    let paid = |set: &str| RewardTerms::of_step(&env_config(&[set]), 0.3, 0.1, &[0.5; 20]).values();
+    let paid =
+        |set: &str| RewardTerms::of_step(&env_config(&[set]), 0.3, 0.1, &[0.5; 20]).named().map(|(_, value)| value);
     let default = [1.0 / 0.4, -1.0, -0.0002 * 5.0, 0.0, 0.0];
     for (set, term, expected) in [
         ("run.seed=0", 0, default[0]),
@@ -323,7 +325,7 @@ fn where_cube_and_target_are_and_how_an_episode_begins_are_settings() {
     let (mut env, mut observation) = started(&task);
     assert_close(&observation[48..51], &[0.3, 0.02, 0.31]);
     assert_close(&observation[61..64], &[0.3, 0.02, 0.31]);
-    let (target, _) = env.simulation().pose(task.scene().body("target").unwrap());
+    let target = env.simulation().pose(task.scene().body("target").unwrap()).position;
     assert_close(&target.map(|x| x as f32), &[0.3, 0.02, 0.71]);
     assert_close(&observation[..24], &[0.0; 24]);
     let joint = Hand::bind(task.scene()).unwrap().joints[3];

@@ -1,4 +1,4 @@
-//! What only training changes: lessons, and what a policy takes to be the same.
+//! Lessons, which only training uses, the symmetry of the cube, and the noise of the actions.
 
 use std::sync::atomic::AtomicBool;
 
@@ -14,7 +14,7 @@ use crate::support::{config, started, task};
 const CUBE_ORIENTATION: usize = 51;
 const GOAL_ORIENTATION: usize = 64;
 
-/// What a lesson of the task itself would be, with these settings on top.
+/// Returns the lesson of the task itself with these settings applied over it.
 fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
     let task = ["task_reward=1", "progress_reward=0", "hold_reward=0", "drop_reward=0", "tolerance=0.1", "hold=50"];
     let task = task.map(|setting| format!("training.{setting}"));
@@ -32,7 +32,7 @@ fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
 
 #[test]
 fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy() {
-    // A hand that moves slowly, to which the cube falls.
+    // The hand moves slowly while the cube falls onto it.
     let task = task(&["env.act_moving_average=0.05"]);
     let cube = task.scene().free_body("cube").unwrap().qpos;
     let (half, root) = (0.5, std::f64::consts::FRAC_1_SQRT_2);
@@ -44,7 +44,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let orientation = *other.simulation().qpos()[cube + 3..].first_chunk().unwrap();
         other.simulation_mut().qpos_mut()[cube + 3..cube + 7].copy_from_slice(&quat::mul(orientation, *turn));
         other.simulation_mut().refresh();
-        // Contacts amplify rounding: after some more steps of a moving hand, no two cubes lie alike.
+        // Contacts amplify rounding errors: after some more steps of a moving hand, the two cubes no longer agree.
         for step in 0..15 {
             let action = [0.3 * (step as f32 / 5.0).sin(); 20];
             let _ = one.step(&action, &mut seen);
@@ -53,11 +53,11 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let moved = seen[48..51].iter().zip(&other_seen[48..51]).all(|(a, b)| (a - b).abs() < 1e-4);
         assert!(moved, "{:?} and {:?}", &seen[48..51], &other_seen[48..51]);
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "they lie differently");
+        assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "their orientations differ");
         for row in [&mut seen, &mut other_seen] {
             Perception::new(Symmetry::Cube, &SPACES).unwrap().turn(row);
         }
-        // All but the goals, which were drawn for cubes that lie differently.
+        // All but the goals: both environments drew the same one, for cubes of different orientation.
         for same in [0..64, 72..157] {
             assert!(apart(&seen[same.clone()], &other_seen[same]) < 0.02, "{seen:?}\n{other_seen:?}");
         }
@@ -73,11 +73,11 @@ fn a_lesson_decides_what_reaches_a_goal() {
     let mut observation = start(&mut env, 0);
     for goals in 1..=20 {
         assert_eq!(env.step(&[0.0; 20], &mut observation).end, Some(End::Redirected));
-        assert_eq!(env.episode().goals, goals, "every step reaches one");
+        assert_eq!(env.episode().goals, goals, "every step reaches a goal");
         env.redirect(&mut observation);
     }
     let in_tolerance = env.episode().in_tolerance;
-    assert!(in_tolerance < 20, "what is within the tolerance of the task is counted by that: {in_tolerance}");
+    assert!(in_tolerance < 20, "in_tolerance counts by the tolerance of the task: {in_tolerance}");
     env.set_lesson(lesson(1000, &easy));
     for episode in 0..30 {
         observation = start(&mut env, episode);
@@ -91,7 +91,7 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let task = task(&[]);
     let (mut plain, mut observation) = started(&task);
     let (mut shaped, _) = started(&task);
-    // A tolerance so wide that a task paid by it would pay a bonus all the time.
+    // A tolerance so wide that, if the task used it, every step would pay the bonus.
     let wide = ["training.tolerance=3.2"];
     let paid = ["training.task_reward=0.5", "training.progress_reward=100"];
     shaped.set_lesson(lesson(0, &[&wide[..], &paid].concat()));
@@ -110,7 +110,7 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     assert!(recent.shaping.progress != 0.0 && recent.reward == plain.take_recent().reward);
 }
 
-/// Where everything is after a second of a swinging hand.
+/// Returns all joint positions after a second of a swinging hand.
 fn after_a_second(settings: &[&str]) -> Vec<f64> {
     let task = task(settings);
     let (mut env, mut observation) = started(&task);
@@ -147,7 +147,7 @@ fn friction_and_the_mass_of_the_cube_are_scaled_as_if_the_scene_said_so() {
     assert!(apart(&slippery, &unchanged) > 1e-3);
 }
 
-/// Turns the cube of an observation onto itself, and its goal with it.
+/// Returns the observation with cube and goal turned by `rotation`, which maps the cube onto itself.
 fn turned(observation: &[f32], rotation: Quat) -> Vec<f32> {
     let mut other = observation.to_vec();
     for place in [CUBE_ORIENTATION, GOAL_ORIENTATION] {
@@ -175,7 +175,7 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
         let mut turns_matter = 0;
         for (row, &value) in block.acted_on().chunks_exact(OBSERVATION_SIZE).zip(&block.values) {
             let mut found = [0.0];
-            policy.forward(&turned(row, [0.5, 0.5, -0.5, 0.5]), None, Some(&mut found), &mut policy.workspace(1));
+            policy.values(&turned(row, [0.5, 0.5, -0.5, 0.5]), &mut found, &mut policy.workspace(1));
             turns_matter += usize::from((found[0] - value).abs() > 1e-4);
         }
         assert_eq!(turns_matter == 0, perceives, "{symmetry}: {turns_matter}");
@@ -208,7 +208,7 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
                 continue;
             }
             redirected += 1;
-            assert!(env.goal() != goal && env.episode().length == length + 1, "the episode goes on");
+            assert!(env.goal() != goal && env.episode().length == length + 1, "the episode continues");
             let old = quat::canonical(goal).map(|x| x as f32);
             assert_eq!(under_the_old[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], old);
             for same in [0..GOAL_ORIENTATION, GOAL_ORIENTATION + 8..OBSERVATION_SIZE] {
@@ -234,7 +234,7 @@ fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
             let reached = step % 4 == 0;
             assert_eq!(end, (reached && trained).then_some(End::Redirected), "step {step}");
             if end.is_some() {
-                assert!(env.goal() == goal, "what is bootstrapped is the goal that was reached");
+                assert!(env.goal() == goal, "the value is bootstrapped under the goal that was reached");
                 env.redirect(&mut observation);
             }
             assert_eq!(env.goal() != goal, reached, "step {step}");
@@ -242,7 +242,7 @@ fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
             let shown = quat::canonical(env.goal()).map(|x| x as f32);
             assert_eq!(observation[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
         }
-        // Where time is up on the step that reaches it, the last observation is bootstrapped all the same.
+        // If the time limit falls on the step that reaches the goal, the last observation is bootstrapped too.
         env.skip_ahead(0.996);
         let goal = env.goal();
         let ends = [0, 1, 2, 3].map(|_| env.step(&[0.0; 20], &mut observation).end);
@@ -268,7 +268,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let never = AtomicBool::new(false);
     agent.collect(&never).unwrap().expect("nothing stops it");
     let Agent { ppo, rollout, .. } = &mut agent;
-    // Squares of the distances from the mean, and numbers of them, of those near the goal and of those far from it.
+    // Sum and count of the squared distances from the mean, near the goal and far from it.
     let mut spread = [[0.0; 2]; 2];
     for block in &rollout.blocks {
         for (i, row) in block.acted_on().chunks_exact(OBSERVATION_SIZE).enumerate() {

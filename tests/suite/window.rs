@@ -1,4 +1,4 @@
-//! The window, on a display of its own that nobody sees (Xvfb), with keys pressed by xdotool.
+//! The window, on a virtual display (Xvfb), with keys pressed by xdotool.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -19,7 +19,7 @@ struct Display {
 }
 
 impl Display {
-    /// A display, if this machine has what it takes.
+    /// Opens a display if this machine has the necessary programs.
     fn open() -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let mut server = Command::new("Xvfb");
@@ -37,7 +37,7 @@ impl Display {
         Some(Self { server, name, folder })
     }
 
-    /// The program on this display.
+    /// Starts the program on this display.
     fn start(&self, folder: &Path, args: &[&str]) -> Child {
         let mut command = command(folder, args);
         command.env("DISPLAY", &self.name).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
@@ -57,20 +57,32 @@ impl Display {
         ]);
         // The window takes the focus a little later.
         xdotool.args(["sleep", "0.5", "key", "--delay", "200"]).args(keys);
-        // A window that a key closes is an error to xdotool; what the keys did is for the caller to see.
+        // xdotool reports an error if a key closes the window; the caller checks what the keys did.
         xdotool.stderr(Stdio::null()).status().unwrap();
     }
 
-    /// The pixels `[height, width, 3]` of the screen, without the panels beside the scene.
+    /// Returns the pixels `[height, width, 3]` of the screen, without the panels beside the scene.
     fn scene(&self) -> Vec<u8> {
+        self.pixels(250..950)
+    }
+
+    /// Returns the fraction of the leftmost part of the screen that has the dark background of a panel.
+    fn panel_at_the_left(&self) -> f64 {
+        let pixels = self.pixels(0..150);
+        let is_background = |rgb: &&[u8]| rgb[0] < 45 && rgb[1] == rgb[0] && rgb[2] == rgb[0];
+        pixels.chunks_exact(3).filter(is_background).count() as f64 / (pixels.len() / 3) as f64
+    }
+
+    /// Returns the pixels `[height, width, 3]` of these columns of the screen.
+    fn pixels(&self, columns: std::ops::Range<usize>) -> Vec<u8> {
         let path: PathBuf = self.folder.path().join("Xvfb_screen0");
         let dump = fs::read(path).unwrap();
-        // XWD: a header of numbers with the highest byte first, the palette, then rows of pixels.
+        // XWD: a big-endian header, the palette, then rows of pixels.
         let word = |i: usize| u32::from_be_bytes(dump[4 * i..4 * i + 4].try_into().unwrap()) as usize;
         let (header, width, height, bytes_per_line, palette) = (word(0), word(4), word(5), word(12), word(19));
         assert_eq!((width, height, word(11)), (1280, 720, 32));
         let pixels = &dump[header + 12 * palette..];
-        let row = |y: usize| &pixels[y * bytes_per_line..][4 * 250..4 * 950];
+        let row = |y: usize| &pixels[y * bytes_per_line..][4 * columns.start..4 * columns.end];
         (0..height).flat_map(|y| row(y).chunks_exact(4).flat_map(|bgrx| [bgrx[2], bgrx[1], bgrx[0]])).collect()
     }
 
@@ -83,15 +95,15 @@ impl Display {
             if test(&scene) {
                 return scene;
             }
-            assert!(begun.elapsed() < PATIENCE, "waited in vain: {what}");
+            assert!(begun.elapsed() < PATIENCE, "timed out waiting until {what}");
             sleep(Duration::from_millis(100));
         }
     }
 
-    /// Waits until the scene stands still, and returns it.
+    /// Waits until the scene stops changing, and returns it.
     #[track_caller]
     fn wait_for_rest(&self) -> Vec<u8> {
-        self.wait("the scene stands still", |scene| {
+        self.wait("the scene stops changing", |scene| {
             sleep(Duration::from_millis(1500));
             self.scene() == scene
         })
@@ -105,7 +117,7 @@ impl Drop for Display {
     }
 }
 
-/// Far from any end of an episode, however slow the machine is.
+/// The arguments for an episode that does not end during a test, however slow the machine is.
 const WAVE: [&str; 12] = [
     "view",
     "--plain",
@@ -126,7 +138,7 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     let Some(display) = Display::open() else { return };
     let folder = tempfile::tempdir().unwrap();
     let mut child = display.start(folder.path(), &WAVE);
-    display.wait("the cube is to be seen", |scene| colours_of_the_cube(scene) >= 2);
+    display.wait("the cube is visible", |scene| colours_of_the_cube(scene) >= 2);
     let before = display.scene();
     display.wait("the hand moves", |scene| scene != before);
 
@@ -136,13 +148,17 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     display.wait("single steps move the hand", |scene| scene != paused);
     let stepped = display.wait_for_rest();
     display.press(&["g"]);
-    display.wait("a new goal is shown while time stands still", |scene| scene != stepped);
+    display.wait("a new goal is shown while paused", |scene| scene != stepped);
     let goal = display.wait_for_rest();
     display.press(&["r"]);
-    display.wait("a reset is shown while time stands still", |scene| scene != goal);
+    display.wait("a reset is shown while paused", |scene| scene != goal);
     let reset = display.wait_for_rest();
     display.press(&["space"]);
-    display.wait("the hand moves on", |scene| scene != reset);
+    display.wait("the hand moves again", |scene| scene != reset);
+
+    assert!(display.panel_at_the_left() < 0.1, "MuJoCo's own panel is closed");
+    display.press(&["x"]);
+    display.wait("a key opens MuJoCo's own panel", |_| display.panel_at_the_left() > 0.5);
 
     display.press(&["ctrl+q"]);
     let begun = Instant::now();
@@ -152,7 +168,7 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     let _ = child.kill();
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(stderr(&output).contains(" steps, 0 episodes to their end"), "{}", stderr(&output));
+    assert!(stderr(&output).contains(" steps, 0 episodes completed"), "{}", stderr(&output));
 }
 
 #[test]
@@ -164,8 +180,8 @@ fn where_there_is_a_display_play_opens_a_window_that_closes_after_its_episodes()
     let output = display.start(folder.path(), &args).wait_with_output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(stderr(&output).contains("shown: 100 steps, 2 episodes"), "{}", stderr(&output));
-    assert!(output.stdout.is_empty(), "what is shown is not scored");
-    // What asks for a result asks for no window.
+    assert!(output.stdout.is_empty(), "episodes in a window are not scored");
+    // Options that request a result open no window.
     args.retain(|arg| !["--plain", "--quality", "fast"].contains(arg));
     for more in ["--headless", "--json"] {
         let output = display.start(folder.path(), &[&args[..], &[more]].concat()).wait_with_output().unwrap();

@@ -1,30 +1,30 @@
-//! The losses of one minibatch, as pure functions of tensors. M samples, A numbers in an action.
+//! The losses of one minibatch, as pure functions of tensors. A minibatch has M samples, an action A values.
 
 use candle_core::{D, Result, Tensor};
 
 use crate::config::PpoConfig;
 
-/// The distributions of the actions of M samples.
-pub struct Gaussian {
+/// The action distributions of M samples.
+pub(super) struct Gaussian {
     /// `[M, A]`
     pub means: Tensor,
-    /// `[A]`, the logarithm of the policy's standard deviations
+    /// `[A]`: logarithms of the policy's standard deviations
     pub log_std: Tensor,
-    /// `[M, 1]`, times the policy's standard deviations are those of a sample
+    /// `[M, 1]`: factors on the policy's standard deviations for each sample
     pub scales: Tensor,
 }
 
-/// What a minibatch is learnt from.
-pub struct Minibatch {
-    /// `[M, O]`, as the nets see them
+/// The data of a minibatch.
+pub(super) struct Batch {
+    /// `[M, O]`: as the nets see them
     pub observations: Tensor,
     /// `[M, A]`
     pub actions: Tensor,
-    /// What the actions were drawn from.
+    /// The distributions that the actions were drawn from.
     pub old: Gaussian,
-    /// `[M]`, of the actions under that distribution
+    /// `[M]`: of the actions under those distributions
     pub old_log_probs: Tensor,
-    /// `[M]`, of the critic at that time
+    /// `[M]`: of the critic at that time
     pub old_values: Tensor,
     /// `[M]`
     pub advantages: Tensor,
@@ -32,9 +32,9 @@ pub struct Minibatch {
     pub returns: Tensor,
 }
 
-/// Scalars of a minibatch.
-pub struct Losses {
-    /// What is minimised.
+/// The losses and statistics of a minibatch.
+pub(super) struct LossTensors {
+    /// The loss that is minimised.
     pub total: Tensor,
     /// The clipped surrogate, negated.
     pub policy: Tensor,
@@ -42,30 +42,30 @@ pub struct Losses {
     pub value: Tensor,
     /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
     pub excess: Tensor,
-    /// Mean KL divergence of the present distribution from the one that acted, nats.
+    /// Mean KL divergence of the current distribution from the one that acted, nats.
     pub kl: Tensor,
-    /// `[M]`, of the probabilities of each action
+    /// `[M]`: probability ratios of the actions
     pub ratios: Tensor,
 }
 
 impl Gaussian {
-    /// The logarithm of the density of `actions` `[M, A]` for each sample, `[M]`; it lacks the logarithm of the scales, here and
-    /// where the actions were drawn, since only ratios count.
+    /// Returns the log-density of `actions` `[M, A]` for each sample, `[M]`. It omits the logarithm of the scales, here
+    /// and where the actions were drawn, since only ratios are used.
     ///
     /// # Errors
-    /// Shapes that do not fit.
-    pub fn log_prob(&self, actions: &Tensor) -> Result<Tensor> {
+    /// Fails if the shapes do not match.
+    pub(super) fn log_prob(&self, actions: &Tensor) -> Result<Tensor> {
         let z = (actions - &self.means)?.broadcast_div(&self.log_std.exp()?)?.broadcast_div(&self.scales)?;
         let constant = 0.5 * std::f64::consts::TAU.ln() * self.log_std.elem_count() as f64;
         let log_scale = (self.log_std.sum_all()? + constant)?;
         (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
     }
 
-    /// Mean over the samples of the KL divergence KL(`old` ‖ self), where both have the same scales.
+    /// Returns the mean over the samples of the KL divergence KL(`old` ‖ self), where both have the same scales.
     ///
     /// # Errors
-    /// Shapes that do not fit.
-    pub fn kl(&self, old: &Self) -> Result<Tensor> {
+    /// Fails if the shapes do not match.
+    pub(super) fn kl(&self, old: &Self) -> Result<Tensor> {
         let moved = (&old.means - self.means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
         let log_std = self.log_std.detach();
         let spread = (((&old.log_std * 2.0)?.exp()? + moved)? / (&log_std * 2.0)?.exp()?)?;
@@ -73,13 +73,13 @@ impl Gaussian {
     }
 }
 
-/// The losses of a minibatch for which the nets gave the distribution `new` and `values` `[M]`.
+/// Returns the losses of a minibatch for which the nets returned the distribution `new` and `values` `[M]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 ///
 /// # Errors
-/// Shapes that do not fit.
-pub fn losses(config: &PpoConfig, batch: &Minibatch, new: &Gaussian, values: &Tensor) -> Result<Losses> {
+/// Fails if the shapes do not match.
+pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: &Tensor) -> Result<LossTensors> {
     let ratios = (new.log_prob(&batch.actions)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
@@ -93,7 +93,7 @@ pub fn losses(config: &PpoConfig, batch: &Minibatch, new: &Gaussian, values: &Te
     let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
     let kl = new.kl(&batch.old)?;
-    Ok(Losses { total, policy, value, excess, kl, ratios: ratios.detach() })
+    Ok(LossTensors { total, policy, value, excess, kl, ratios: ratios.detach() })
 }
 
 #[cfg(test)]
@@ -106,7 +106,7 @@ mod tests {
         Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
     }
 
-    /// With the standard deviations 0.7 and 1.1, times the scales.
+    /// Returns Gaussians with standard deviations of 0.7 and 1.1 times the scales.
     fn gaussian(means: &[f32], scales: &[f32]) -> Gaussian {
         Gaussian {
             means: tensor(means, &[scales.len(), 2]),
@@ -122,8 +122,8 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The numbers are those of this program (PyTorch). One sample's ratio is clipped, two are not; one value is clipped; the
-    /// noise of each sample has a scale of its own:
+    /// The expected values are those of this program (PyTorch). Clipping takes effect on one ratio and one value; each
+    /// sample has its own noise scale:
     /// ```python
     /// import torch
     /// from torch.distributions import Normal, kl_divergence
@@ -157,7 +157,7 @@ mod tests {
         let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
         let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
         let old = gaussian(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[1.0, 1.5, 0.8]);
-        let batch = Minibatch {
+        let batch = Batch {
             observations: tensor(&[0.0; 3], &[3, 1]),
             old_log_probs: old.log_prob(&actions).unwrap(),
             actions,
@@ -183,7 +183,7 @@ mod tests {
 
     #[test]
     fn means_beyond_the_bounds_of_actions_are_pulled_back() {
-        let batch = Minibatch {
+        let batch = Batch {
             observations: tensor(&[0.0], &[1, 1]),
             actions: tensor(&[0.2, 1.5], &[1, 2]),
             old: gaussian(&[-0.5, 0.5], &[1.0]),

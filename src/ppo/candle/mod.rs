@@ -1,5 +1,5 @@
-//! The same computation in candle's own tensors, layers and automatic gradients: slower, the reference that the kernels are
-//! compared with, and the place to try a change of the algorithm first. No other folder names candle's crates.
+//! The same computation with candle's tensors, layers and automatic differentiation: slower, the reference for the
+//! kernels, and the place to try a change of the algorithm first. No other folder names candle's crates.
 
 mod loss;
 mod nets;
@@ -8,29 +8,29 @@ use anyhow::Result;
 use candle_core::{Device, Module, Tensor};
 
 use super::Policy;
-use super::backend::{self, Backend, ShardSums};
+use super::backend::{self, GradientBackend, ShardSums};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::tree_sum;
 use crate::spaces::Spaces;
-use loss::{Gaussian, Minibatch};
+use loss::{Batch, Gaussian};
 use nets::Nets;
 
-/// Gradients by candle.
-pub struct Reference {
+/// The gradient backend in candle.
+pub(super) struct Reference {
     config: PpoConfig,
-    /// `[A]`, of the policy that collected the rollout.
+    /// `[A]`: of the policy that collected the rollout.
     old_log_std: Vec<f32>,
 }
 
 impl Reference {
-    /// With these settings.
-    pub fn new(config: &PpoConfig) -> Self {
+    /// Creates the backend with these settings.
+    pub(super) fn new(config: &PpoConfig) -> Self {
         Self { config: config.clone(), old_log_std: Vec::new() }
     }
 
-    /// These samples of a rollout.
-    fn minibatch(&self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Minibatch> {
+    /// Gathers these samples of a rollout.
+    fn minibatch(&self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
         let Spaces { observation_size, action_size, .. } = policy.spaces;
         let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
             let located = samples.iter().map(|&sample| rollout.locate(sample));
@@ -41,7 +41,7 @@ impl Reference {
         let raw = array(observation_size, |block| &block.observations);
         let mut observations = vec![0.0; raw.len()];
         policy.reader().read(&raw, &mut observations);
-        Ok(Minibatch {
+        Ok(Batch {
             observations: rows(observation_size, observations)?,
             actions: rows(action_size, array(action_size, |block| &block.actions))?,
             old: Gaussian {
@@ -57,7 +57,7 @@ impl Reference {
     }
 }
 
-impl Backend for Reference {
+impl GradientBackend for Reference {
     fn begin(&mut self, policy: &Policy, _: &Rollout) {
         self.old_log_std = policy.log_std().to_vec();
     }

@@ -1,4 +1,4 @@
-//! Actor and critic of candle's own layers, on variables that hold the parameters of a policy.
+//! Actor and critic built from candle's layers, on variables that hold the parameters of a policy.
 
 use std::ops::Range;
 
@@ -10,24 +10,24 @@ use super::super::Policy;
 use super::super::parameters::Layer;
 use crate::config::Activation;
 
-/// The nets of a policy, to be differentiated.
-pub struct Nets {
+/// The nets of a policy, in differentiable form.
+pub(super) struct Nets {
     /// `[M, O]` → `[M, A]`
     pub actor: Sequential,
     /// `[M, O]` → `[M, 1]`
     pub critic: Sequential,
     /// `[A]`
     pub log_std: Var,
-    /// All variables, and where their numbers lie among the parameters of the policy.
+    /// All variables, and the ranges of their values among the parameters of the policy.
     variables: Vec<(Range<usize>, Var)>,
 }
 
 impl Nets {
-    /// With the present parameters of `policy`.
+    /// Creates the nets with the current parameters of `policy`.
     ///
     /// # Errors
-    /// Those of candle.
-    pub fn new(policy: &Policy) -> Result<Self> {
+    /// Fails if candle reports an error.
+    pub(super) fn new(policy: &Policy) -> Result<Self> {
         let activation: fn(&Tensor) -> Result<Tensor> = match policy.activation {
             Activation::Elu => |x| x.elu(1.0),
             Activation::Relu => Tensor::relu,
@@ -57,11 +57,11 @@ impl Nets {
         Ok(Self { actor, critic, log_std, variables })
     }
 
-    /// Writes what `grads` has for each variable into the gradient of all parameters.
+    /// Writes the gradient of each variable in `grads` to its range of the gradient of all parameters.
     ///
     /// # Errors
-    /// Those of candle.
-    pub fn write_gradient(&self, grads: &GradStore, out: &mut [f32]) -> Result<()> {
+    /// Fails if candle reports an error.
+    pub(super) fn write_gradient(&self, grads: &GradStore, out: &mut [f32]) -> Result<()> {
         for (range, variable) in &self.variables {
             let out = &mut out[range.clone()];
             match grads.get(variable) {

@@ -1,21 +1,21 @@
-//! The activations and their slopes, on the calling thread, in the widest vectors the processor has.
+//! The activations and their derivatives, on the calling thread, in the widest vectors of the processor.
 //!
-//! candle runs these functions one element at a time, in several passes, which costs more than the matrix products between
-//! them.
+//! candle computes these functions one element at a time, in several passes, which costs more than the matrix products
+//! between them.
 
 use pulp::Arch;
 
 use crate::config::Activation;
 
-/// e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); e^x beyond 88 is cut off there.
+/// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); x is clamped to [-87, 88].
 ///
-/// With x = n ln 2 + r, |r| ≤ ln 2 / 2: e^x - 1 = 2ⁿ (e^r - 1) + (2ⁿ - 1), which loses nothing near 0. The polynomial for
-/// (e^r - 1 - r) / r² is that of `expf` in Cephes (S. L. Moshier).
+/// With x = n ln 2 + r, |r| ≤ ln 2 / 2: e^x - 1 = 2ⁿ (e^r - 1) + (2ⁿ - 1), which loses no precision near 0. The
+/// polynomial for (e^r - 1 - r) / r² is that of `expf` in Cephes (S. L. Moshier).
 #[inline(always)]
 fn exp_m1(x: f32) -> f32 {
-    /// 1.5 · 2²³: adding it rounds to a whole number, which then stands in the low bits.
+    /// 1.5 · 2²³: adding it rounds to a whole number, which is then in the low bits.
     const ROUND: f32 = 12_582_912.0;
-    /// ln 2 in two parts, the first of so few digits that its product with n is exact.
+    /// ln 2 in two parts; the first has so few digits that its product with n is exact.
     const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
     let x = x.clamp(-87.0, 88.0);
     let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
@@ -34,7 +34,7 @@ fn elu(x: f32) -> f32 {
     if x > 0.0 { x } else { exp_m1(x) }
 }
 
-/// Unlike `max`, keeps what is not a number.
+/// Unlike `max`, propagates NaN.
 #[inline(always)]
 fn relu(x: f32) -> f32 {
     if x < 0.0 { 0.0 } else { x }
@@ -47,12 +47,12 @@ fn tanh(x: f32) -> f32 {
 }
 
 /// Adds `bias` `[C]` to each row of `x` `[B, C]`.
-pub fn add_bias(x: &mut [f32], bias: &[f32]) {
+pub(super) fn add_bias(x: &mut [f32], bias: &[f32]) {
     each_row(x, bias, |x, b| x + b);
 }
 
 /// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, in place.
-pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
+pub(super) fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
     match activation {
         Activation::Elu => each_row(x, bias, |x, b| elu(x + b)),
         Activation::Relu => each_row(x, bias, |x, b| relu(x + b)),
@@ -60,10 +60,12 @@ pub fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
     }
 }
 
-/// Multiplies `grad` `[B, C]` by the slopes of the activation, in place, and adds the sums of its columns to `sums` `[C]`.
+/// Multiplies `grad` `[B, C]` by the derivatives of the activation, in place, and adds the sums of its columns to
+/// `sums` `[C]`.
 ///
-/// `outputs` `[B, C]` are those of the activation, of which all slopes are functions; without an activation they are not looked at.
-pub fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
+/// `outputs` `[B, C]` are the outputs of the activation, which determine its derivatives. They are not read if there is
+/// no activation.
+pub(super) fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
     match activation {
         None => add_columns(sums, grad),
         Some(Activation::Elu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
@@ -83,7 +85,7 @@ fn add_columns(sums: &mut [f32], rows: &[f32]) {
     );
 }
 
-/// `x[i] = f(x[i], y[i])`, and the rows of `x` are added to `sums`.
+/// Sets `x[i] = f(x[i], y[i])` and adds the rows of `x` to `sums`.
 #[inline(always)]
 fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     assert_eq!(x.len(), y.len());
@@ -101,7 +103,7 @@ fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32)
     );
 }
 
-/// `x[i, j] = f(x[i, j], y[j])` for each row of `x` `[B, C]`, compiled for the processor it runs on.
+/// Sets `x[i, j] = f(x[i, j], y[j])` for each row of `x` `[B, C]`, compiled for the processor it runs on.
 #[inline(always)]
 fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
     Arch::new().dispatch(

@@ -1,8 +1,11 @@
 //! Products of bf16 matrices on the tiles of x86-64 processors (AMX), with sums in f32.
 //!
-//! Stable Rust has no functions for these instructions, so this file speaks assembly, and it alone does. The operands come
-//! packed in tiles by [`super::bf16`]; [`Tiles::product`] is safe. Intel 64 and IA-32 Architectures Software Developer's Manual,
-//! volume 1, chapter 18; the permission: Linux, Documentation/arch/x86/xstate.rst.
+//! Stable Rust has no intrinsics for these instructions, so this file, and only this one, uses assembly.
+//! [`super::bf16`] packs the operands into tiles; [`Tiles::product`] is safe. Instructions: Intel 64 and IA-32
+//! Architectures Software Developer's Manual, volume 1, chapter 18. Permission: Linux,
+//! Documentation/arch/x86/xstate.rst.
+
+#![expect(unsafe_code, reason = "assembly")]
 
 use std::sync::OnceLock;
 
@@ -11,31 +14,31 @@ use anyhow::Result;
 use super::bf16::{LINES, Packed, Side, TILE};
 use super::product::Matrix;
 
-/// Rows and columns of the product that are computed together: two tiles by two.
+/// Rows and columns of the product that are computed together: two by two tiles.
 const BLOCK: usize = 2 * LINES;
 
-/// The right to use the tiles.
+/// The permission to use the tiles.
 #[derive(Clone, Copy, Debug)]
 pub struct Tiles(());
 
 impl Tiles {
-    /// Asks processor and kernel, once for the whole process.
+    /// Requests the tiles from the processor and the kernel, once per process.
     ///
     /// # Errors
-    /// Tiles that are missing, may not be used, or multiply wrongly; the message says which.
+    /// Fails if the tiles are missing, may not be used, or multiply wrongly; the message says which.
     pub fn request() -> Result<Self> {
         static ANSWER: OnceLock<Result<(), &'static str>> = OnceLock::new();
         let answer = ANSWER.get_or_init(|| {
             machine::request()?;
-            if Tiles(()).multiply_rightly() { Ok(()) } else { Err("its tiles give wrong products") }
+            if Tiles(()).multiply_rightly() { Ok(()) } else { Err("this processor's tiles compute wrong products") }
         });
         answer.map(|()| Self(())).map_err(anyhow::Error::msg)
     }
 
-    /// Writes the product of packed matrices into `out` `[rows, columns]`, row after row, or adds it to what is there.
+    /// Writes the product of packed matrices to `out` `[rows, columns]`, by rows, or adds it if `add` is set.
     ///
     /// # Panics
-    /// Sizes that do not fit.
+    /// Panics if the sizes do not match.
     pub fn product(self, out: &mut [f32], columns: usize, lhs: &Packed, rhs: &Packed, add: bool) {
         let (rows, depth) = (out.len() / columns, lhs.depth());
         assert_eq!(out.len(), rows * columns, "elements of the product");
@@ -43,8 +46,8 @@ impl Tiles {
         let pair = 2 * depth * TILE;
         assert_eq!(lhs.tiles().len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
         assert_eq!(rhs.tiles().len(), columns.div_ceil(BLOCK) * pair, "tiles of the right matrix");
-        let session = machine::Session::begin();
-        // The tiles of the right matrix that are in use stay in the cache while those of the left one go by.
+        let session = machine::TileSession::begin();
+        // The tiles of the right matrix in use stay in the cache while those of the left one stream past.
         for (j, rhs) in rhs.tiles().chunks_exact(pair).enumerate() {
             for (i, lhs) in lhs.tiles().chunks_exact(pair).enumerate() {
                 let (height, width) = ((rows - i * BLOCK).min(BLOCK), (columns - j * BLOCK).min(BLOCK));
@@ -53,7 +56,7 @@ impl Tiles {
                     session.multiply(&mut out[first..], columns, lhs, rhs, add);
                     continue;
                 }
-                // What is beyond the edge is computed aside.
+                // A block that extends beyond the edge is computed in a separate buffer.
                 let mut whole = [0.0; BLOCK * BLOCK];
                 session.multiply(&mut whole, BLOCK, lhs, rhs, false);
                 for (row, whole) in whole.chunks_exact(BLOCK).take(height).enumerate() {
@@ -66,7 +69,7 @@ impl Tiles {
         }
     }
 
-    /// Multiplies whole numbers, which leaves no room for rounding.
+    /// Returns whether a product of whole numbers, which needs no rounding, is exact.
     fn multiply_rightly(self) -> bool {
         let (rows, depth, columns) = (37, 70, 50);
         let numbers =
@@ -94,11 +97,11 @@ mod machine {
     use super::super::bf16::{DEPTH, LINES, TILE};
     use super::BLOCK;
 
-    /// Bytes from one row of a tile to the next, in memory as in the processor.
+    /// Bytes in a row of a tile, both in memory and in the processor.
     const ROW_BYTES: usize = 64;
 
-    /// Whether there are tiles for bf16 that this process may use; the kernel is asked for the permission.
-    pub fn request() -> Result<(), &'static str> {
+    /// Checks that there are tiles for bf16, and requests the kernel's permission for this process to use them.
+    pub(super) fn request() -> Result<(), &'static str> {
         const OSXSAVE: u32 = 1 << 27;
         const BF16_AND_TILE: u32 = 1 << 22 | 1 << 24;
         const TILE_STATE: u64 = 0b11 << 17;
@@ -106,33 +109,33 @@ mod machine {
         const ARCH_REQ_XCOMP_PERM: u64 = 0x1023;
         const XFEATURE_XTILEDATA: u64 = 18;
         if __cpuid(0).eax < 7 || __cpuid_count(7, 0).edx & BF16_AND_TILE != BF16_AND_TILE {
-            return Err("this processor has no tiles for bf16 (AMX)");
+            return Err("this processor has no bf16 tiles (AMX)");
         }
         if __cpuid(1).ecx & OSXSAVE == 0 {
             return Err("the kernel does not save the processor's tiles (AMX)");
         }
         let (low, high): (u32, u32);
-        // SAFETY: OSXSAVE says that the instruction exists; it only reads.
+        // SAFETY: OSXSAVE guarantees that the instruction exists; it only reads.
         unsafe { asm!("xgetbv", in("ecx") 0, out("eax") low, out("edx") high, options(nomem, nostack)) };
         if (u64::from(high) << 32 | u64::from(low)) & TILE_STATE != TILE_STATE {
             return Err("the kernel does not save the processor's tiles (AMX)");
         }
         let answer: i64;
-        // SAFETY: this call changes no memory of the process; the kernel makes room in its own.
+        // SAFETY: this call does not change memory of the process; the kernel allocates the state in its own memory.
         unsafe {
             asm!("syscall", inlateout("rax") ARCH_PRCTL => answer, in("rdi") ARCH_REQ_XCOMP_PERM,
                 in("rsi") XFEATURE_XTILEDATA, lateout("rcx") _, lateout("r11") _, options(nostack));
         }
-        if answer == 0 { Ok(()) } else { Err("the kernel does not permit the processor's tiles (AMX)") }
+        if answer == 0 { Ok(()) } else { Err("the kernel does not permit the use of tiles (AMX)") }
     }
 
-    /// The tiles of this thread, set up; given back in the end.
-    pub struct Session(PhantomData<*const ()>);
+    /// The configured tiles of this thread, released on drop.
+    pub(super) struct TileSession(PhantomData<*const ()>);
 
     #[repr(align(64))]
     struct Setup([u8; 64]);
 
-    /// All eight tiles have sixteen rows of 64 bytes (the layout is "palette 1").
+    /// The configuration: eight tiles of sixteen rows of 64 bytes (layout "palette 1").
     const SETUP: Setup = {
         let mut bytes = [0; 64];
         bytes[0] = 1;
@@ -145,22 +148,23 @@ mod machine {
         Setup(bytes)
     };
 
-    impl Session {
-        pub fn begin() -> Self {
-            // SAFETY: `Tiles` exists only where the processor has these instructions and the kernel permits them. The setup is
-            // kept until `drop`: in between run only `multiply` and plain copies, and the compiler uses no tiles of its own.
+    impl TileSession {
+        pub(super) fn begin() -> Self {
+            // SAFETY: `Tiles` exists only where the processor has these instructions and the kernel permits them. The
+            // configuration stays loaded until `drop`: only `multiply` and plain copies run in between, and the
+            // compiler uses no tiles itself.
             unsafe { asm!("ldtilecfg [{}]", in(reg) &SETUP.0, options(readonly, nostack)) };
             Self(PhantomData)
         }
 
-        /// Computes 32 × 32 numbers of a product, whose rows are `columns` numbers apart in `out`.
-        pub fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[u16], rhs: &[u16], add: bool) {
+        /// Computes 32 × 32 values of a product, whose rows are `columns` values apart in `out`.
+        pub(super) fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[u16], rhs: &[u16], add: bool) {
             let depth = lhs.len() / (2 * TILE);
             assert!(depth > 0 && lhs.len() == 2 * depth * TILE && rhs.len() == lhs.len());
             assert!(columns >= BLOCK && out.len() >= (BLOCK - 1) * columns + BLOCK);
             const { assert!(TILE * 2 == LINES * ROW_BYTES && DEPTH * 2 == ROW_BYTES) };
-            // SAFETY: each operand has two times `depth` tiles of 1024 bytes, one after the other, of which the loop reads
-            // one of each half in each of its `depth` turns; `out` has 32 rows of 32 numbers at that distance.
+            // SAFETY: each operand is 2 × `depth` consecutive tiles of 1024 bytes, and each of the `depth` iterations
+            // of the loop reads one tile of each half. `out` has 32 rows of 32 values at that distance.
             unsafe {
                 let second_rows = out.as_mut_ptr().add(LINES * columns);
                 asm!(
@@ -211,9 +215,9 @@ mod machine {
         }
     }
 
-    impl Drop for Session {
+    impl Drop for TileSession {
         fn drop(&mut self) {
-            // SAFETY: as in `begin`; nothing is left in the tiles that is still needed.
+            // SAFETY: as in `begin`; the tiles hold nothing that is still needed.
             unsafe { asm!("tilerelease", options(nomem, nostack)) };
         }
     }
@@ -222,12 +226,12 @@ mod machine {
 #[cfg(not(all(target_arch = "x86_64", target_os = "linux")))]
 mod machine {
     pub fn request() -> Result<(), &'static str> {
-        Err("tiles for bf16 (AMX) are used on x86-64 Linux alone")
+        Err("bf16 tiles (AMX) are used only on x86-64 Linux")
     }
 
-    pub struct Session;
+    pub struct TileSession;
 
-    impl Session {
+    impl TileSession {
         pub fn begin() -> Self {
             unreachable!("there are no tiles here")
         }
@@ -242,7 +246,7 @@ mod tests {
     use crate::ppo::kernels::bf16::rounded;
     use crate::rng;
 
-    /// Where there are no tiles, there is nothing to test but that this is said.
+    /// On a machine without tiles, only the error message is tested.
     #[test]
     fn products_of_rounded_numbers_agree_with_doubles() {
         let tiles = match Tiles::request() {
@@ -257,7 +261,7 @@ mod tests {
                 |count: usize| -> Vec<f32> { (0..count).map(|_| rng::uniform(&mut rng, -2.0, 2.0) as f32).collect() };
             let (a, b, before) = (random(rows * depth), random(depth * columns), random(rows * columns));
             for add in [false, true] {
-                // Each operand once as it is, once lying the other way.
+                // Both operands, once stored by rows and once by columns.
                 for (lhs, rhs) in [
                     (Matrix::new(&a, rows, depth), Matrix::new(&b, depth, columns)),
                     (Matrix::new(&a, depth, rows).transposed(), Matrix::new(&b, columns, depth).transposed()),

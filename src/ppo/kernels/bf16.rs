@@ -1,43 +1,43 @@
-//! bf16, the upper half of a float: rounding, and the order in which the tiles of [`super::amx`] want their operands.
+//! bf16, the upper half of an f32: rounding, and packing of operands into the tiles that [`super::amx`] multiplies.
 
 use pulp::Arch;
 
 use super::product::Matrix;
 
-/// Lines (rows of the left matrix, columns of the right one) in a tile.
-pub const LINES: usize = 16;
+/// Lines in a tile: rows of the left matrix or columns of the right one.
+pub(super) const LINES: usize = 16;
 
-/// Numbers of each line in a tile.
-pub const DEPTH: usize = 32;
+/// Values of each line in a tile.
+pub(super) const DEPTH: usize = 32;
 
-/// Numbers in a tile.
-pub const TILE: usize = LINES * DEPTH;
+/// Values in a tile.
+pub(super) const TILE: usize = LINES * DEPTH;
 
-/// The nearest bf16, of two as near the even one; what is not a number stays so.
+/// Rounds to the nearest bf16, ties to even; NaN stays NaN.
 #[inline(always)]
-pub fn round(x: f32) -> u16 {
+pub(super) fn round(x: f32) -> u16 {
     let bits = x.to_bits();
     let rounded = bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16;
     if x.is_nan() { 0x7fc0 } else { rounded as u16 }
 }
 
-/// The same as a float.
+/// Rounds to the nearest bf16, returned as f32.
 #[inline(always)]
-pub fn rounded(x: f32) -> f32 {
+pub(super) fn rounded(x: f32) -> f32 {
     f32::from_bits(u32::from(round(x)) << 16)
 }
 
-/// On which side of a product a matrix stands.
+/// The position of a matrix in a product.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// Lines are rows. A tile has 16 lines of 32 numbers.
+    /// The left operand: lines are rows. A tile has 16 lines of 32 values.
     Left,
-    /// Lines are columns. A tile has 16 pairs of numbers of 16 lines.
+    /// The right operand: lines are columns. A tile has 16 rows, each with one pair of values from each of 16 lines.
     Right,
 }
 
-/// A matrix in tiles, with zeros beyond its edges: all along the first sixteen lines, then all along the next, up to an even
-/// number of sixteens.
+/// A matrix in tiles, padded with zeros: first all tiles along the first sixteen lines, then along the next sixteen, up
+/// to an even number of such groups.
 #[derive(Default)]
 pub struct Packed {
     tiles: Vec<u16>,
@@ -45,19 +45,19 @@ pub struct Packed {
 }
 
 impl Packed {
-    /// The tiles.
+    /// Returns the tiles.
     pub fn tiles(&self) -> &[u16] {
         &self.tiles
     }
 
-    /// Tiles along a line.
+    /// Returns the number of tiles along a line.
     pub fn depth(&self) -> usize {
         self.depth
     }
 
-    /// Takes in the matrix that stands on that side, in the room of the one before.
+    /// Packs a matrix as the left or right operand, reusing the memory of the previous one.
     pub fn pack(&mut self, matrix: Matrix, side: Side) {
-        // Seen from either side: so many lines of so many numbers.
+        // From here on, either operand is `lines` lines of `numbers` values.
         let matrix = if side == Side::Left { matrix } else { matrix.transposed() };
         let [lines, numbers] = matrix.size();
         self.depth = numbers.div_ceil(DEPTH);
@@ -75,12 +75,12 @@ impl Packed {
     }
 }
 
-/// Fills a tile with the lines and numbers from `first` on.
+/// Fills a tile, starting at this line and this position in the line.
 #[inline(always)]
 fn pack_tile(tile: &mut [u16], matrix: Matrix, [line, number]: [usize; 2], side: Side) {
     let ([lines, numbers], data) = (matrix.size(), matrix.data());
     let (lines, numbers) = (lines.saturating_sub(line).min(LINES), (numbers - number).min(DEPTH));
-    // One of the strides is 1: along it whole vectors are rounded, then put in their places.
+    // One of the strides is 1. Values along it are rounded as whole vectors, then moved into place.
     let [across, along] = matrix.strides().map(|stride| stride as usize);
     let place = |line: usize, number: usize| match side {
         Side::Left => line * DEPTH + number,
@@ -132,7 +132,7 @@ mod tests {
             assert_eq!(rounded(x), expected, "{x}");
         }
         assert!(rounded(f32::NAN).is_nan());
-        assert!(rounded(f32::from_bits(0xff80_0001)).is_nan(), "a NaN whose upper half alone would be infinite");
+        assert!(rounded(f32::from_bits(0xff80_0001)).is_nan(), "a NaN whose upper half alone would be infinity");
     }
 
     #[test]
@@ -143,7 +143,7 @@ mod tests {
         let by_columns: Vec<f32> = (0..rows * columns).map(|i| number(i % rows, i / rows)).collect();
         for matrix in [Matrix::new(&by_rows, rows, columns), Matrix::new(&by_columns, columns, rows).transposed()] {
             for side in [Side::Left, Side::Right] {
-                let mut packed = Packed { tiles: vec![7; 9999], depth: 3 }; // of a matrix before
+                let mut packed = Packed { tiles: vec![7; 9999], depth: 3 }; // left from a previous matrix
                 packed.pack(matrix, side);
                 let [lines, numbers] = if side == Side::Left { [rows, columns] } else { [columns, rows] };
                 assert_eq!(packed.depth(), numbers.div_ceil(DEPTH));

@@ -1,4 +1,4 @@
-//! The losses of PPO with their gradients with respect to what the nets gave, sample by sample.
+//! The losses of PPO and their gradients with respect to the outputs of the nets, sample by sample.
 //!
 //! J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 
@@ -7,24 +7,24 @@ use pulp::Arch;
 use super::super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 
-/// What the losses of a minibatch need besides the samples. A numbers in an action.
-pub struct Loss<'a> {
+/// The losses of a minibatch. An action has A values.
+pub(super) struct Loss<'a> {
     rollout: &'a Rollout,
     clip: f32,
     value_clip: f32,
     value_coef: f32,
     bounds_coef: f32,
-    /// Of one sample in the means over the minibatch.
+    /// The weight of one sample in the means over the minibatch.
     share: f32,
     /// `[A]`: reciprocals of the standard deviations.
-    precision: Vec<f32>,
-    /// What the logarithm of the density has at the mean, negated.
+    inverse_std: Vec<f32>,
+    /// The negated log-density at the mean.
     log_scale: f32,
 }
 
 /// Sums over samples.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Sums {
+pub(super) struct Sums {
     /// The clipped surrogate.
     pub surrogate: f64,
     /// The clipped squared error of the values.
@@ -35,22 +35,23 @@ pub struct Sums {
     pub clipped: usize,
     /// The largest |ratio - 1|.
     pub ratio_error: f32,
-    /// `[A]`, squared differences of the means from those that acted, over the squares of the noise scales.
+    /// `[A]`: squared differences of the means from those that acted, divided by the squared noise scales.
     pub moved: Vec<f32>,
-    /// `[A]`, the gradient with respect to the logarithm of the standard deviations.
+    /// `[A]`: the gradient with respect to the logarithms of the standard deviations.
     pub log_std_grad: Vec<f32>,
 }
 
 impl Sums {
-    /// Of no samples.
-    pub fn new(action_size: usize) -> Self {
+    /// Creates the sums over no samples.
+    pub(super) fn new(action_size: usize) -> Self {
         Self { moved: vec![0.0; action_size], log_std_grad: vec![0.0; action_size], ..Self::default() }
     }
 }
 
 impl<'a> Loss<'a> {
-    /// For a minibatch of so many samples of `rollout`; logarithms of the standard deviations `[A]`.
-    pub fn new(rollout: &'a Rollout, samples: usize, config: &PpoConfig, log_std: &[f32]) -> Self {
+    /// Creates the losses of a minibatch of `samples` samples of `rollout`; `log_std` `[A]` are the logarithms of the
+    /// standard deviations.
+    pub(super) fn new(rollout: &'a Rollout, samples: usize, config: &PpoConfig, log_std: &[f32]) -> Self {
         Self {
             rollout,
             clip: config.clip as f32,
@@ -58,14 +59,14 @@ impl<'a> Loss<'a> {
             value_coef: config.value_coef as f32,
             bounds_coef: config.bounds_coef as f32,
             share: 1.0 / samples as f32,
-            precision: log_std.iter().map(|s| (-s).exp()).collect(),
+            inverse_std: log_std.iter().map(|s| (-s).exp()).collect(),
             log_scale: log_std.iter().map(|s| s + 0.5 * std::f32::consts::TAU.ln()).sum(),
         }
     }
 
     /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
-    pub fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
-        let width = self.precision.len();
+    pub(super) fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        let width = self.inverse_std.len();
         Arch::new().dispatch(
             #[inline(always)]
             || {
@@ -82,16 +83,16 @@ impl<'a> Loss<'a> {
     fn actor_sample(&self, block: &RolloutBlock, i: usize, mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
         let row = RolloutBlock::row(mean.len(), i);
         let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
-        // First the distance from the mean in standard deviations, then the gradient in its place.
+        // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
         let sharpness = 1.0 / block.noise_scales[i];
-        for (((z, action), mean), precision) in grad.iter_mut().zip(action).zip(mean).zip(&self.precision) {
-            *z = (action - mean) * (precision * sharpness);
+        for (((z, action), mean), inverse_std) in grad.iter_mut().zip(action).zip(mean).zip(&self.inverse_std) {
+            *z = (action - mean) * (inverse_std * sharpness);
         }
         let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
         let ratio = (log_prob - block.log_probs[i]).exp();
         let advantage = block.advantages[i];
         let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage);
-        // A ratio that is not a number takes the second way, and the sum shows it.
+        // A NaN ratio takes the second branch and makes the sum NaN.
         let (surrogate, slope) = if free <= bounded { (free, -self.share * free) } else { (bounded, 0.0) };
         let error = (ratio - 1.0).abs();
         sums.surrogate += f64::from(surrogate);
@@ -105,23 +106,23 @@ impl<'a> Loss<'a> {
             *sum += moved * moved;
         }
         let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.share);
-        for ((z, precision), mean) in grad.iter_mut().zip(&self.precision).zip(mean) {
+        for ((z, inverse_std), mean) in grad.iter_mut().zip(&self.inverse_std).zip(mean) {
             let beyond = mean - mean.clamp(-1.0, 1.0);
             excess += beyond * beyond;
-            *z = *z * (slope * sharpness * precision) + pull * beyond;
+            *z = *z * (slope * sharpness * inverse_std) + pull * beyond;
         }
         sums.excess += f64::from(excess);
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
-    pub fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
+    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let (old, target) = (block.values[i], block.returns[i]);
             let step = (value - old).clamp(-self.value_clip, self.value_clip);
             let (free, bounded) = (value - target, old + step - target);
             let inside = (value - old).abs() <= self.value_clip;
-            // Where the step is clipped and that makes the error larger, the value has no influence on it.
+            // Where clipping the step makes the error larger, the error does not depend on the value.
             let (error, slope) =
                 if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
             sums.value_error += f64::from(error * error);
@@ -130,9 +131,9 @@ impl<'a> Loss<'a> {
     }
 }
 
-/// Mean over `samples` samples of the KL divergence KL(old ‖ new) of diagonal Gaussians, of the sums of squared differences of
-/// their means `[A]`, and the logarithms of their standard deviations `[A]`.
-pub fn kl(moved: &[f64], samples: usize, old_log_std: &[f32], log_std: &[f32]) -> f64 {
+/// Returns the mean over `samples` samples of the KL divergence KL(old ‖ new) of diagonal Gaussians, given the sums of
+/// squared differences of their means `[A]` and the logarithms of their standard deviations `[A]`.
+pub(super) fn kl(moved: &[f64], samples: usize, old_log_std: &[f32], log_std: &[f32]) -> f64 {
     let terms = moved.iter().zip(old_log_std).zip(log_std).map(|((&moved, &old), &new)| {
         let (old, new) = (f64::from(old), f64::from(new));
         let spread = ((2.0 * old).exp() + moved / samples as f64) / (2.0 * new).exp();
@@ -152,7 +153,7 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The numbers are those of the PyTorch program at `losses_and_gradients_match_pytorch` in `candle/loss.rs`.
+    /// The expected values are those of the PyTorch program at the test of the same name in `candle/loss.rs`.
     #[test]
     fn losses_and_gradients_match_pytorch() {
         let spaces = Spaces { observation_size: 1, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
@@ -192,7 +193,7 @@ mod tests {
         assert_close(&[sums.value_error as f32 / 3.0], &[0.296_666_7]);
         assert_eq!(sums.excess, 0.0);
 
-        // Means beyond ±1 are pulled back by 2 · 0.5 · their distance, a third each, on top of what the surrogate says.
+        // Means beyond ±1 add 2 · 0.5 · their distance, divided by three samples, to the gradient of the surrogate.
         let grads = [[1.5, -0.2], [1.0, -0.2]].map(|mean| {
             let mut grad = [0.0; 2];
             loss.actor(&[2], &mean, &mut grad, &mut sums);

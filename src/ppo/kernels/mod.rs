@@ -1,10 +1,11 @@
-//! Our own kernels: a minibatch in one pass over its samples, without a graph.
+//! Custom kernels: the gradient of a minibatch in one pass over its samples, without an autograd graph.
 //!
-//! What the nets see of all samples is computed once. The samples of each shard in a minibatch are split into groups, and each
-//! (group, net) is one task for one thread: it gathers a block of rows at a time, takes it forward, computes the loss and goes
-//! backward while all of it lies in the cache of that core, and adds up the gradient of its group. Then the groups are added as a
-//! binary tree. How samples are grouped depends on their number and that of the shards alone, so the result is the same for any
-//! number of threads. After the first minibatch no array of samples or weights is allocated, but for what gemm packs matrices into.
+//! The network inputs of all samples are computed once per rollout. The samples of each shard in a minibatch are split
+//! into groups, and each (group, net) is one job for one thread. The job gathers a block of rows at a time, runs the
+//! forward pass, the loss and the backward pass while all of it is in the cache of that core, and accumulates the
+//! gradient of its group. Then the gradients of the groups are added as a binary tree. The grouping depends only on the
+//! numbers of samples and shards, so the result is the same for any number of threads. After the first minibatch, the
+//! only float arrays that are allocated are the packing buffers of gemm and small temporaries of the sums.
 
 mod activation;
 mod amx;
@@ -19,51 +20,52 @@ use std::sync::Mutex;
 use anyhow::Result;
 use rayon::prelude::*;
 
-pub use multiplier::{Arithmetic, Multiplier};
-pub use net::{Net, Workspace};
-pub use product::Matrix;
+pub(super) use multiplier::{Arithmetic, Multiplier};
+pub(super) use net::Net;
+pub use net::Workspace;
+pub(super) use product::Matrix;
 
 use super::Policy;
-use super::backend::{Backend, Minibatch, ShardSums};
+use super::backend::{GradientBackend, Minibatch, ShardSums};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::tree_sum;
 use loss::{Loss, Sums};
 
-/// Groups of a minibatch, if its shards are fewer. More can occupy more threads (there are two tasks for each) and take more memory
-/// and time to add.
+/// The largest number of groups in a minibatch, unless it has more shards. More groups can occupy more threads (there
+/// are two jobs per group), but take more memory and more time to add up.
 const GROUPS: usize = 16;
 
-/// Samples of a shard that are worth a group of their own.
+/// The fewest samples of a shard that are worth their own group.
 const SMALLEST_GROUP: usize = 32;
 
-/// Rows that go through a net together: enough for fast products, few enough for the cache of a core.
-pub const ROWS: usize = 256;
+/// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
+pub(super) const ROWS: usize = 256;
 
-/// Numbers of the gradient that one task adds up.
+/// Gradient values that one job adds up.
 const CHUNK: usize = 4096;
 
-/// Gradients by our own kernels.
-pub struct Kernels {
+/// The gradient backend with custom kernels.
+pub(super) struct Kernels {
     config: PpoConfig,
     arithmetic: Arithmetic,
-    /// For each thread of the pool.
+    /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
-    /// For each group and net.
-    parts: Vec<Part>,
-    /// `[B, O]`, what the nets see of the samples of the rollout.
+    /// Results, one per group and net.
+    parts: Vec<Partial>,
+    /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
     old_log_std: Vec<f32>,
 }
 
-/// What a task leaves behind.
+/// The result of a job.
 #[derive(Clone, Default)]
-struct Part {
+struct Partial {
     gradient: Vec<f32>,
     sums: Sums,
 }
 
-/// Which net a task is about.
+/// The net that a job works on.
 #[derive(Clone, Copy, PartialEq)]
 enum Role {
     Actor,
@@ -73,8 +75,8 @@ enum Role {
 const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 
 impl Kernels {
-    /// With these settings.
-    pub fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
+    /// Creates the backend with these settings.
+    pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
         Self {
             config: config.clone(),
             arithmetic,
@@ -85,21 +87,21 @@ impl Kernels {
         }
     }
 
-    /// Makes room for so many groups of so many samples; the rows that go through a net together: blocks of one size, as far as that
-    /// goes.
+    /// Makes room for this number of groups of up to `samples` samples. Returns the number of rows that pass through a
+    /// net together, chosen for blocks of equal size as far as possible.
     fn reserve(&mut self, policy: &Policy, groups: usize, samples: usize) -> usize {
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        self.workspaces.retain_mut(|work| work.get_mut().expect("no task has panicked").rows() >= rows);
+        self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
             self.workspaces.push(Mutex::new(policy.workspace(rows, true, self.arithmetic)));
         }
         if self.parts.len() < 2 * groups {
-            self.parts.resize(2 * groups, Part::default());
+            self.parts.resize(2 * groups, Partial::default());
         }
         rows
     }
 
-    /// Writes the sum of the gradients of the groups of the net of this role.
+    /// Writes the sum of the gradients of all groups for one net.
     fn add_up(&self, role: Role, groups: usize, out: &mut [f32]) {
         let gradients: Vec<&[f32]> =
             (0..groups).map(|group| &self.parts[2 * group + role as usize].gradient[..]).collect();
@@ -110,8 +112,8 @@ impl Kernels {
         });
     }
 
-    /// The sums of a shard, whose groups left these parts.
-    fn shard_sums(&self, parts: &[Part], samples: usize, log_std: &[f32]) -> ShardSums {
+    /// Returns the sums of a shard from the results of its groups.
+    fn shard_sums(&self, parts: &[Partial], samples: usize, log_std: &[f32]) -> ShardSums {
         let sum = |of: fn(&Sums) -> f64| parts.iter().map(|part| of(&part.sums)).sum::<f64>();
         let moved: Vec<f64> = (0..log_std.len())
             .map(|i| parts.iter().step_by(2).map(|part| f64::from(part.sums.moved[i])).sum())
@@ -127,8 +129,8 @@ impl Kernels {
     }
 }
 
-/// The groups that each shard of so many samples is split into, of so many shards: a power of two, so that all groups can be added
-/// as a tree. It depends on nothing else.
+/// Returns the number of groups that each shard of `samples` samples is split into: a power of two, so that all groups
+/// can be added as a tree. It depends on nothing but `samples` and `shards`.
 fn groups_of_shard(samples: usize, shards: usize) -> usize {
     let mut groups = (GROUPS / shards).max(1);
     while groups > 1 && samples / groups < SMALLEST_GROUP {
@@ -137,7 +139,7 @@ fn groups_of_shard(samples: usize, shards: usize) -> usize {
     groups
 }
 
-impl Backend for Kernels {
+impl GradientBackend for Kernels {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
         let (reader, size) = (policy.reader(), policy.spaces.observation_size);
         self.seen.resize(rollout.samples() * size, 0.0);
@@ -174,8 +176,8 @@ impl Backend for Kernels {
             let net = &nets[role as usize];
             part.gradient.resize(net.parameter_count(), 0.0);
             part.sums = Sums::new(log_std.len());
-            let thread = rayon::current_thread_index().expect("rayon runs this");
-            let work = &mut *self.workspaces[thread].lock().expect("no task has panicked");
+            let thread = rayon::current_thread_index().expect("runs on a rayon thread");
+            let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
                 for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
                     row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);

@@ -1,4 +1,4 @@
-//! The choice of what multiplies matrices.
+//! Matrix products in the arithmetic of the configured precision.
 
 use anyhow::{Context, Result};
 
@@ -7,51 +7,51 @@ use super::bf16::{Packed, Side, rounded};
 use super::product::{Matrix, product};
 use crate::config::Precision;
 
-/// An arithmetic that this machine has.
+/// An arithmetic that this machine supports.
 #[derive(Clone, Copy, Debug)]
 pub enum Arithmetic {
-    /// Floats.
+    /// f32 throughout.
     F32,
-    /// Operands rounded to bf16, then floats.
+    /// Operands rounded to bf16, products and sums in f32.
     Rounded,
-    /// Operands rounded to bf16, sums in floats, on tiles.
+    /// Operands rounded to bf16, products on tiles, sums in f32.
     Tiles(Tiles),
 }
 
 impl Arithmetic {
-    /// What a precision asks for.
+    /// Returns the arithmetic for a precision.
     ///
     /// # Errors
-    /// Tiles that this machine lacks.
+    /// Fails if the precision requires tiles and this machine lacks them.
     pub fn new(precision: Precision) -> Result<Self> {
         Ok(match precision {
             Precision::F32 => Self::F32,
             Precision::Bf16Rounded => Self::Rounded,
             Precision::Bf16 => Self::Tiles(
-                Tiles::request().context("ppo.precision = \"bf16\" cannot be had here; begin the run with \"f32\"")?,
+                Tiles::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
             ),
         })
     }
 }
 
-/// Multiplies matrices, one product after the other, with the room that this takes.
-pub struct Multiplier {
+/// A matrix multiplier with reusable buffers for its operands.
+pub(crate) struct Multiplier {
     arithmetic: Arithmetic,
     rounded: [Vec<f32>; 2],
     packed: [Packed; 2],
 }
 
 impl Multiplier {
-    /// Has no room yet: it takes what the largest product so far has needed.
-    pub fn new(arithmetic: Arithmetic) -> Self {
+    /// Creates a multiplier with empty buffers. They grow to the size that the largest product needs.
+    pub(crate) fn new(arithmetic: Arithmetic) -> Self {
         Self { arithmetic, rounded: Default::default(), packed: Default::default() }
     }
 
-    /// Writes the product into `out`, row after row, or adds it to what is there.
+    /// Writes the product to `out`, by rows, or adds it if `add` is set.
     ///
     /// # Panics
-    /// Sizes that do not fit.
-    pub fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
+    /// Panics if the sizes do not match.
+    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
         assert_eq!(lhs.size()[1], rhs.size()[0], "columns of the first and rows of the second matrix");
         assert_eq!(out.len(), lhs.size()[0] * rhs.size()[1], "elements of the product");
         match self.arithmetic {

@@ -6,34 +6,35 @@ use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
 
-/// One network on the present parameters.
-pub struct Net<'a> {
-    layers: Vec<Layer<'a>>,
+/// One network with the current parameters.
+pub(crate) struct Net<'a> {
+    layers: Vec<Dense<'a>>,
     activation: Activation,
 }
 
-/// `[outputs, inputs]` and `[outputs]`
-struct Layer<'a> {
+/// A dense layer: weight `[outputs, inputs]` and bias `[outputs]`.
+struct Dense<'a> {
     weight: &'a [f32],
     bias: &'a [f32],
     inputs: usize,
     outputs: usize,
 }
 
-/// What a block of up to `rows` rows needs on its way through nets of the same hidden layers.
+/// Buffers for passing a block of up to `rows` rows through nets with the same hidden layers.
 pub struct Workspace {
-    /// `[rows, I]`: what the nets read.
+    /// `[rows, I]`: inputs of the nets.
     pub inputs: Vec<f32>,
-    /// `[rows, outputs]` of each layer.
+    /// `[rows, outputs]` for each layer.
     outputs: Vec<Vec<f32>>,
-    /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the one below it.
+    /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the layer below it.
     grads: [Vec<f32>; 2],
     multiplier: Multiplier,
     rows: usize,
 }
 
 impl Workspace {
-    /// For a net of these layers, and any other of the same hidden ones with fewer outputs. Only a `learning` one can go backward.
+    /// Creates a workspace for a net with these layers, or with the same hidden layers and fewer outputs. The backward
+    /// pass requires `learning`.
     pub fn new(layers: &[parameters::Layer], rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
         let widest = layers.iter().map(|layer| layer.outputs).max().expect("a net has layers");
         Self {
@@ -45,12 +46,13 @@ impl Workspace {
         }
     }
 
-    /// The most rows it holds.
+    /// Returns the largest number of rows that it holds.
     pub fn rows(&self) -> usize {
         self.rows
     }
 
-    /// What a net of `outputs` outputs gave for `rows` rows, and where the gradient with respect to that goes.
+    /// Returns the outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
+    /// respect to them.
     pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
         let last = self.outputs.last().expect("a net has layers");
         (&last[..rows * outputs], &mut self.grads[0][..rows * outputs])
@@ -58,9 +60,9 @@ impl Workspace {
 }
 
 impl<'a> Net<'a> {
-    /// The net of these layers of `parameters`.
-    pub fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
-        let layer = |layer: &parameters::Layer| Layer {
+    /// Creates the net of these layers, whose ranges refer to `parameters`.
+    pub(crate) fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
+        let layer = |layer: &parameters::Layer| Dense {
             weight: &parameters[layer.weight.clone()],
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
@@ -69,23 +71,23 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Numbers in an input.
-    pub fn inputs(&self) -> usize {
+    /// Returns the number of inputs.
+    pub(crate) fn inputs(&self) -> usize {
         self.layers[0].inputs
     }
 
-    /// Numbers in an output.
-    pub fn outputs(&self) -> usize {
+    /// Returns the number of outputs.
+    pub(crate) fn outputs(&self) -> usize {
         self.layers.last().expect("a net has layers").outputs
     }
 
-    /// Numbers in all weights and biases.
-    pub fn parameter_count(&self) -> usize {
+    /// Returns the number of weights and biases.
+    pub(crate) fn parameter_count(&self) -> usize {
         self.layers.iter().map(|layer| layer.outputs * (layer.inputs + 1)).sum()
     }
 
-    /// Takes the first `rows` rows of the inputs through the net, and returns its outputs `[rows, outputs]`.
-    pub fn forward<'w>(&self, rows: usize, work: &'w mut Workspace) -> &'w [f32] {
+    /// Runs the first `rows` rows of the inputs through the net and returns its outputs `[rows, outputs]`.
+    pub(crate) fn forward<'w>(&self, rows: usize, work: &'w mut Workspace) -> &'w [f32] {
         for (l, layer) in self.layers.iter().enumerate() {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
@@ -100,9 +102,9 @@ impl<'a> Net<'a> {
         &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
     }
 
-    /// Takes the gradient with respect to the outputs of the last forward pass, which lies in `work`, back through the net.
-    /// Writes the gradient of the parameters, in their order, into `gradient`, or adds it to what is there.
-    pub fn backward(&self, rows: usize, work: &mut Workspace, gradient: &mut [f32], add: bool) {
+    /// Propagates the gradient with respect to the outputs of the last forward pass, which is in `work`, back through
+    /// the net. Writes the gradient of the parameters, in their order, to `gradient`, or adds it if `add` is set.
+    pub(crate) fn backward(&self, rows: usize, work: &mut Workspace, gradient: &mut [f32], add: bool) {
         let mut rest = gradient;
         let [above, below] = &mut work.grads;
         for (l, layer) in self.layers.iter().enumerate().rev() {
@@ -128,7 +130,7 @@ impl<'a> Net<'a> {
     }
 }
 
-impl Layer<'_> {
+impl Dense<'_> {
     fn weight(&self) -> Matrix<'_> {
         Matrix::new(self.weight, self.outputs, self.inputs)
     }

@@ -1,61 +1,63 @@
-//! Matrix products of slices, on the calling thread: the callers run many of them at once, each on numbers that stay in the
-//! cache of one core, which is faster than one product on all threads.
+//! Matrix products of slices on the calling thread. Callers run many of them in parallel, each on data that stays in
+//! the cache of one core, which is faster than one product on all threads.
+
+#![expect(unsafe_code, reason = "the matrix product of gemm takes pointers")]
 
 use gemm::{Parallelism, gemm};
 
-/// A matrix in a slice.
+/// A matrix stored in a slice.
 #[derive(Clone, Copy)]
 pub struct Matrix<'a> {
     data: &'a [f32],
     /// Rows and columns.
     size: [usize; 2],
-    /// Distance in `data` between neighbours in a column and in a row.
+    /// Distances in `data` between neighbours in a column and in a row.
     strides: [isize; 2],
 }
 
 impl<'a> Matrix<'a> {
-    /// Row after row.
+    /// Creates a matrix stored by rows.
     ///
     /// # Panics
-    /// If `data` has another number of elements.
+    /// Panics if `data` does not have `rows * columns` elements.
     pub fn new(data: &'a [f32], rows: usize, columns: usize) -> Self {
         assert_eq!(data.len(), rows * columns, "elements of a matrix");
         Self { data, size: [rows, columns], strides: [columns as isize, 1] }
     }
 
-    /// The numbers as they lie in memory.
+    /// Returns the values in memory order.
     pub fn data(&self) -> &'a [f32] {
         self.data
     }
 
-    /// Rows and columns.
+    /// Returns the numbers of rows and columns.
     pub fn size(&self) -> [usize; 2] {
         self.size
     }
 
-    /// Distance in the data between neighbours in a column and in a row; one of them is 1.
+    /// Returns the distances in the data between neighbours in a column and in a row; one of them is 1.
     pub fn strides(&self) -> [isize; 2] {
         self.strides
     }
 
-    /// Other numbers that lie in the same way.
+    /// Returns a matrix of other data with the same layout.
     pub fn of<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
         assert_eq!(data.len(), self.data.len(), "elements of a matrix");
         Matrix { data, size: self.size, strides: self.strides }
     }
 
-    /// The same numbers with rows and columns exchanged.
+    /// Returns the transposed matrix, without copying.
     pub fn transposed(self) -> Self {
         let ([rows, columns], [down, right]) = (self.size, self.strides);
         Self { data: self.data, size: [columns, rows], strides: [right, down] }
     }
 }
 
-/// Writes the product into `out`, row after row, or adds it to what is there.
+/// Writes the product to `out`, by rows, or adds it if `add` is set.
 ///
 /// # Panics
-/// Sizes that do not fit.
-pub fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
+/// Panics if the sizes do not match.
+pub(super) fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
     let ([m, k], [rhs_rows, n]) = (lhs.size, rhs.size);
     assert_eq!(k, rhs_rows, "columns of the first and rows of the second matrix");
     assert_eq!(out.len(), m * n, "elements of the product");

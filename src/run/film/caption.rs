@@ -1,9 +1,9 @@
-//! Text in the corner of a picture, on a darkened ground.
+//! Text in the corner of a picture, on a darkened background.
 
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 
-/// Draws captions into pictures of one size.
-pub struct Captions {
+/// The font and layout of captions for pictures of one size.
+pub(super) struct Captions {
     font: FontRef<'static>,
     scale: PxScale,
     width: usize,
@@ -11,16 +11,16 @@ pub struct Captions {
 }
 
 impl Captions {
-    /// For pictures of this width and height in pixels.
-    pub fn new([width, height]: [u32; 2]) -> Self {
+    /// Prepares captions for pictures with this width and height in pixels.
+    pub(super) fn new([width, height]: [u32; 2]) -> Self {
         let font =
             FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR).expect("the font is part of the program");
         let scale = PxScale::from((height as f32 / 28.0).max(11.0));
         Self { font, scale, width: width as usize, height: height as usize }
     }
 
-    /// Writes the lines into the top left corner of `rgb` `[height, width, 3]`; what does not fit is cut off.
-    pub fn draw(&self, rgb: &mut [u8], lines: &[String]) {
+    /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
+    pub(super) fn draw(&self, rgb: &mut [u8], lines: &[String]) {
         if lines.is_empty() {
             return;
         }
@@ -50,7 +50,7 @@ impl Captions {
         }
     }
 
-    /// Mixes white into a pixel.
+    /// Blends white into a pixel.
     fn blend(&self, rgb: &mut [u8], x: i64, y: i64, cover: f32) {
         let inside = (0..self.width as i64).contains(&x) && (0..self.height as i64).contains(&y);
         if !inside {
@@ -72,9 +72,9 @@ mod tests {
         let captions = Captions::new([320, 240]);
         let mut rgb = vec![100; 320 * 240 * 3];
         captions.draw(&mut rgb, &["goals 3".into(), "error 12°".into()]);
-        assert!(rgb.iter().any(|&channel| channel > 200), "there is writing");
-        assert!(rgb[..3].iter().all(|&channel| channel == 40), "on a dark ground");
-        assert!(rgb[rgb.len() / 2..].iter().all(|&channel| channel == 100), "the rest is as it was");
+        assert!(rgb.iter().any(|&channel| channel > 200), "text is drawn");
+        assert!(rgb[..3].iter().all(|&channel| channel == 40), "on a darkened background");
+        assert!(rgb[rgb.len() / 2..].iter().all(|&channel| channel == 100), "the rest is unchanged");
         captions.draw(&mut rgb, &vec!["x".repeat(500); 100]);
     }
 }

@@ -1,25 +1,25 @@
-//! What the kinds of film files have in common.
+//! The common interface of the film encoders.
 
 use anyhow::Result;
 
 use crate::run::OutputFile;
 
-/// What a film file is made for.
+/// The parameters of a film file.
 #[derive(Clone, Copy, Debug)]
 pub struct FilmFormat {
     /// Width and height in pixels.
     pub size: [u32; 2],
     /// Frames per second.
     pub fps: u32,
-    /// The most frames it can have.
+    /// The most frames that the film can have.
     pub longest: usize,
 }
 
-/// A kind of film file.
-pub trait Film {
-    /// Takes the next frame `[height, width, 3]`.
+/// An encoder for one kind of film file.
+pub(super) trait FilmEncoder {
+    /// Adds the next frame `[height, width, 3]`.
     fn push(&mut self, rgb: &[u8]) -> Result<()>;
 
-    /// Writes what is still to be written.
+    /// Writes what is left and returns the file.
     fn finish(self: Box<Self>) -> Result<OutputFile>;
 }

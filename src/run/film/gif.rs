@@ -1,4 +1,4 @@
-//! GIF: one palette for the whole film, and of each frame only what differs from the one before.
+//! GIF: one palette for the whole film; each frame holds only what differs from the previous one.
 
 use std::borrow::Cow;
 use std::io::BufWriter;
@@ -7,25 +7,25 @@ use anyhow::{Result, anyhow};
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
-use super::format::{Film, FilmFormat};
+use super::format::{FilmEncoder, FilmFormat};
 use crate::run::OutputFile;
 
-/// Colours of the palette; the index after them leaves a pixel as it was.
+/// The number of colours in the palette; the index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
 const TRANSPARENT: u8 = COLOURS as u8;
-/// The palette is chosen for the frames at the start, as many as fit in so many bytes.
+/// The most bytes of frames kept for choosing the palette, which suits the frames at the start.
 const BYTES_FOR_PALETTE: usize = 200 << 20;
-/// Pixels that the palette is chosen by, at most.
+/// The most pixels sampled for choosing the palette.
 const PIXELS_FOR_PALETTE: usize = 400_000;
 
 /// A GIF file being written.
-pub struct GifFilm {
+pub(super) struct GifFilm {
     format: FilmFormat,
     stage: Stage,
 }
 
 enum Stage {
-    /// Frames `[height, width, 3]` wait for the palette.
+    /// Frames `[height, width, 3]` that wait for the palette.
     Gathering {
         file: Option<OutputFile>,
         frames: Vec<Vec<u8>>,
@@ -42,15 +42,15 @@ struct Writing {
 }
 
 impl GifFilm {
-    /// Nothing is written until the palette is known.
-    pub fn new(file: OutputFile, format: FilmFormat) -> Self {
+    /// Creates a film; writes nothing until the palette is known.
+    pub(super) fn new(file: OutputFile, format: FilmFormat) -> Self {
         Self { format, stage: Stage::Gathering { file: Some(file), frames: Vec::new() } }
     }
 
-    /// Chooses the palette, if that is still to be done, and writes what waited for it.
+    /// Returns the film with a palette. On the first call, chooses the palette and writes the frames that waited for it.
     fn writing(&mut self) -> Result<&mut Writing> {
         if let Stage::Gathering { file, frames } = &mut self.stage {
-            let file = file.take().ok_or_else(|| anyhow!("the film could not be begun"))?;
+            let file = file.take().ok_or_else(|| anyhow!("the film could not be started"))?;
             let mut writing = Writing::new(file, self.format, Palette::of(frames))?;
             frames.iter().try_for_each(|rgb| writing.write(rgb))?;
             self.stage = Stage::Writing(Box::new(writing));
@@ -62,7 +62,7 @@ impl GifFilm {
     }
 }
 
-impl Film for GifFilm {
+impl FilmEncoder for GifFilm {
     fn push(&mut self, rgb: &[u8]) -> Result<()> {
         match &mut self.stage {
             Stage::Gathering { frames, .. } if (frames.len() + 1) * rgb.len() <= BYTES_FOR_PALETTE => {
@@ -80,7 +80,7 @@ impl Film for GifFilm {
                 let file = writing.encoder.into_inner()?;
                 file.into_inner().map_err(|error| anyhow!("{}", error.error()))
             }
-            Stage::Gathering { .. } => unreachable!("it was just begun"),
+            Stage::Gathering { .. } => unreachable!("the stage was just changed"),
         }
     }
 }
@@ -99,7 +99,7 @@ impl Writing {
             let at = 3 * (y * width + x);
             self.previous.get(at..at + 3) != Some(&rgb[at..at + 3])
         };
-        // The smallest rectangle around all changes; one pixel where there are none.
+        // The smallest rectangle around all changes; one pixel if there are none.
         let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
         let (top, bottom) = (rows.first().copied().unwrap_or(0), rows.last().copied().unwrap_or(0));
         let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
@@ -112,7 +112,7 @@ impl Writing {
                 pixels.push(if changed(x, y) { self.palette.index(&rgb[at..at + 3]) } else { TRANSPARENT });
             }
         }
-        // Hundredths of a second, so that the whole film has the right length whatever the pace.
+        // Rounds times, not delays, to hundredths of a second, so that the film has the right length at any frame rate.
         let hundredths = |frames: u64| (frames * 100 + u64::from(self.format.fps) / 2) / u64::from(self.format.fps);
         self.encoder.write_frame(&Frame {
             delay: (hundredths(self.frames + 1) - hundredths(self.frames)) as u16,
@@ -132,15 +132,15 @@ impl Writing {
     }
 }
 
-/// Colours, and the nearest of them for each other colour.
+/// A palette that finds the nearest of its colours for any colour.
 struct Palette {
     quantizer: NeuQuant,
-    /// By the upper six bits of red, green and blue, what was looked up already.
+    /// Indices that were looked up already, by the upper six bits of red, green and blue.
     known: Vec<Option<u8>>,
 }
 
 impl Palette {
-    /// The palette that suits these frames.
+    /// Chooses a palette for these frames.
     fn of(frames: &[Vec<u8>]) -> Self {
         let pixels: usize = frames.iter().map(|rgb| rgb.len() / 3).sum();
         let every = pixels.div_ceil(PIXELS_FOR_PALETTE).max(1);
@@ -156,7 +156,7 @@ impl Palette {
     fn index(&mut self, rgb: &[u8]) -> u8 {
         let key = rgb.iter().fold(0, |key, &channel| key << 6 | usize::from(channel >> 2));
         *self.known[key].get_or_insert_with(|| {
-            // The middle of what shares the key.
+            // The middle of the colours that share the key.
             let middle = |channel: u8| channel & !3 | 2;
             self.quantizer.index_of(&[middle(rgb[0]), middle(rgb[1]), middle(rgb[2]), 255]) as u8
         })

@@ -1,6 +1,6 @@
 //! Films and pictures as files: H.264 in MP4, GIF, PNG.
 //!
-//! A film is drawn by one thread and encoded by another, so that both cores of a small machine work.
+//! One thread draws a film and another encodes it, which keeps both cores of a small machine busy.
 
 mod caption;
 mod format;
@@ -14,24 +14,24 @@ use std::thread::{self, JoinHandle};
 use anyhow::{Context, Result, bail, ensure};
 
 use self::caption::Captions;
-use self::format::Film;
+use self::format::FilmEncoder;
 use self::gif::GifFilm;
 use self::mp4::Mp4Film;
 use super::OutputFile;
 
 pub use self::format::FilmFormat;
 
-/// Pictures that may wait for the encoder.
+/// The most frames that wait for the encoder.
 const WAITING: usize = 4;
 
-/// The most frames of a film: the index of an MP4 is kept in memory, and room for it in the file.
+/// The most frames of a film. The index of an MP4 is kept in memory, and space for it is reserved in the file.
 const MOST_FRAMES: usize = 2_000_000;
 
-/// A film being written; it is there once it is finished.
+/// A film being written. The file appears once the film is finished.
 pub struct FilmWriter {
     path: PathBuf,
     frames: SyncSender<Frame>,
-    /// Buffers of frames that have been encoded, to be used again.
+    /// Buffers of encoded frames, for reuse.
     spare: Receiver<Vec<u8>>,
     encoder: JoinHandle<Result<OutputFile>>,
 }
@@ -43,13 +43,13 @@ struct Frame {
 }
 
 impl FilmWriter {
-    /// Begins a film, MP4 or GIF by the name of `path`.
+    /// Starts a film: MP4 or GIF, by the extension of `path`.
     ///
     /// # Errors
-    /// Another kind of name, a format that the kind cannot have, a place that cannot be written to.
+    /// Fails for any other extension, for a format that the kind of file does not support, or if the file cannot be written.
     pub fn create(path: &Path, format: FilmFormat) -> Result<Self> {
         let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-        let begin: fn(OutputFile, FilmFormat) -> Result<Box<dyn Film>> = match extension.as_str() {
+        let begin: fn(OutputFile, FilmFormat) -> Result<Box<dyn FilmEncoder>> = match extension.as_str() {
             "mp4" => |file, format| Ok(Box::new(Mp4Film::new(file, format)?)),
             "gif" => |file, format| Ok(Box::new(GifFilm::new(file, format))),
             _ => bail!("{}: the name of a film must end in .mp4 or .gif", path.display()),
@@ -60,7 +60,7 @@ impl FilmWriter {
         let steady = format.fps <= 50;
         ensure!(extension == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
         let fits = format.longest <= MOST_FRAMES;
-        ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; take fewer or shorter episodes", format.longest);
+        ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes", format.longest);
         let file = OutputFile::create(path)?;
         let (frames, incoming) = sync_channel::<Frame>(WAITING);
         let (done, spare) = sync_channel(WAITING + 1);
@@ -78,8 +78,8 @@ impl FilmWriter {
         Ok(Self { path: path.to_owned(), frames, spare, encoder })
     }
 
-    /// Adds a frame `[height, width, 3]` with these lines of text in its corner. Where the encoder has failed nothing happens:
-    /// [`FilmWriter::failed`] tells, and `finish` why.
+    /// Adds a frame `[height, width, 3]` with these lines of text in its corner. Does nothing if the encoder has failed:
+    /// [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`] returns the reason.
     pub fn push(&mut self, rgb: &[u8], caption: Vec<String>) {
         let mut buffer = self.spare.try_recv().unwrap_or_default();
         buffer.clear();
@@ -87,33 +87,33 @@ impl FilmWriter {
         let _ = self.frames.send(Frame { rgb: buffer, caption });
     }
 
-    /// Whether the encoder has ended early.
+    /// Whether the encoder has stopped early.
     pub fn failed(&self) -> bool {
         self.encoder.is_finished()
     }
 
-    /// Gives the film up, leaving what was there before; why the encoder failed, if it did.
+    /// Abandons the film and leaves an existing file as it was. Returns why the encoder failed, if it did.
     pub fn abandon(self) -> Option<anyhow::Error> {
         drop(self.frames);
         let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
-        encoded.err().map(|error| error.context(format!("cannot make the film {}", self.path.display())))
+        encoded.err().map(|error| error.context(format!("cannot write the film {}", self.path.display())))
     }
 
     /// Completes the file.
     ///
     /// # Errors
-    /// Those of the encoder and of the file, also of earlier frames.
+    /// Fails if the encoder or the file failed, on this or an earlier frame.
     pub fn finish(self) -> Result<()> {
         drop(self.frames);
         let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
-        encoded.and_then(OutputFile::complete).with_context(|| format!("cannot make the film {}", self.path.display()))
+        encoded.and_then(OutputFile::complete).with_context(|| format!("cannot write the film {}", self.path.display()))
     }
 }
 
 /// Writes a picture `[height, width, 3]` as PNG.
 ///
 /// # Errors
-/// A name that does not end in .png, a place that cannot be written to.
+/// Fails if the name does not end in .png, or if the file cannot be written.
 pub fn write_png(output: OutputFile, [width, height]: [u32; 2], rgb: &[u8]) -> Result<()> {
     let named = output.path().extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
     ensure!(named, "{}: the name of a picture must end in .png", output.path().display());

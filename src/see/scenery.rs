@@ -1,4 +1,4 @@
-//! The task in a scene that is to be looked at: the real hand's meshes, a camera, a quality.
+//! The task in a scene for display: the real hand's meshes, a camera, a quality.
 
 use std::sync::Arc;
 
@@ -10,10 +10,10 @@ use crate::env::Task;
 use crate::run;
 use crate::sim::{Look, Quality, mesh_files};
 
-/// Loads the task as `shot` wants to see it. Meshes that cannot be had are said to be missing, and the primitives are shown.
+/// Loads the task for display as `shot` requests. If the meshes are not available, prints a note and shows the primitives.
 ///
 /// # Errors
-/// As [`Task::new`].
+/// Fails like [`Task::new`].
 pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
     let own_scene = config.model_file().is_some();
     let meshes = if shot.plain || own_scene {

@@ -1,4 +1,4 @@
-//! Episodes as a film, one after the other, and single pictures; without a display.
+//! Films of consecutive episodes, and single pictures, without a display.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,25 +11,25 @@ use crate::evaluate::{Actor, Episodes, Moment, Player};
 use crate::run::{self, Bar, FilmFormat, FilmWriter, OutputFile};
 use crate::sim::Renderer;
 
-/// A film of episodes that are played one after the other.
+/// A film of episodes played one after another.
 pub struct Film {
     renderer: Renderer,
     writer: FilmWriter,
     fps: u32,
-    /// Frames of the present episode.
+    /// Frames of the current episode.
     frames: u64,
     all_frames: u64,
-    /// The most frames of an episode.
+    /// The maximum number of frames of an episode.
     longest: u64,
     bar: Bar,
     begun: Instant,
 }
 
 impl Film {
-    /// Begins the film `path` of so many episodes of `task`, which must be one to see.
+    /// Starts the film `path` of up to `episodes` episodes of `task`, which must have been loaded for display.
     ///
     /// # Errors
-    /// No EGL, another name than .mp4 or .gif, a place that cannot be written to.
+    /// Fails if there is no EGL, the name does not end in .mp4 or .gif, or the path cannot be written to.
     pub fn create(path: &Path, task: &Task, fps: u32, episodes: u64) -> Result<Self> {
         let config = task.config();
         let seconds = f64::from(config.max_episode_steps()) * config.ctrl_dt;
@@ -38,25 +38,25 @@ impl Film {
         let renderer = Renderer::new(task.scene())?;
         let format = FilmFormat { size: renderer.size(), fps, longest: all as usize };
         let writer = FilmWriter::create(path, format)?;
-        let bar = Bar::new(all, "frames");
+        let bar = Bar::new(all, "frames", "film");
         Ok(Self { renderer, writer, fps, frames: 0, all_frames: 0, longest, bar, begun: Instant::now() })
     }
 
-    /// Adds the frames that are due at this moment: frame k of an episode shows it k / fps seconds after its start.
+    /// Adds the frames that are due at `moment`: frame k of an episode shows it k / fps seconds after its start.
     ///
     /// # Errors
-    /// OpenGL's; that the encoder or the file failed, of which [`Film::abandon`] tells more.
+    /// Fails if OpenGL, the encoder or the file does; [`Film::abandon`] returns the cause if it was the encoder or the file.
     pub fn observe(&mut self, moment: &Moment) -> Result<()> {
         let env = moment.env;
         if moment.step.is_none() {
             self.frames = 0;
         }
-        ensure!(!self.writer.failed(), "the film cannot go on");
+        ensure!(!self.writer.failed(), "the film cannot be continued");
         let time = f64::from(env.episode().length) * env.config().ctrl_dt;
         let ended = moment.step.is_some_and(|(_, end)| end.is_some());
         loop {
             let due = self.frames as f64 / f64::from(self.fps);
-            // The frame of the end would belong to what comes after it.
+            // A frame exactly at the end belongs to what follows.
             if due > time + 1e-9 || ended && due > time - 1e-9 {
                 break;
             }
@@ -73,25 +73,25 @@ impl Film {
         Ok(())
     }
 
-    /// Gives the film up, leaving what was there before; why it failed, if it was the film.
+    /// Discards the film, keeping any existing file. Returns why the film failed, if it did.
     pub fn abandon(self) -> Option<anyhow::Error> {
         self.writer.abandon()
     }
 
-    /// Completes the file; returns what to say about it.
+    /// Completes the file and returns a summary to print.
     ///
     /// # Errors
-    /// The encoder's and the file's.
+    /// Fails if the encoder or the file does.
     pub fn finish(self) -> Result<String> {
         self.writer.finish()?;
         let [width, height] = self.renderer.size();
         let seconds = self.all_frames as f64 / f64::from(self.fps);
         let pace = self.all_frames as f64 / self.begun.elapsed().as_secs_f64();
-        Ok(format!("{width}x{height}, {} frames, {seconds:.2} s, made at {pace:.1} frames/s", self.all_frames))
+        Ok(format!("{width}x{height}, {} frames, {seconds:.2} s, rendered at {pace:.1} frames/s", self.all_frames))
     }
 }
 
-/// What is written into a picture.
+/// Returns the lines of text for a frame.
 fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
     let tolerance = env.config().success_tolerance.to_degrees();
     vec![
@@ -101,11 +101,11 @@ fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
     ]
 }
 
-/// Draws one picture of `task`, which must be one to see, after `seconds` of the first of these episodes.
+/// Draws one picture of `task`, which must have been loaded for display, after `seconds` of the first of `episodes`.
 ///
 /// # Errors
-/// No EGL, another name than .png, a place that cannot be written to.
-pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episodes, seconds: f64) -> Result<()> {
+/// Fails if there is no EGL, the name does not end in .png, or the path cannot be written to.
+pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episodes, seconds: f64) -> Result<[u32; 2]> {
     let output = OutputFile::create(path)?;
     let mut renderer = Renderer::new(task.scene())?;
     let mut player = Player::new(task, episodes);
@@ -116,5 +116,6 @@ pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episod
     }
     let size = renderer.size();
     let picture = renderer.draw(player.env().simulation())?;
-    run::write_png(output, size, picture)
+    run::write_png(output, size, picture)?;
+    Ok(size)
 }

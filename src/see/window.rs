@@ -1,4 +1,4 @@
-//! The hand in a window, at real time or slower: the loop that owns time, and what the panel shows of the task.
+//! The hand in a window: the loop that controls time, and the panel's readout of the task.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -7,18 +7,22 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use crate::env::{ACTION_SIZE, Env, Repose, Task};
+use crate::env::{ACTION_SIZE, Env, Repose, RewardTerms, Task};
 use crate::evaluate::{Actor, Episodes, Player};
-use crate::sim::{Bar, Controls, Curve, Readout, Viewer};
+use crate::run;
+use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
 /// Whether this build has windows.
-pub const PRESENT: bool = true;
+pub const HAS_WINDOWS: bool = true;
 
-/// The shortest time between two pictures.
+/// The minimum time between two frames.
 const FRAME: Duration = Duration::from_micros(16_667);
-/// A machine that cannot keep up falls behind by at most so many seconds.
+/// The maximum lag, in seconds, of a machine that cannot keep up.
 const LARGEST_LAG: f64 = 0.25;
-/// Control steps that the curves show.
+/// Printed when a window opens.
+const KEYS: &str = "window: Space pauses, Right steps, Up and Down change the speed, G new goal, R reset, P next kind of actions, \
+                    X MuJoCo's panel, Ctrl+Q closes";
+/// The number of control steps that the curves show.
 const HISTORY: usize = 800;
 
 /// An open window.
@@ -27,31 +31,33 @@ pub struct Window {
 }
 
 impl Window {
-    /// Opens a window on `task`, which must be one to see, that lets the user choose between actors of these names; the one at
-    /// `first` begins.
+    /// Opens a window on `task`, which must have been loaded for display. The user chooses between `actors`, initially the one
+    /// at `first`.
     ///
     /// # Errors
-    /// No display or a missing library, with the packages that bring them.
+    /// Fails if there is no display or a library is missing; the message names the packages that provide it.
     pub fn open(task: &Task, actors: Vec<&'static str>, first: usize) -> Result<Self> {
-        Ok(Self { viewer: Viewer::open(task.scene(), "shadow-repose", actors, first)? })
+        let viewer = Viewer::open(task.scene(), "shadow-repose", actors, first)?;
+        run::say(KEYS);
+        Ok(Self { viewer })
     }
 
-    /// Plays the episodes, of which there may be no end, until they are over or the window is closed; returns what to say
-    /// about it.
+    /// Plays the episodes, possibly without end, until they are over or the window is closed. Returns a summary to print.
     ///
     /// # Errors
-    /// OpenGL's.
+    /// Fails if OpenGL does.
     pub fn play(mut self, task: &Arc<Task>, actors: &[Actor], episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
         let mut episode = episodes.first;
         let (mut tally, mut history) = (Tally::default(), History::default());
-        let mut pace = Pace::new(task.config().ctrl_dt);
+        let mut clock = Clock::new(task.config().ctrl_dt);
         while self.viewer.is_open() {
             let frame = Instant::now();
             let readout = readout(player.env(), episode, &tally, &history);
             let asked = self.viewer.show(player.env_mut().simulation_mut(), readout)?;
             if asked.reset {
                 tally.goals += player.env().episode().goals;
+                tally.ended_early += 1;
                 episode += 1;
                 if episode - episodes.first >= episodes.count {
                     return Ok(tally.to_string());
@@ -61,7 +67,7 @@ impl Window {
             if asked.new_goal {
                 player.new_goal();
             }
-            for _ in 0..pace.steps_due(&asked) {
+            for _ in 0..clock.steps_due(&asked) {
                 let end = player.step(&actors[asked.choice]);
                 tally.steps += 1;
                 history.add(player.env(), tally.steps as f64 * task.config().ctrl_dt);
@@ -81,15 +87,15 @@ impl Window {
     }
 }
 
-/// Turns the time that has passed into control steps.
-struct Pace {
+/// A clock that converts elapsed time into control steps.
+struct Clock {
     ctrl_dt: f64,
     last: Instant,
-    /// s of the scene that are still to be played.
+    /// Scene time that is still to be played, s.
     owed: f64,
 }
 
-impl Pace {
+impl Clock {
     fn new(ctrl_dt: f64) -> Self {
         Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
     }
@@ -108,13 +114,15 @@ impl Pace {
     }
 }
 
-/// What has been played in the window so far.
+/// The totals played in the window so far.
 #[derive(Default)]
 struct Tally {
     steps: u64,
     episodes: u32,
     drops: u32,
     goals: u32,
+    /// Episodes that the user ended.
+    ended_early: u32,
 }
 
 impl Tally {
@@ -126,17 +134,27 @@ impl Tally {
     }
 }
 
-impl std::fmt::Display for Tally {
-    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-        let Self { steps, episodes, drops, goals } = self;
-        write!(f, "shown: {steps} steps, {episodes} episodes to their end, {drops} drops, {goals} goals reached")
+impl Tally {
+    /// Returns what happened in the episodes before the current one, also in those that the user ended.
+    fn before(&self) -> String {
+        match self.episodes + self.ended_early {
+            0 => "nothing yet".to_owned(),
+            count => format!("{} goals, {} drops in {count} episodes", self.goals, self.drops),
+        }
     }
 }
 
-/// The recent past of an episode.
+impl std::fmt::Display for Tally {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        let Self { steps, episodes, drops, goals, .. } = self;
+        write!(f, "shown: {steps} steps, {episodes} episodes completed, {drops} drops, {goals} goals reached")
+    }
+}
+
+/// The recent history of the error and the reward.
 #[derive(Default)]
 struct History {
-    /// Degrees.
+    /// Rotation error, degrees.
     error: VecDeque<[f64; 2]>,
     reward: VecDeque<[f64; 2]>,
 }
@@ -158,30 +176,37 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, history: &History) -> Re
     let (stats, reward) = (env.episode(), env.last_step().reward);
     let tolerance = config.success_tolerance.to_degrees();
     let asked = config.max_consecutive_successes;
-    // Of each term the largest that a step can pay or cost.
-    let largest = [
-        config.rot_reward_scale / config.rot_eps,
-        config.dist_reward_scale * config.fall_dist,
-        config.action_penalty_scale * ACTION_SIZE as f64,
-        config.reach_goal_bonus,
-        config.fall_penalty,
-    ];
-    let terms = reward.named().into_iter().zip(largest).map(|((name, value), largest)| {
-        let share = if largest == 0.0 { 0.0 } else { (value / largest) as f32 };
-        Bar { name, share, text: format!("{value:+.3}") }
+    // The largest value of each term in a step, positive or negative.
+    let largest = RewardTerms {
+        rotation: config.rot_reward_scale / config.rot_eps,
+        distance: config.dist_reward_scale * config.fall_dist,
+        action: config.action_penalty_scale * ACTION_SIZE as f64,
+        bonus: config.reach_goal_bonus,
+        fall: config.fall_penalty,
+    };
+    let terms = reward.named().into_iter().zip(largest.named()).map(|((name, value), (_, largest))| {
+        let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };
+        Gauge { name, fraction, signed: true, text: format!("{value:+.3}") }
     });
-    let hold = Bar { name: "held", share: env.held() as f32 / asked as f32, text: format!("{}/{asked}", env.held()) };
+    let fraction = env.held() as f32 / asked as f32;
+    let hold = Gauge { name: "held", fraction, signed: false, text: format!("{} of {asked} steps", env.held()) };
+    let angle = |radians: f64| format!("{:.1}° = {radians:.3} rad", radians.to_degrees());
     Readout {
         rows: vec![
             ("goals reached", stats.goals.to_string()),
-            ("rotation error", format!("{:.1}° (goal {tolerance:.1}°)", env.rot_dist().to_degrees())),
+            ("rotation error", angle(env.rot_dist())),
+            ("tolerance", angle(config.success_tolerance)),
             ("episode", format!("{episode}, {:.2} s", f64::from(stats.length) * config.ctrl_dt)),
-            ("before it", format!("{} goals, {} drops in {}", tally.goals, tally.drops, tally.episodes)),
+            ("before", tally.before()),
         ],
         bars: vec![("within the tolerance", vec![hold]), ("reward of this step", terms.collect())],
         curves: vec![
-            Curve { name: "rotation error, degrees", points: history.error.clone(), level: Some(tolerance) },
-            Curve { name: "reward", points: history.reward.clone(), level: None },
+            Trend {
+                name: "rotation error, degrees (line: tolerance)",
+                points: history.error.clone(),
+                level: Some(tolerance),
+            },
+            Trend { name: "reward of a step", points: history.reward.clone(), level: None },
         ],
     }
 }
@@ -196,17 +221,17 @@ mod tests {
 
     #[test]
     fn a_pause_lets_single_steps_through_and_does_not_catch_up_afterwards() {
-        let mut pace = Pace::new(1e-3);
-        pace.last -= Duration::from_secs(10);
-        assert_eq!(pace.steps_due(&controls(true, 1.0, 3)), 3);
-        assert_eq!(pace.steps_due(&controls(true, 1.0, 0)), 0);
-        assert!(pace.steps_due(&controls(false, 1.0, 0)) < 200, "the pause is not played");
+        let mut clock = Clock::new(1e-3);
+        clock.last -= Duration::from_secs(10);
+        assert_eq!(clock.steps_due(&controls(true, 1.0, 3)), 3);
+        assert_eq!(clock.steps_due(&controls(true, 1.0, 0)), 0);
+        assert!(clock.steps_due(&controls(false, 1.0, 0)) < 200, "the time of the pause is not made up for");
     }
 
     #[test]
     fn a_machine_that_is_too_slow_falls_behind_instead_of_stalling() {
-        let mut pace = Pace::new(0.01);
-        pace.last -= Duration::from_secs(60);
-        assert_eq!(pace.steps_due(&controls(false, 1.0, 0)), 25);
+        let mut clock = Clock::new(0.01);
+        clock.last -= Duration::from_secs(60);
+        assert_eq!(clock.steps_due(&controls(false, 1.0, 0)), 25);
     }
 }

@@ -1,0 +1,46 @@
+//! The command line as texts for other programs: shell completions and a manual page.
+
+use anyhow::Result;
+
+use crate::cli::{CompletionsArgs, Shell, command};
+use crate::run;
+
+/// Prints completions for a shell.
+///
+/// # Errors
+/// Fails if stdout cannot be written to.
+pub fn completions(args: &CompletionsArgs) -> Result<()> {
+    let shell = match args.shell {
+        Shell::Bash => clap_complete::Shell::Bash,
+        Shell::Zsh => clap_complete::Shell::Zsh,
+        Shell::Fish => clap_complete::Shell::Fish,
+    };
+    let mut text = Vec::new();
+    clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
+    run::print(&String::from_utf8(text)?)
+}
+
+/// Prints a manual page of all commands.
+///
+/// # Errors
+/// Fails if stdout cannot be written to.
+pub fn man() -> Result<()> {
+    let mut program = command().name("shadow-repose");
+    program.build();
+    let (mut page, whole) = (Vec::new(), clap_mangen::Man::new(program.clone()));
+    whole.render_title(&mut page)?;
+    whole.render_name_section(&mut page)?;
+    whole.render_synopsis_section(&mut page)?;
+    whole.render_description_section(&mut page)?;
+    let mut page = String::from_utf8(page)?;
+    for command in program.get_subcommands().filter(|command| command.get_name() != "help") {
+        let (mut section, part) = (Vec::new(), clap_mangen::Man::new(command.clone()));
+        part.render_description_section(&mut section)?;
+        part.render_options_section(&mut section)?;
+        part.render_extra_section(&mut section)?;
+        // Sections of the command's own page are parts of one section here.
+        let section = String::from_utf8(section)?.replace(".SH ", ".SS ");
+        page += &format!(".SH \"SHADOW-REPOSE {}\"\n{section}", command.get_name().to_uppercase());
+    }
+    run::print(&page)
+}

@@ -1,0 +1,148 @@
+//! Reads event files back: finds the bytes of a file that are whole events up to a step.
+//!
+//! A file is a sequence of records: length (8 bytes, little endian), its checksum, an event, its checksum (TFRecord, from
+//! TensorFlow's record_writer.h). An event is a protobuf message, of which only the step, field 2, is read. Files are untrusted:
+//! sizes are bounded before anything is allocated.
+
+use std::io::{BufRead, ErrorKind, Result};
+
+use tensorboard_rs::masked_crc32c::masked_crc32c;
+
+/// The most bytes of an event. This program writes none that is larger; a record that claims to be is damaged.
+const LARGEST: u64 = 1 << 20;
+
+/// Returns the number of bytes at the start of a file that are whole events up to `last_step`. Steps do not decrease within a
+/// file.
+///
+/// # Errors
+/// Fails if the file cannot be read.
+pub(super) fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u64> {
+    let mut length = 0;
+    while let Some(event) = next_event(&mut reader)? {
+        if step_of(&event).is_none_or(|step| step > last_step as i64) {
+            break;
+        }
+        length += 16 + event.len() as u64;
+    }
+    Ok(length)
+}
+
+/// Reads the next event; returns `None` at the end of the file, or if no whole record follows.
+fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
+    let Some(length) = checked(reader, 8)? else { return Ok(None) };
+    match length.try_into().map(u64::from_le_bytes) {
+        Ok(length) if length <= LARGEST => checked(reader, length as usize),
+        _ => Ok(None),
+    }
+}
+
+/// Reads `count` bytes and their checksum; returns `None` if they are incomplete or do not match.
+fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
+    let (mut bytes, mut checksum) = (vec![0; count], [0; 4]);
+    match reader.read_exact(&mut bytes).and_then(|()| reader.read_exact(&mut checksum)) {
+        Err(error) if error.kind() == ErrorKind::UnexpectedEof => Ok(None),
+        result => result.map(|()| (masked_crc32c(&bytes) == u32::from_le_bytes(checksum)).then_some(bytes)),
+    }
+}
+
+/// Returns the step of an event, or 0 if it has none; `None` if it is not a protobuf message.
+fn step_of(event: &[u8]) -> Option<i64> {
+    let (mut rest, mut step) = (event, 0);
+    while !rest.is_empty() {
+        let key = varint(&mut rest)?;
+        let skipped = match key & 7 {
+            0 => {
+                let value = varint(&mut rest)?;
+                step = if key >> 3 == 2 { value as i64 } else { step };
+                0
+            }
+            1 => 8,
+            2 => varint(&mut rest)?,
+            5 => 4,
+            _ => return None,
+        };
+        rest = rest.get(usize::try_from(skipped).ok()?..)?;
+    }
+    Some(step)
+}
+
+/// Reads a protobuf varint: seven bits per byte, the lowest first; the eighth bit is clear in the last byte only.
+fn varint(rest: &mut &[u8]) -> Option<u64> {
+    let mut value = 0;
+    for shift in (0..64).step_by(7) {
+        let (&byte, behind) = rest.split_first()?;
+        *rest = behind;
+        value |= u64::from(byte & 0x7f) << shift;
+        if byte < 0x80 {
+            return Some(value);
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use protobuf::Message;
+    use tensorboard_proto::event::Event;
+    use tensorboard_proto::summary::{Summary, Summary_Value};
+    use tensorboard_rs::record_writer::RecordWriter;
+
+    use super::*;
+
+    /// Returns an event as another library writes it.
+    fn event(step: i64, values: usize) -> Vec<u8> {
+        let (mut event, mut summary) = (Event::new(), Summary::new());
+        for _ in 0..values {
+            let mut value = Summary_Value::new();
+            value.set_tag("reward/rotation".into());
+            value.set_simple_value(0.5);
+            summary.mut_value().push(value);
+        }
+        event.set_wall_time(1.7e9);
+        event.set_step(step);
+        event.set_summary(summary);
+        event.write_to_bytes().unwrap()
+    }
+
+    fn record(event: &[u8]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        RecordWriter::new(&mut bytes).write(event).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn the_step_is_the_one_that_protobuf_reads() {
+        for step in [0, 1, 127, 128, 16_384, 100_000_000, i64::MAX, -1, i64::MIN] {
+            for values in [0, 1, 40] {
+                assert_eq!(step_of(&event(step, values)), Some(step));
+            }
+        }
+        assert_eq!(step_of(&[]), Some(0));
+        // A file version, a group, a string longer than the event, a varint that does not end.
+        assert_eq!(step_of(b"\x1a\x01x"), Some(0));
+        for bad in
+            [&b"\x0b\x0c"[..], b"\x1a\x09x", b"\x10\xff", &[0xff; 12], b"\x1a\xff\xff\xff\xff\xff\xff\xff\xff\xff\x01"]
+        {
+            assert_eq!(step_of(bad), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_whole_record_ends_a_file() {
+        let whole = [record(&event(1, 2)), record(&event(2, 2))].concat();
+        let first = whole.len() as u64 / 2;
+        let length = |bytes: &[u8]| length_up_to(bytes, 5).unwrap();
+        assert_eq!((length(&whole), length(&[]), length_up_to(&whole[..], 1).unwrap()), (2 * first, 0, first));
+        for end in 0..whole.len() {
+            assert_eq!(length(&whole[..end]), if end as u64 >= first { first } else { 0 });
+        }
+        // A flipped bit, or a block that a crash left empty.
+        for place in 0..whole.len() {
+            let mut damaged = whole.clone();
+            damaged[place] ^= 8;
+            assert_eq!(length(&damaged), if place as u64 >= first { first } else { 0 }, "byte {place}");
+        }
+        assert_eq!(length(&[&whole[..], &[0; 4096]].concat()), 2 * first);
+        assert_eq!(length(&[&whole[..], &record(&vec![0x40; 2 << 20])].concat()), 2 * first, "larger than any event");
+    }
+}

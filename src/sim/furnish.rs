@@ -1,0 +1,82 @@
+//! What a custom scene may lack for display: a light, a sky, and cubes whose faces can be told apart.
+//!
+//! Nothing here changes the physics: what is added has no mass, collides with nothing, and comes after the existing objects.
+
+use std::path::Path;
+
+use anyhow::{Result, anyhow};
+use mujoco_rs::mujoco_c::{mjtBuiltin as MjtBuiltin, mjtLightType as MjtLightType};
+use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
+use mujoco_rs::wrappers::SpecItem;
+use mujoco_rs::wrappers::mj_model::MjtTexture;
+
+use super::look::VISUAL;
+
+/// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours.
+const CUBES: [(&str, f32); 2] = [("cube", 1.0), ("target", 0.7)];
+
+/// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
+const FACES: [[f32; 3]; 6] =
+    [[0.8, 0.1, 0.12], [0.95, 0.45, 0.05], [0.1, 0.6, 0.25], [0.1, 0.3, 0.8], [0.93, 0.93, 0.93], [0.95, 0.82, 0.1]];
+
+/// The thickness of a face's plate beyond the box, as a fraction of the box's half size.
+const PLATE: f64 = 0.02;
+
+/// Compiles the scene in `file` with what it lacks; `None` if it lacks nothing.
+///
+/// # Errors
+/// Fails if MuJoCo refuses the scene.
+pub(super) fn furnished(file: &Path, model: &MjModel) -> Result<Option<MjModel>> {
+    let is_dark = model.nlight() == 0;
+    let has_no_sky = !model.tex_type().contains(&MjtTexture::mjTEXTURE_SKYBOX);
+    let boxes: Vec<_> =
+        CUBES.iter().filter_map(|&(name, opacity)| Some((name, plain_box(model, name)?, opacity))).collect();
+    if !is_dark && !has_no_sky && boxes.is_empty() {
+        return Ok(None);
+    }
+    let mut spec = MjSpec::from_xml(file).map_err(|error| anyhow!("{error}"))?;
+    if is_dark {
+        let light = spec.world_body_mut().add_light();
+        light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(MjtLightType::mjLIGHT_DIRECTIONAL);
+    }
+    if has_no_sky {
+        let sky = spec.add_texture();
+        sky.with_name("sky of shadow-repose").with_type(MjtTexture::mjTEXTURE_SKYBOX);
+        sky.with_builtin(MjtBuiltin::mjBUILTIN_GRADIENT).with_width(64).with_height(384);
+        sky.with_rgb1([0.74, 0.78, 0.83]).with_rgb2([0.42, 0.49, 0.58]);
+    }
+    for (name, half, opacity) in boxes {
+        let body = spec.body_mut(name).ok_or_else(|| anyhow!("there is no body {name}"))?;
+        for (face, [red, green, blue]) in FACES.into_iter().enumerate() {
+            let (axis, sign) = (face / 2, if face % 2 == 0 { 1.0 } else { -1.0 });
+            let (mut size, mut position) = (half.map(|half| 0.88 * half), [0.0; 3]);
+            size[axis] = PLATE * half[axis];
+            position[axis] = sign * half[axis];
+            body.add_geom()
+                .with_type(MjtGeomBase::mjGEOM_BOX)
+                .with_size(size)
+                .with_pos(position)
+                .with_rgba([red, green, blue, opacity])
+                .with_group(VISUAL)
+                .with_contype(0)
+                .with_conaffinity(0)
+                // Whatever the defaults of its class say.
+                .with_quat([1.0, 0.0, 0.0, 0.0])
+                .with_mass(0.0)
+                .with_density(0.0);
+        }
+    }
+    spec.compile().map(Some).map_err(|error| anyhow!("{error}"))
+}
+
+/// Returns the half sizes (m) of a body that is one box in the middle of its frame, without a material.
+fn plain_box(model: &MjModel, name: &str) -> Option<[f64; 3]> {
+    let body = model.name_to_id(MjtObjBase::mjOBJ_BODY, name)?;
+    let geom = usize::try_from(model.body_geomadr()[body]).ok()?;
+    let is_plain = model.body_geomnum()[body] == 1
+        && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX
+        && model.geom_matid()[geom] < 0
+        && model.geom_pos()[geom] == [0.0; 3]
+        && model.geom_quat()[geom] == [1.0, 0.0, 0.0, 0.0];
+    is_plain.then(|| model.geom_size()[geom])
+}
