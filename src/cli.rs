@@ -76,7 +76,7 @@ const EXAMPLES: [(&str, [&str; 2]); 8] = [
     ("man", ["shadow-repose man | man -l -", "shadow-repose man > ~/.local/share/man/man1/shadow-repose.1"]),
 ];
 
-/// Returns the command line with what is only known at run time: version, defaults that are settings, examples.
+/// Returns the command line with what is only known at run time: version, examples, defaults that are settings.
 pub fn command() -> clap::Command {
     let run = Config::resolve(None, &[]).expect("the defaults are valid").run;
     let defaults = [
@@ -89,6 +89,11 @@ pub fn command() -> clap::Command {
         let filled = defaults.iter().fold(help.clone(), |help, (key, value)| help.replace(key, value));
         if filled == help { arg } else { arg.help(filled) }
     };
+    without_defaults().mut_subcommands(|command| command.mut_args(with_defaults))
+}
+
+/// Returns the command line whose help does not tell the defaults that are settings. They take longer to read than the arguments.
+fn without_defaults() -> clap::Command {
     let (program, commit) = (env!("CARGO_PKG_VERSION"), env!("SHADOW_REPOSE_COMMIT"));
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
     // `view` makes no films.
@@ -111,9 +116,7 @@ pub fn command() -> clap::Command {
         let examples = format!("Examples:\n  {}", examples.join("\n  "));
         command = match name {
             "" => command.after_help(examples),
-            _ => {
-                command.mut_subcommand(name, |command| with_help(command.after_help(examples).mut_args(with_defaults)))
-            }
+            _ => command.mut_subcommand(name, |command| with_help(command.after_help(examples))),
         };
     }
     command
@@ -124,7 +127,11 @@ pub fn command() -> clap::Command {
 /// # Errors
 /// Fails if the command line is wrong, or asks for help or the version.
 pub fn parse() -> Result<Cli, clap::Error> {
-    Cli::from_arg_matches(&command().try_get_matches()?).map_err(|error| error.format(&mut command()))
+    let parsed = without_defaults().try_get_matches().map_err(|answer| match answer.kind() {
+        ErrorKind::DisplayHelp => command().try_get_matches().err().unwrap_or(answer),
+        _ => answer,
+    });
+    Cli::from_arg_matches(&parsed?).map_err(|error| error.format(&mut command()))
 }
 
 /// The options that change settings.
