@@ -25,6 +25,7 @@ fn main() {
     println!("cargo::rerun-if-changed=src/run/pip.rs");
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
+    println!("cargo::rerun-if-env-changed=SHADOW_REPOSE_PACKAGE");
     version_facts();
     if env::var_os("DOCS_RS").is_some() || env::var_os("MUJOCO_STATIC_LINK_DIR").is_some() {
         return;
@@ -45,8 +46,11 @@ fn main() {
     } else {
         linked
     };
-    // A binary looks for the library beside itself, in a `lib` folder beside or above itself, and where it was built.
-    for place in ["$ORIGIN", "$ORIGIN/lib", "$ORIGIN/../lib", &library_folder.display().to_string()] {
+    // A binary looks for the library beside itself, in a `lib` folder beside or above itself, and where it was built. That place
+    // means nothing on the machine where a package is installed.
+    let places = ["$ORIGIN", "$ORIGIN/lib", "$ORIGIN/../lib", &library_folder.display().to_string()];
+    let packaged = env::var_os("SHADOW_REPOSE_PACKAGE").is_some();
+    for place in &places[..places.len() - usize::from(packaged)] {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{place}");
     }
 }

@@ -13,6 +13,8 @@ mod meshes;
 mod metrics;
 mod output;
 mod pip;
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+mod processor;
 mod progress;
 mod records;
 mod report;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use shadow_repose::ppo::{Checkpoint, Evaluation};
 
-use crate::support::{metrics, names, program, stderr, succeeded, train, weights};
+use crate::support::{metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
 
 /// Returns a folder with a finished run of two iterations in `run`.
 fn trained(more: &[&str]) -> tempfile::TempDir {
@@ -430,4 +430,17 @@ fn bench_prints_every_figure() {
     }
     assert_eq!((figures["threads"].as_u64(), figures["num_envs"].as_u64()), (Some(2), Some(64)));
     assert_eq!(figures["hidden"], serde_json::json!([16]));
+}
+
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+#[test]
+fn a_processor_without_avx_is_named_in_a_sentence() {
+    let of_2008 = ["-cpu", "Nehalem", env!("CARGO_BIN_EXE_shadow-repose"), "--version"];
+    match std::process::Command::new("qemu-x86_64").args(of_2008).output() {
+        Err(_) => assert!(!must_be_possible("no qemu-x86_64, which emulates other processors")),
+        Ok(output) => {
+            assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+            assert!(stderr(&output).starts_with("error: this processor has no AVX"), "{}", stderr(&output));
+        }
+    }
 }

@@ -85,7 +85,6 @@ pub(crate) fn succeeded(output: Output) -> Output {
 }
 
 /// Prints that something cannot be tested here and returns false. Fails if CI has installed what the test needs.
-#[cfg(any(feature = "video", feature = "viewer"))]
 pub(crate) fn must_be_possible(what: &str) -> bool {
     assert!(std::env::var_os("SHADOW_REPOSE_SEES").is_none(), "not possible here: {what}");
     eprintln!("not tested: {what}");
