@@ -12,10 +12,11 @@
 //!
 //! | module | what it is | imports |
 //! |---|---|---|
-//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, manual, play, plot, run, train, view |
+//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, run, train, view |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, run, schedule, sim |
-//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, ppo, run, see, sim, trace |
+//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, run, see, sim, trace |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
+//! | [`mod@export`] | a policy as an ONNX file | cli, config, env, load, ppo, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, ppo, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, run |
@@ -74,6 +75,7 @@ pub mod config;
 pub mod dump;
 pub mod env;
 pub mod evaluate;
+pub mod export;
 pub mod load;
 pub mod manual;
 pub mod pace;

@@ -10,7 +10,7 @@ use anyhow::{Context, Error, Result, bail, ensure};
 
 use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::env::SPACES;
-use crate::ppo::{Checkpoint, Damaged};
+use crate::ppo::{Checkpoint, Damaged, Policy};
 use crate::run;
 
 /// The key of the only setting that is a path.
@@ -62,6 +62,45 @@ impl fmt::Display for Origin {
             Self::BuiltIn => f.write_str("built into the program"),
             Self::File(path) => path.display().fmt(f),
         }
+    }
+}
+
+/// A policy, and the task that it was trained for, overlaid with `--set`.
+pub struct Loaded {
+    /// Where it comes from.
+    pub origin: Origin,
+    /// What a user is told that it is.
+    pub name: String,
+    /// The settings of the task.
+    pub config: EnvConfig,
+    /// The policy.
+    pub policy: Policy,
+    /// The checkpoint that holds it.
+    pub checkpoint: Checkpoint,
+}
+
+impl Loaded {
+    /// Loads the policy from `place`, by default from the newest run, or the built-in one if there is no run.
+    ///
+    /// # Errors
+    /// Fails as [`Origin::of`] and [`Origin::load`] do, or if the policy's numbers cannot be used.
+    pub fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
+        let origin = match (place, run::newest_run()) {
+            (Some(place), _) => Origin::of(place)?,
+            (None, Some(newest)) => Origin::of(&newest)?,
+            (None, None) => {
+                run::say("there is no run here: taking the built-in policy");
+                Origin::BuiltIn
+            }
+        };
+        let (checkpoint, config) = origin.load(overrides)?;
+        let policy = Policy::load(&config.net, SPACES, &checkpoint)
+            .with_context(|| format!("cannot use the policy {origin}"))?;
+        let name = match &origin {
+            Origin::BuiltIn => "the built-in policy, repose.safetensors".to_owned(),
+            Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
+        };
+        Ok(Self { origin, name, config: config.env, policy, checkpoint })
     }
 }
 

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use shadow_repose::cli::{self, Command};
 use shadow_repose::run::Requests;
 use shadow_repose::train::train;
-use shadow_repose::{bench, manual, play, plot, run, view};
+use shadow_repose::{bench, export, manual, play, plot, run, view};
 
 fn main() -> ExitCode {
     let command = match cli::parse() {
@@ -17,6 +17,7 @@ fn main() -> ExitCode {
         Command::Train(args) => train(&args, &requests),
         Command::Play(args) => play::play(&args, &requests),
         Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
+        Command::Export(args) => export::export(&args).map(|()| ExitCode::SUCCESS),
         Command::Plot(args) => plot::plot(&args).map(|()| ExitCode::SUCCESS),
         Command::Bench(args) => bench::bench(&args).map(|()| ExitCode::SUCCESS),
         Command::Completions(args) => manual::completions(&args).map(|()| ExitCode::SUCCESS),

@@ -10,12 +10,11 @@ use anyhow::{Context, Result, ensure};
 use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs, usage_error};
-use crate::config::{Config, EnvConfig, Override, expect_used};
-use crate::env::{SPACES, Score, Task};
+use crate::config::{Config, EnvConfig, expect_used};
+use crate::env::{Score, Task};
 use crate::evaluate::{Actor, Episodes, Moment, evaluate};
-use crate::load::Origin;
+use crate::load::Loaded;
 use crate::pace::Pace;
-use crate::ppo::Policy;
 use crate::run::{self, Requests};
 use crate::see::{Film, HAS_WINDOWS, Window, task_to_see};
 use crate::sim::Quality;
@@ -175,36 +174,6 @@ fn film(
 fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     let count = args.episodes.unwrap_or(otherwise) as usize;
     Episodes { seed: args.seed, purpose: "score", first: 0, count }
-}
-
-/// A policy, and the task that it was trained for, overlaid with `--set`.
-struct Loaded {
-    origin: Origin,
-    /// What it is called when it begins to play.
-    name: String,
-    config: EnvConfig,
-    policy: Policy,
-}
-
-impl Loaded {
-    fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
-        let origin = match (place, run::newest_run()) {
-            (Some(place), _) => Origin::of(place)?,
-            (None, Some(newest)) => Origin::of(&newest)?,
-            (None, None) => {
-                run::say("there is no run here: playing the built-in policy");
-                Origin::BuiltIn
-            }
-        };
-        let (checkpoint, config) = origin.load(overrides)?;
-        let policy = Policy::load(&config.net, SPACES, &checkpoint)
-            .with_context(|| format!("cannot play the policy {origin}"))?;
-        let name = match &origin {
-            Origin::BuiltIn => "the built-in policy, repose.safetensors".to_owned(),
-            Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
-        };
-        Ok(Self { origin, name, config: config.env, policy })
-    }
 }
 
 /// Plays the episodes and returns their score, or `None` if interrupted.

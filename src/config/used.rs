@@ -8,7 +8,7 @@ use super::layers::Override;
 use super::overlay::table_of;
 
 /// The commands that take settings.
-const COMMANDS: [&str; 4] = ["train", "bench", "play", "view"];
+const COMMANDS: [&str; 5] = ["train", "bench", "play", "view", "export"];
 
 /// Settings of `[env]` and `[run]` that are used by fewer commands than the rest of their section.
 const FEWER: [(&str, &[&str]); 5] = [

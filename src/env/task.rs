@@ -43,6 +43,11 @@ impl Task {
         &self.config
     }
 
+    /// Returns the hand in the scene.
+    pub fn hand(&self) -> &Hand {
+        &self.hand
+    }
+
     /// Returns the scene.
     pub fn scene(&self) -> &Scene {
         &self.scene

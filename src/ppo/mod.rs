@@ -37,7 +37,7 @@ pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
 pub use perception::Perception;
-pub use policy::{FrozenPolicy, Policy};
+pub use policy::{ActorParts, FrozenPolicy, LayerParts, Policy};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{Backend, PpoConfig};

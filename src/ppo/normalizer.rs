@@ -8,7 +8,7 @@ use crate::ranks::Division;
 const EPSILON: f64 = 1e-5;
 
 /// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
-const CLIP: f32 = 5.0;
+pub(super) const CLIP: f32 = 5.0;
 
 /// Rows that one task sums; fixed, so that the result does not depend on the number of threads.
 const ROWS_PER_TASK: usize = 1024;
@@ -94,9 +94,9 @@ fn column_sums(
 #[derive(Clone, Debug)]
 pub struct Scaling {
     /// `[O]`
-    mean: Vec<f32>,
+    pub(super) mean: Vec<f32>,
     /// `[O]`
-    factor: Vec<f32>,
+    pub(super) factor: Vec<f32>,
 }
 
 impl Scaling {

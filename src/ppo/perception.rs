@@ -16,7 +16,7 @@ use crate::quat;
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
-const ROTATIONS: [[f32; 4]; 24] = {
+pub(super) const ROTATIONS: [[f32; 4]; 24] = {
     const H: f32 = 0.5;
     const R: f32 = FRAC_1_SQRT_2;
     [
@@ -54,7 +54,7 @@ const ROTATIONS: [[f32; 4]; 24] = {
 #[derive(Clone, Copy, Debug)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
-    cube_and_goal: Option<CubeAndGoal>,
+    pub(super) cube_and_goal: Option<CubeAndGoal>,
 }
 
 impl Perception {

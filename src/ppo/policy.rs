@@ -5,12 +5,13 @@ use rand::RngExt;
 
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
+use super::normalizer::CLIP;
 use super::parameters::{Layer, Layout};
-use super::perception::{Perception, Reader};
+use super::perception::{Perception, ROTATIONS, Reader};
 use crate::config::{Activation, NetConfig};
 use crate::ranks::Division;
 use crate::rng::{self, Rng};
-use crate::spaces::Spaces;
+use crate::spaces::{CubeAndGoal, Spaces};
 
 /// The factor on the initial weights of the actor's last layer; it keeps first actions near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
@@ -40,7 +41,58 @@ pub struct FrozenPolicy<'a> {
     std: Vec<f32>,
 }
 
+/// What the actor computes, as numbers for another program: the symmetry, then `(x - mean) * factor` within ± `clip`, then the
+/// layers, with the activation after all but the last.
+pub struct ActorParts<'a> {
+    /// The offsets of the orientations of cube and goal, if they are to be rotated (see `perception`).
+    pub cube_and_goal: Option<CubeAndGoal>,
+    /// The rotations of the cube's symmetry, as w, x, y, z; the first of the nearest is taken.
+    pub rotations: &'static [[f32; 4]],
+    /// `[O]`
+    pub mean: Vec<f32>,
+    /// `[O]`
+    pub factor: Vec<f32>,
+    /// The limit of a normalised value.
+    pub clip: f32,
+    /// The layers, from the observation to the mean action.
+    pub layers: Vec<LayerParts<'a>>,
+    /// The function after each hidden layer.
+    pub activation: Activation,
+}
+
+/// A layer: weight · x + bias.
+pub struct LayerParts<'a> {
+    /// The number of inputs.
+    pub inputs: usize,
+    /// The number of outputs.
+    pub outputs: usize,
+    /// `[outputs, inputs]`
+    pub weight: &'a [f32],
+    /// `[outputs]`
+    pub bias: &'a [f32],
+}
+
 impl Policy {
+    /// Returns the parts of the actor.
+    pub fn actor(&self) -> ActorParts<'_> {
+        let Reader { perception, scaling } = self.reader();
+        let layers = self.layout.actor.iter().map(|layer| LayerParts {
+            inputs: layer.inputs,
+            outputs: layer.outputs,
+            weight: &self.parameters[layer.weight.clone()],
+            bias: &self.parameters[layer.bias.clone()],
+        });
+        ActorParts {
+            cube_and_goal: perception.cube_and_goal,
+            rotations: &ROTATIONS,
+            mean: scaling.mean,
+            factor: scaling.factor,
+            clip: CLIP,
+            layers: layers.collect(),
+            activation: self.activation,
+        }
+    }
+
     /// Creates a policy with these parameters for environments with these spaces.
     ///
     /// # Errors

@@ -10,6 +10,7 @@ mod bad_input;
 mod binary;
 mod docs;
 mod experiment;
+mod export;
 mod fork;
 mod outputs;
 mod pace;

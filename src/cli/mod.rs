@@ -1,5 +1,7 @@
 //! The command line: its structure and help texts. What the commands do is elsewhere.
 
+mod values;
+
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -9,9 +11,7 @@ use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, Override};
 use crate::sim::{self, Camera, Quality};
-
-/// The largest integer in a TOML file.
-const LARGEST: u64 = i64::MAX as u64;
+use values::{LARGEST, camera, quality, seconds, size, steps, time};
 
 /// Parses a number of threads, within the limits of `run.threads`.
 fn threads() -> RangedU64ValueParser<usize> {
@@ -45,6 +45,8 @@ pub enum Command {
     Play(PlayArgs),
     /// Show the scene without a policy
     View(ViewArgs),
+    /// Write a policy as an ONNX file, for programs in other languages
+    Export(ExportArgs),
     /// Plot the learning curves of runs as SVG or PNG
     Plot(PlotArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
@@ -56,11 +58,12 @@ pub enum Command {
 }
 
 /// Two examples for the end of the help of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, [&str; 2]); 8] = [
+const EXAMPLES: [(&str, [&str; 2]); 9] = [
     ("", ["shadow-repose play --ckpt builtin", "shadow-repose train"]),
     ("train", ["shadow-repose train --seed 1 --name first", "shadow-repose train --resume"]),
     ("play", ["shadow-repose play --ckpt builtin --headless", "shadow-repose play --video film.mp4"]),
     ("view", ["shadow-repose view --actions wave", "shadow-repose view --screenshot hand.png"]),
+    ("export", ["shadow-repose export --out policy.onnx", "shadow-repose export --ckpt builtin --out builtin.onnx"]),
     (
         "plot",
         ["shadow-repose plot runs/shadow-hand-repose/*", "shadow-repose plot RUN --metric eval/goals --out goals.png"],
@@ -239,6 +242,21 @@ pub struct PlayArgs {
     pub shot: Shot,
 }
 
+/// The options of `export`.
+#[derive(Args, Debug)]
+pub struct ExportArgs {
+    /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest) or builtin, the policy that comes
+    /// with the program [default: the newest run, or builtin if there is none]
+    #[arg(long, value_name = "FILE|RUN|builtin", help_heading = POLICY)]
+    pub ckpt: Option<PathBuf>,
+    /// Change one env.* setting that the file tells, e.g. env.model=my_scene.xml; repeatable
+    #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
+    pub set: Vec<Override>,
+    /// File to write
+    #[arg(long, value_name = "FILE", default_value = "policy.onnx", help_heading = OUTPUT)]
+    pub out: PathBuf,
+}
+
 /// The options of `view`.
 #[derive(Args, Debug)]
 pub struct ViewArgs {
@@ -308,53 +326,6 @@ pub enum Motion {
     Random,
     /// Each actuator swings slowly around the middle of its range, slightly after the previous one
     Wave,
-}
-
-fn size(text: &str) -> Result<[u32; 2], String> {
-    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
-    let pixels = |text: &str, largest: u32| match text.parse() {
-        Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
-        _ => Err(format!("{text} must be a whole number from 16 to {largest}")),
-    };
-    Ok([pixels(width, 3840)?, pixels(height, 2160)?])
-}
-
-fn camera(text: &str) -> Result<Camera, String> {
-    let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
-    match numbers.as_deref() {
-        Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
-            match (0.05..=10.0).contains(&distance) {
-                true => Ok(Camera { azimuth, elevation, distance }),
-                false => Err(format!("the distance of {distance} m must be from 0.05 to 10 m")),
-            }
-        }
-        _ => Err("must be three numbers, e.g. 150,-27,0.66".into()),
-    }
-}
-
-fn steps(text: &str) -> Result<u64, String> {
-    // Users write large numbers of steps as 1e8.
-    let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
-    let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
-    steps.ok_or_else(|| "must be a whole number of at least 1, e.g. 30000000 or 3e7".into())
-}
-
-fn time(text: &str) -> Result<Duration, String> {
-    let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
-    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
-}
-
-fn quality(text: &str) -> Result<Quality, String> {
-    match text {
-        "fast" => Ok(Quality::Fast),
-        "high" => Ok(Quality::High),
-        _ => Err("must be fast or high".into()),
-    }
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let seconds = text.parse().ok().filter(|seconds| (0.0..=3600.0).contains(seconds));
-    seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
 }
 
 /// Policies that need no checkpoint.

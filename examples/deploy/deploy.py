@@ -1,0 +1,251 @@
+"""Runs an exported policy in plain Python: MuJoCo for the hand, onnxruntime for the policy, and nothing of shadow-repose.
+
+usage: deploy.py POLICY.onnx --check TRACE           compare observations and actions with a trace of the program
+       deploy.py POLICY.onnx --episodes 200 --seed 0 [--json]   play, and print the score
+
+Reset, observe, act, step: that is all a program of your own needs. The scene is the program's, or your own with --scene. Python 3.11
+or newer; `pip install -r requirements.txt`.
+"""
+
+import argparse
+import json
+import pathlib
+import sys
+import tomllib
+
+import mujoco
+import numpy as np
+import onnxruntime
+
+SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
+HAND = "right Shadow Hand, 24 joints, 20 actuators"
+JOINTS = """THJ5 THJ4 THJ3 THJ2 THJ1 FFJ4 FFJ3 FFJ2 FFJ1 MFJ4 MFJ3 MFJ2 MFJ1 RFJ4 RFJ3 RFJ2 RFJ1
+            LFJ5 LFJ4 LFJ3 LFJ2 LFJ1 WRJ2 WRJ1""".split()
+FINGERTIPS = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"]
+OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
+
+
+class Policy:
+    """The file: `obs` [batch, 157] to `actions` [batch, 20]. Symmetry, normaliser and clipping are inside."""
+
+    def __init__(self, path):
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1  # small products: more threads only wait for each other
+        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        self.facts = self.session.get_modelmeta().custom_metadata_map
+        if self.facts.get("hand") != HAND:
+            sys.exit(f"error: {path} is for another hand: {self.facts.get('hand')}")
+
+    def numbers(self, key):
+        return np.array([float(number) for number in self.facts[key].split(",")])
+
+    def act(self, observation):
+        return self.session.run(["actions"], {"obs": observation[None]})[0][0]
+
+
+class Hand:
+    """The simulated hand: what the policy sees of it, and what its actions do."""
+
+    def __init__(self, policy, scene):
+        env = tomllib.loads(policy.facts["config"])["env"]
+        self.env = env
+        self.model = mujoco.MjModel.from_xml_path(str(scene))
+        self.model.opt.timestep = env["sim_dt"]
+        cube = self.model.body("cube")
+        cube.mass[:] *= env["cube_mass_scale"]
+        cube.inertia[:] *= env["cube_mass_scale"]
+        self.model.geom_friction[:] *= env["friction_scale"]
+        self.model.pair_friction[:] *= env["friction_scale"]
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_setConst(self.model, self.data)
+        self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
+        joints = [self.model.joint("rh_" + name) for name in JOINTS]
+        self.angle = np.array([joint.qposadr[0] for joint in joints])
+        self.speed = np.array([joint.dofadr[0] for joint in joints])
+        self.limits = np.array([joint.range for joint in joints])
+        free = self.model.joint(cube.jntadr[0])
+        self.cube, self.cube_speed = free.qposadr[0], free.dofadr[0]
+        self.tips = [self.model.body(name).id for name in FINGERTIPS]
+        self.target = self.model.body("target").mocapid[0]
+        # An action of -1 … 1 asks for a target within the control range: offset + scale * action.
+        self.actuators = [self.model.actuator(name) for name in policy.facts["joint_names"].split(",")]
+        self.controls = np.array([actuator.id for actuator in self.actuators])
+        self.offset, self.scale = policy.numbers("action_offset"), policy.numbers("action_scale")
+        self.alpha = float(policy.facts["ema_alpha"])
+        ranges = np.array([actuator.ctrlrange for actuator in self.actuators])
+        if not np.allclose(ranges, np.stack([self.offset - self.scale, self.offset + self.scale], 1), rtol=0, atol=1e-9):
+            sys.exit(f"error: the actuators of {scene} have other ranges than those that the policy was exported for")
+        self.low, self.high = ranges.T
+        self.previous_action = np.zeros(20)
+        self.goal = np.array([1.0, 0, 0, 0])
+
+    def place(self, qpos, qvel):
+        """Puts everything somewhere; positions of bodies follow."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        mujoco.mj_step1(self.model, self.data)
+
+    def reset(self, random):
+        """Begins an episode: joints near their start, the cube above the palm, both orientations uniformly random."""
+        env, qpos = self.env, self.model.qpos0.copy()
+        noise = random.uniform(-env["reset_dof_pos_noise"], env["reset_dof_pos_noise"], len(JOINTS))
+        qpos[self.angle] = np.clip(qpos[self.angle] + noise, self.limits[:, 0], self.limits[:, 1])
+        qvel = np.zeros(self.model.nv)
+        qvel[self.speed] = random.uniform(-env["reset_dof_vel_noise"], env["reset_dof_vel_noise"], len(JOINTS))
+        noise = random.uniform(-env["reset_position_noise"], env["reset_position_noise"], 3)
+        qpos[self.cube:self.cube + 3] = env["goal_position"] + noise
+        qpos[self.cube + 3:self.cube + 7] = uniform_rotation(random)
+        self.place(qpos, qvel)
+        self.goal = uniform_rotation(random)
+        self.previous_action = np.zeros(20)
+        # The targets begin where the joints are. A J0 drives the sum of a finger's two outer joints.
+        angles = dict(zip(JOINTS, qpos[self.angle]))
+        names = [actuator.name.removeprefix("rh_A_") for actuator in self.actuators]
+        sums = [angles[name[:2] + "J2"] + angles[name[:2] + "J1"] if name.endswith("J0") else angles[name] for name in names]
+        self.targets = np.clip(sums, self.low, self.high)
+
+    def observe(self):
+        """Returns the 157 values that the policy sees, in the order of `observation_names`."""
+        env, data = self.env, self.data
+        cube, speed = data.qpos[self.cube:self.cube + 7], data.qvel[self.cube_speed:self.cube_speed + 6]
+        tips = []
+        for tip in self.tips:
+            # The velocity of the frame's origin in the world frame; MuJoCo gives the angular part first.
+            velocity = np.zeros(6)
+            mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_XBODY, tip, velocity, 0)
+            tips += [data.xpos[tip], data.xquat[tip], velocity[3:], velocity[:3]]
+        return np.concatenate([
+            data.qpos[self.angle],
+            env["vel_obs_scale"] * data.qvel[self.speed],
+            cube[:3],
+            positive(cube[3:]),
+            speed[:3],
+            env["vel_obs_scale"] * rotated(cube[3:], speed[3:]),  # a free joint turns in the cube's own frame
+            env["goal_position"],
+            positive(self.goal),
+            positive(product(cube[3:], conjugate(self.goal))),
+            *tips,
+            self.previous_action,
+        ]).astype(np.float32)
+
+    def step(self, action):
+        """Turns the action into smoothed targets, and lets the physics run for one control step."""
+        self.previous_action = np.clip(action, -1, 1).astype(float)
+        asked = self.offset + self.scale * self.previous_action
+        self.targets = np.clip(self.alpha * asked + (1 - self.alpha) * self.targets, self.low, self.high)
+        self.data.ctrl[self.controls] = self.targets
+        for _ in range(self.substeps):
+            # mj_step in the other order, so that bodies and joints end at the same instant.
+            mujoco.mj_step2(self.model, self.data)
+            mujoco.mj_step1(self.model, self.data)
+
+    def rotation_error(self):
+        """Returns the angle between cube and goal, rad."""
+        between = product(self.data.qpos[self.cube + 3:self.cube + 7], conjugate(self.goal))
+        return 2 * np.arcsin(min(1.0, np.linalg.norm(between[1:])))
+
+    def dropped(self):
+        """Returns whether the cube is out of the hand."""
+        return np.linalg.norm(self.data.qpos[self.cube:self.cube + 3] - self.env["goal_position"]) >= self.env["fall_dist"]
+
+
+def product(a, b):
+    """The quaternion product: first the rotation b, then a."""
+    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    return np.array([w, *v])
+
+
+def conjugate(q):
+    return q * [1, -1, -1, -1]
+
+
+def positive(q):
+    """A quaternion and its negative are the same rotation; the policy sees the one with w >= 0."""
+    return -q if q[0] < 0 else q
+
+
+def rotated(q, v):
+    return product(product(q, np.array([0, *v])), conjugate(q))[1:]
+
+
+def uniform_rotation(random):
+    q = random.normal(size=4)
+    return q / np.linalg.norm(q)
+
+
+def play(policy, hand, episodes, seed):
+    """Returns goals, length and whether the cube was dropped, for each episode."""
+    env, played = hand.env, []
+    for episode in range(episodes):
+        random = np.random.default_rng([seed, episode])
+        hand.reset(random)
+        goals = held = steps = 0
+        while steps < round(env["max_episode_seconds"] / env["ctrl_dt"]):
+            hand.step(policy.act(hand.observe()))
+            steps += 1
+            if hand.dropped():
+                break
+            if hand.rotation_error() <= env["success_tolerance"]:
+                held += 1
+            elif env["success_hold"] == "consecutive":
+                held = 0
+            if held >= env["max_consecutive_successes"]:
+                goals, held, hand.goal = goals + 1, 0, uniform_rotation(random)
+        played.append((goals, steps, hand.dropped()))
+        print(f"\repisode {episode + 1} of {episodes}", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return np.array(played, float)
+
+
+def score(played):
+    goals, lengths, drops = played.T
+    margin = 1.96 * goals.std(ddof=1) / len(goals) ** 0.5 if len(goals) > 1 else float("nan")
+    return {"episodes": len(goals), "goals_per_episode": goals.mean(), "goals_ci95": [goals.mean() - margin, goals.mean() + margin],
+            "drop_rate": drops.mean(), "episode_length": lengths.mean()}
+
+
+def check(policy, hand, trace):
+    """Puts the hand into each state of a trace, and compares what is seen and done there. Returns the largest differences."""
+    header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
+    largest, compared = [0.0, 0.0], 0
+    for record, after in zip(records, records[1:] + [None]):
+        same = after is not None and after["episode"] == record["episode"]
+        hand.place(record["qpos"], record["qvel"])
+        # Where a goal was reached, the observation already shows the next one.
+        hand.goal = np.array(after["goal"] if same else record["goal"])
+        hand.previous_action = np.clip(record["action"], -1, 1) if not record.get("reset") else np.zeros(20)
+        seen, expected = hand.observe(), np.array(record["obs"])
+        if not same:  # the goal after an episode's last step is in no record
+            seen[64:72] = expected[64:72]
+        largest[0] = max(largest[0], np.abs(seen - expected).max())
+        if same:
+            action = policy.act(seen)
+            largest[1] = max(largest[1], np.abs(action - np.clip(after["action"], -1, 1)).max())
+            compared += 1
+    print(f"{len(records)} observations: {largest[0]:.1e} off at most; {compared} actions: {largest[1]:.1e}")
+    return largest[0] <= OBSERVATION_LIMIT and largest[1] <= ACTION_LIMIT and compared > 0
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy")
+    parser.add_argument("--scene", default=SCENE, help="MJCF file (default: the program's)")
+    parser.add_argument("--check", metavar="TRACE")
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    policy = Policy(args.policy)
+    hand = Hand(policy, args.scene)
+    if args.check:
+        sys.exit(0 if check(policy, hand, args.check) else "error: too far off")
+    found = score(play(policy, hand, args.episodes, args.seed))
+    if args.json:
+        print(json.dumps(found))
+    else:
+        low, high = found["goals_ci95"]
+        print(f"{found['goals_per_episode']:.2f} goals per episode ({low:.2f} … {high:.2f}), drops {100 * found['drop_rate']:.1f} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+//! The values of options as a user writes them.
+
+use std::time::Duration;
+
+use crate::sim::{Camera, Quality};
+
+/// The largest integer in a TOML file.
+pub(super) const LARGEST: u64 = i64::MAX as u64;
+
+pub(super) fn size(text: &str) -> Result<[u32; 2], String> {
+    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
+    let pixels = |text: &str, largest: u32| match text.parse() {
+        Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
+        _ => Err(format!("{text} must be a whole number from 16 to {largest}")),
+    };
+    Ok([pixels(width, 3840)?, pixels(height, 2160)?])
+}
+
+pub(super) fn camera(text: &str) -> Result<Camera, String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    match numbers.as_deref() {
+        Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
+            match (0.05..=10.0).contains(&distance) {
+                true => Ok(Camera { azimuth, elevation, distance }),
+                false => Err(format!("the distance of {distance} m must be from 0.05 to 10 m")),
+            }
+        }
+        _ => Err("must be three numbers, e.g. 150,-27,0.66".into()),
+    }
+}
+
+pub(super) fn steps(text: &str) -> Result<u64, String> {
+    // Users write large numbers of steps as 1e8.
+    let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
+    let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
+    steps.ok_or_else(|| "must be a whole number of at least 1, e.g. 30000000 or 3e7".into())
+}
+
+pub(super) fn time(text: &str) -> Result<Duration, String> {
+    let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
+    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
+}
+
+pub(super) fn quality(text: &str) -> Result<Quality, String> {
+    match text {
+        "fast" => Ok(Quality::Fast),
+        "high" => Ok(Quality::High),
+        _ => Err("must be fast or high".into()),
+    }
+}
+
+pub(super) fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.0..=3600.0).contains(seconds));
+    seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
+}

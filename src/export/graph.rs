@@ -1,0 +1,102 @@
+//! The graph of a policy: what `ppo::perception`, the normaliser and the actor compute, in operations of ONNX.
+
+use super::onnx::Attribute::{Float, Int};
+use super::onnx::Graph;
+use crate::config::Activation;
+use crate::ppo::ActorParts;
+use crate::spaces::CubeAndGoal;
+
+/// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
+pub(super) fn policy_graph(actor: &ActorParts) -> Graph {
+    let size = actor.mean.len();
+    let actions = actor.layers.last().expect("a net has layers").outputs;
+    let mut graph = Graph::new("policy", ("obs", size), ("actions", actions));
+    let seen = match actor.cube_and_goal {
+        Some(places) => turn(&mut graph, actor, places),
+        None => "obs".into(),
+    };
+    graph.floats("mean", &[size], &actor.mean);
+    graph.floats("factor", &[size], &actor.factor);
+    let centred = graph.node("Sub", &[&seen, "mean"], "centred", &[]);
+    let scaled = graph.node("Mul", &[&centred, "factor"], "scaled", &[]);
+    let mut row = clip(&mut graph, &scaled, actor.clip, "normalised");
+    for (i, layer) in actor.layers.iter().enumerate() {
+        let (weight, bias) = (format!("actor.{i}.weight"), format!("actor.{i}.bias"));
+        graph.floats(&weight, &[layer.outputs, layer.inputs], layer.weight);
+        graph.floats(&bias, &[layer.outputs], layer.bias);
+        row = graph.node("Gemm", &[&row, &weight, &bias], &format!("layer{i}"), &[("transB", Int(1))]);
+        if i + 1 < actor.layers.len() {
+            let name = format!("hidden{i}");
+            row = match actor.activation {
+                Activation::Elu => graph.node("Elu", &[&row], &name, &[("alpha", Float(1.0))]),
+                Activation::Relu => graph.node("Relu", &[&row], &name, &[]),
+                Activation::Tanh => graph.node("Tanh", &[&row], &name, &[]),
+            };
+        }
+    }
+    clip(&mut graph, &row, 1.0, "actions");
+    graph
+}
+
+fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
+    let [low, high] = ["low", "high"].map(|side| format!("{output}_{side}"));
+    graph.floats(&low, &[], &[-limit]);
+    graph.floats(&high, &[], &[limit]);
+    graph.node("Clip", &[row, &low, &high], output, &[])
+}
+
+/// Turns cube and goal by the rotation of the cube's symmetry that brings the cube closest to its unrotated orientation.
+fn turn(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
+    assert!(cube + 4 <= goal, "the goal follows the cube");
+    // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
+    let mut cosines = [0.0; 4 * 24];
+    // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
+    let mut products = Vec::new();
+    for (j, &[w, x, y, z]) in actor.rotations.iter().enumerate() {
+        [w, -x, -y, -z].into_iter().enumerate().for_each(|(k, value)| cosines[k * 24 + j] = value);
+        products.extend([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w]);
+    }
+    graph.floats("cosines", &[4, 24], &cosines);
+    graph.floats("products", &[24, 4, 4], &products);
+    for (name, sign) in [("zero", 0.0), ("plus", 1.0), ("minus", -1.0)] {
+        graph.floats(name, &[1], &[sign]);
+    }
+    let size = actor.mean.len();
+    let parts = [
+        ("before", [0, cube]),
+        ("cube", [cube, cube + 4]),
+        ("between", [cube + 4, goal]),
+        ("goal", [goal, goal + 4]),
+        ("after", [goal + 4, size]),
+    ];
+    graph.index("axis", 1);
+    for (name, ends) in parts {
+        slice(graph, "obs", ends, name);
+    }
+    let near = graph.node("MatMul", &["cube", "cosines"], "near", &[]);
+    let nearness = graph.node("Abs", &[&near], "nearness", &[]);
+    // The first of equals, as in `ppo::perception`.
+    let nearest = graph.node("ArgMax", &[&nearness], "nearest", &[("axis", Int(1)), ("keepdims", Int(0))]);
+    let product = graph.node("Gather", &["products", &nearest], "product", &[("axis", Int(0))]);
+    let [cube, goal] = ["cube", "goal"].map(|quaternion| turned(graph, quaternion, &product));
+    graph.node("Concat", &["before", &cube, "between", &goal, "after"], "seen", &[("axis", Int(1))])
+}
+
+/// Multiplies a quaternion by the rotation, and negates it if w is negative then.
+fn turned(graph: &mut Graph, quaternion: &str, product: &str) -> String {
+    let name = |what: &str| format!("{quaternion}_{what}");
+    let row = graph.node("Unsqueeze", &[quaternion, "axis"], &name("row"), &[]);
+    let turned = graph.node("MatMul", &[&row, product], &name("turned_row"), &[]);
+    let turned = graph.node("Squeeze", &[&turned, "axis"], &name("turned"), &[]);
+    let w = slice(graph, &turned, [0, 1], &name("w"));
+    let negative = graph.node("Less", &[&w, "zero"], &name("negative"), &[]);
+    let sign = graph.node("Where", &[&negative, "minus", "plus"], &name("sign"), &[]);
+    graph.node("Mul", &[&turned, &sign], &name("seen"), &[])
+}
+
+fn slice(graph: &mut Graph, row: &str, ends: [usize; 2], output: &str) -> String {
+    let [from, to] = ["from", "to"].map(|end| format!("{output}_{end}"));
+    graph.index(&from, ends[0]);
+    graph.index(&to, ends[1]);
+    graph.node("Slice", &[row, &from, &to, "axis"], output, &[])
+}

@@ -1,0 +1,82 @@
+//! Exporting a policy as an ONNX file, which programs in other languages run: symmetry, normaliser and actor in one graph, and what
+//! a program must know to use it as metadata.
+
+mod graph;
+mod onnx;
+
+use anyhow::{Context, Result};
+use toml::{Table, Value};
+
+use crate::cli::ExportArgs;
+use crate::config::{EnvConfig, expect_used};
+use crate::env::{ACTUATORS, Hand, OBSERVATION, Task};
+use crate::load::Loaded;
+use crate::run;
+use graph::policy_graph;
+use onnx::Model;
+
+/// The hand that the policy was trained for, for programs that refuse another.
+const HAND: &str = "right Shadow Hand, 24 joints, 20 actuators";
+
+/// Writes a policy as an ONNX file. The same policy gives the same bytes.
+///
+/// # Errors
+/// Fails if the policy, a setting or the scene cannot be used, or if the file cannot be written.
+pub fn export(args: &ExportArgs) -> Result<()> {
+    expect_used(&args.set, "export")?;
+    let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
+    let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
+    let output = run::OutputFile::create(&args.out)?;
+    let bytes = model(&loaded, &task).to_bytes();
+    output.finish(&bytes)?;
+    run::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
+    Ok(())
+}
+
+fn model(loaded: &Loaded, task: &Task) -> Model {
+    Model { graph: policy_graph(&loaded.policy.actor()), metadata: metadata(loaded, task.hand()) }
+}
+
+/// Returns what a program must know to run the policy: lists are comma-separated, numbers can be read back exactly.
+///
+/// The names are those that mjlab's runners expect, where they have one for it: `joint_names` are what an action drives, here the
+/// actuators, and their target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
+fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
+    let EnvConfig { act_moving_average, vel_obs_scale, .. } = loaded.config;
+    let ranges = hand.actuators.map(|actuator| actuator.range);
+    let offsets = list(ranges.map(|[low, high]| (low + high) / 2.0));
+    let progress = &loaded.checkpoint.progress;
+    let mut facts = vec![
+        ("action_offset", offsets.clone()),
+        ("action_scale", list(ranges.map(|[low, high]| (high - low) / 2.0))),
+        ("actions_clipped", "true".into()),
+        ("commit", env!("SHADOW_REPOSE_COMMIT").into()),
+        ("config", settings(loaded)),
+        ("ctrl_dt", loaded.config.ctrl_dt.to_string()),
+        ("default_joint_pos", offsets),
+        ("ema_alpha", act_moving_average.to_string()),
+        ("hand", HAND.into()),
+        ("joint_names", list(ACTUATORS.map(|name| format!("rh_A_{name}")))),
+        ("observation_names", list(OBSERVATION.map(|group| group.name))),
+        ("observation_sizes", list(OBSERVATION.map(|group| group.length))),
+        ("program", concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into()),
+        ("quaternion_order", "wxyz, w >= 0 but for the fingertips".into()),
+        ("vel_obs_scale", vel_obs_scale.to_string()),
+    ];
+    if progress.env_steps > 0 {
+        facts.push(("env_steps", progress.env_steps.to_string()));
+    }
+    facts.extend(progress.best.map(|best| ("goals_per_episode", best.goals.to_string())));
+    facts
+}
+
+/// Returns all settings of the training as TOML, with the task as it is exported.
+fn settings(loaded: &Loaded) -> String {
+    let mut table: Table = loaded.checkpoint.config.parse().expect("it was read when the policy was loaded");
+    table.insert("env".into(), Value::try_from(&loaded.config).expect("settings are a table"));
+    table.to_string()
+}
+
+fn list<T: ToString, const N: usize>(values: [T; N]) -> String {
+    values.map(|value| value.to_string()).join(",")
+}

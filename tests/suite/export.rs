@@ -1,0 +1,83 @@
+//! Policies for other programs.
+
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::support::{program, stderr, succeeded, train};
+
+/// Returns the Python that .ci/run has prepared with mujoco, onnx and onnxruntime.
+fn python() -> Option<OsString> {
+    let python = std::env::var_os("SHADOW_REPOSE_PYTHON");
+    if python.is_none() {
+        eprintln!("not tested: SHADOW_REPOSE_PYTHON does not name a Python with mujoco, onnx and onnxruntime");
+    }
+    python
+}
+
+fn runs(python: &OsString, folder: &Path, args: &[&str]) {
+    let output = Command::new(python).args(args).current_dir(folder).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(&output);
+    assert!(output.status.success(), "{args:?}: {said}");
+}
+
+#[test]
+fn an_exported_policy_sees_and_does_in_python_what_it_does_here() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let other =
+        ["--total-steps", "256", "--run-dir", "run", "--set", "ppo.symmetry=none", "--set", "ppo.activation=tanh"];
+    succeeded(program(folder, &train(&other)));
+    let deploy = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/deploy/deploy.py");
+    for policy in ["builtin", "run"] {
+        succeeded(program(folder, &["export", "--ckpt", policy]));
+        succeeded(program(folder, &["play", "--ckpt", policy, "--json", "--episodes", "2", "--trace", "trace.jsonl"]));
+        let check = "import onnx, sys; onnx.checker.check_model(onnx.load(sys.argv[1]), full_check=True)";
+        runs(&python, folder, &["-c", check, "policy.onnx"]);
+        runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--check", "trace.jsonl"]);
+    }
+    runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--episodes", "2", "--json"]);
+}
+
+#[test]
+fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_know() {
+    let folder = tempfile::tempdir().unwrap();
+    let export = |out: &str, more: &[&str]| {
+        succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin", "--out", out], more].concat()));
+        fs::read(folder.path().join(out)).unwrap()
+    };
+    let first = export("first.onnx", &[]);
+    assert_eq!(first, export("second.onnx", &[]));
+    let holds = |bytes: &[u8], text: &str| bytes.windows(text.len()).any(|window| window == text.as_bytes());
+    for text in [
+        "rh_A_THJ5,rh_A_THJ4,",
+        "joint_pos,joint_vel,cube_pos",
+        "24,24,3,4,3,3,3,4,4,65,20",
+        "max_episode_seconds = 10.0",
+    ] {
+        assert!(holds(&first, text), "{text}");
+    }
+    let other = export("third.onnx", &["--set", "env.max_episode_seconds=3"]);
+    assert!(holds(&other, "max_episode_seconds = 3.0") && !holds(&other, "max_episode_seconds = 10.0"));
+}
+
+#[test]
+fn what_cannot_be_exported_is_named_and_nothing_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("noise"), "no policy").unwrap();
+    for (args, named) in [
+        (&["--ckpt", "noise"][..], "cannot use noise"),
+        (&["--ckpt", "nowhere"], "nowhere"),
+        (&["--ckpt", "builtin", "--set", "ppo.gamma=0.5"], "`export` does not use ppo.gamma"),
+        (&["--ckpt", "builtin", "--set", "env.model=none.xml"], "none.xml"),
+        (&["--ckpt", "builtin", "--out", "none/policy.onnx"], "mkdir"),
+    ] {
+        let output = program(folder.path(), &[&["export"], args].concat());
+        assert_eq!(output.status.code(), Some(1), "{args:?}");
+        let said = stderr(&output);
+        assert!(said.contains(named) && said.lines().filter(|line| line.starts_with("error")).count() == 1, "{said}");
+    }
+    assert_eq!(crate::support::names(folder.path()), ["noise"]);
+}
