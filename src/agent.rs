@@ -11,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 
 use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
-use crate::env::{Env, EnvPool, EnvState, Lesson, Repose, Resumable, Task};
+use crate::env::{Env, EnvPool, EnvState, Lesson, Randomization, Repose, Resumable, Task};
 use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
 use crate::ranks::Division;
 
@@ -71,9 +71,10 @@ impl Agent<Repose> {
     /// Creates the agent of a training with these settings, at the start of its first episodes.
     ///
     /// # Errors
-    /// Fails if this machine does not support the precision.
+    /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
     pub fn of_task(task: &Arc<Task>, config: &Config) -> Result<Self> {
-        let envs = (0..config.env.num_envs).map(|_| Repose::new(task)).collect();
+        let randomization = Randomization::new(task, &config.randomization)?;
+        let envs = (0..config.env.num_envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
         let training = config.training.clone();
         let division = Division::alone(config.shards());
         Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &training))

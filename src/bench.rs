@@ -13,13 +13,14 @@ use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part};
 use crate::config::{Config, expect_used, user_file};
 use crate::env::{
-    ACTION_SIZE, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Repose, StepBuffers, Task, Transition,
+    ACTION_SIZE, Draw, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Randomization, Repose, StepBuffers,
+    Task, Transition,
 };
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng::{self, Rng};
 use crate::run;
 use crate::schedule::in_rounds;
-use crate::sim::{BareSimulation, SimulationState};
+use crate::sim::{BareSimulation, FreeJoint, Scene, SimulationState};
 use crate::spaces::Spaces;
 
 /// The number of rounds of measuring physics and pool.
@@ -98,12 +99,14 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
 
 /// The record of what an environment did in a turn.
 struct Recording {
-    /// Its state at the beginning.
-    start: SimulationState,
+    /// Its state at the beginning, and what its episode has drawn.
+    start: (SimulationState, Option<Draw>),
     /// Its controls, step by step.
     ctrl: Vec<f64>,
-    /// The episodes that began: the number of steps before each, and its first state.
-    resets: Vec<(usize, SimulationState)>,
+    /// The random force on the cube in each step, if there are such forces.
+    pushes: Vec<Option<[f64; 3]>>,
+    /// The episodes that began: the number of steps before each, its first state, and what it has drawn.
+    resets: Vec<(usize, SimulationState, Option<Draw>)>,
     steps: usize,
 }
 
@@ -114,16 +117,18 @@ struct RecordingEnv {
 }
 
 impl RecordingEnv {
-    fn new(task: &Arc<Task>) -> Self {
-        let env = Repose::new(task);
-        let ctrl = Vec::with_capacity(TURN * ACTION_SIZE);
-        let recording = Recording { start: env.simulation().state(), ctrl, resets: Vec::new(), steps: 0 };
+    fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
+        let env = Repose::randomized(task, randomization);
+        let (ctrl, pushes) = (Vec::with_capacity(TURN * ACTION_SIZE), Vec::with_capacity(TURN));
+        let start = (env.simulation().state(), None);
+        let recording = Recording { start, ctrl, pushes, resets: Vec::new(), steps: 0 };
         Self { env, recording }
     }
 
     fn begin(&mut self) {
-        self.recording.start = self.env.simulation().state();
+        self.recording.start = (self.env.simulation().state(), self.env.draw().cloned());
         self.recording.ctrl.clear();
+        self.recording.pushes.clear();
         self.recording.resets.clear();
         self.recording.steps = 0;
     }
@@ -140,7 +145,8 @@ impl Env for RecordingEnv {
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
         self.env.reset(rng, observation);
-        self.recording.resets.push((self.recording.steps, self.env.simulation().state()));
+        let draw = self.env.draw().cloned();
+        self.recording.resets.push((self.recording.steps, self.env.simulation().state(), draw));
     }
 
     fn skip_ahead(&mut self, share: f64) {
@@ -149,6 +155,7 @@ impl Env for RecordingEnv {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         let transition = self.env.step(action, observation);
+        self.recording.pushes.push(self.env.last_step().push);
         self.recording.ctrl.extend_from_slice(self.env.simulation().ctrl());
         self.recording.steps += 1;
         transition
@@ -160,6 +167,44 @@ impl Env for RecordingEnv {
 
     fn episode(&self) -> EpisodeStats {
         self.env.episode()
+    }
+}
+
+/// The physics alone of an environment.
+struct Replay {
+    sim: BareSimulation,
+    /// What the last episode has drawn, and its scene.
+    drawn: (Option<Draw>, Scene),
+    /// The scenes of the episodes that begin in the next turn.
+    resets: Vec<Scene>,
+}
+
+impl Replay {
+    fn new(nominal: &Scene) -> Self {
+        Self { sim: BareSimulation::new(nominal), drawn: (None, nominal.clone()), resets: Vec::new() }
+    }
+
+    /// Prepares what the replay of a turn needs: its first state and its scenes.
+    fn prepare(&mut self, recording: &Recording, scene_of: impl Fn(Option<&Draw>) -> Scene) {
+        let (state, draw) = &recording.start;
+        if *draw != self.drawn.0 {
+            self.drawn = (draw.clone(), scene_of(draw.as_ref()));
+        }
+        self.sim.start(state, &self.drawn.1);
+        self.resets = recording.resets.iter().map(|(_, _, draw)| scene_of(draw.as_ref())).collect();
+        if let (Some((_, _, draw)), Some(scene)) = (recording.resets.last(), self.resets.last()) {
+            self.drawn = (draw.clone(), scene.clone());
+        }
+    }
+
+    fn step(&mut self, recording: &Recording, step: usize, cube: FreeJoint, substeps: usize) {
+        if let Some(force) = recording.pushes[step] {
+            self.sim.push(cube.body, force);
+        }
+        self.sim.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
+        if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, ..)| after) {
+            self.sim.start(&recording.resets[i].1, &self.resets[i]);
+        }
     }
 }
 
@@ -191,8 +236,15 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let turns = STEPS.div_ceil(envs * TURN);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
     let mut draw = || config.ppo.std_bounds(0)[1] as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
-    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task)).collect());
-    let mut bare: Vec<BareSimulation> = (0..envs).map(|_| BareSimulation::new(task.scene())).collect();
+    let randomization = Randomization::new(task, &config.randomization)?;
+    let randomization = randomization.as_ref();
+    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task, randomization)).collect());
+    let scene = randomization.map_or(task.scene(), |randomization| randomization.nominal());
+    let scene_of = |draw: Option<&Draw>| match (randomization, draw) {
+        (Some(randomization), Some(draw)) => randomization.scene_of(draw, task),
+        _ => scene.clone(),
+    };
+    let mut bare: Vec<Replay> = (0..envs).map(|_| Replay::new(scene)).collect();
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
     pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
     let mut turn = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
@@ -211,10 +263,12 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
             pool_seconds += turn(&mut pool, TURN);
             let sizes = pool.block_sizes();
             let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
-            bare_seconds += replay(&mut bare, &recordings, &sizes, config.env.substeps());
+            bare.par_iter_mut().zip(&recordings).for_each(|(bare, recording)| bare.prepare(recording, scene_of));
+            bare_seconds += replay(&mut bare, &recordings, &sizes, task);
             drop(recordings);
             // The replay computed the same physics only if it ended in the same states.
-            let same = bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.qpos() == env.env.simulation().qpos());
+            let same =
+                bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.sim.qpos() == env.env.simulation().qpos());
             ensure!(same, "the replay of the physics did not end in the states of the environments");
         }
         let done = (turns * TURN * envs) as f64;
@@ -244,18 +298,15 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
 }
 
 /// Replays the recordings in the same blocks and returns the seconds that the steps took.
-fn replay(bare: &mut [BareSimulation], recordings: &[&Recording], sizes: &[usize], substeps: usize) -> f64 {
-    bare.par_iter_mut().zip(recordings).for_each(|(bare, recording)| bare.start(&recording.start));
+fn replay(bare: &mut [Replay], recordings: &[&Recording], sizes: &[usize], task: &Task) -> f64 {
+    let (cube, substeps) = (task.hand().cube, task.config().substeps());
     let steps = recordings[0].steps;
     let mut all = bare.iter_mut().zip(recordings);
     let blocks: Vec<Vec<_>> = sizes.iter().map(|&size| all.by_ref().take(size).collect()).collect();
     let start = Instant::now();
     in_rounds(blocks, steps, |block, step| {
         for (bare, recording) in block {
-            bare.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
-            if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, _)| after) {
-                bare.start(&recording.resets[i].1);
-            }
+            bare.step(recording, step, cube, substeps);
         }
     });
     start.elapsed().as_secs_f64()

@@ -14,7 +14,8 @@
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, run, train, view |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, run, schedule, sim |
-//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, run, see, sim, trace |
+//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, robustness, run, see, sim, trace |
+//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, env, evaluate, load, run |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, env, load, ppo, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, run |
@@ -42,7 +43,7 @@
 //!
 //! `env` and `ppo` do not depend on each other: they meet in `collect`, `evaluate` and the modules above. `run` depends on
 //! neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal) is
-//! confined to one folder, unsafe code to four files.
+//! confined to one folder, unsafe code to five files.
 //!
 //! # Data path of an iteration
 //! There are N environments in blocks of n, T steps, and O and A values in an observation and an action. A block's arrays
@@ -85,6 +86,7 @@ pub mod ppo;
 pub mod quat;
 pub mod ranks;
 pub mod rng;
+pub mod robustness;
 pub mod run;
 pub mod schedule;
 pub mod see;

@@ -41,14 +41,23 @@ impl Origin {
         if place == Path::new(BUILTIN) { Ok(Self::BuiltIn) } else { run::resolve_checkpoint(place).map(Self::File) }
     }
 
+    /// Returns the file, or the name of what is built in.
+    fn path(&self) -> &Path {
+        match self {
+            Self::BuiltIn => Path::new(BUILTIN),
+            Self::File(path) => path,
+        }
+    }
+
     /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.
     ///
     /// # Errors
     /// Fails as [`read`] and [`for_playing`] do.
     pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, PolicyConfig)> {
-        let (checkpoint, path) = match self {
-            Self::BuiltIn => (Checkpoint::parse(BUILTIN_POLICY)?, Path::new(BUILTIN)),
-            Self::File(path) => (read(path)?, path.as_path()),
+        let path = self.path();
+        let checkpoint = match self {
+            Self::BuiltIn => Checkpoint::parse(BUILTIN_POLICY)?,
+            Self::File(path) => read(path)?,
         };
         let config = for_playing(&checkpoint, path, overrides);
         let config = if *self == Self::BuiltIn { config } else { config.with_context(|| cannot_use(path)) }?;
@@ -101,6 +110,14 @@ impl Loaded {
             Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
         Ok(Self { origin, name, config: config.env, policy, checkpoint })
+    }
+
+    /// Returns the settings of its task, overlaid with other `overrides` than those with which it was loaded.
+    ///
+    /// # Errors
+    /// Fails as [`for_playing`] does.
+    pub fn config_with(&self, overrides: &[Override]) -> Result<EnvConfig> {
+        Ok(for_playing(&self.checkpoint, self.origin.path(), overrides)?.env)
     }
 }
 

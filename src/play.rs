@@ -15,6 +15,7 @@ use crate::env::{Score, Task};
 use crate::evaluate::{Actor, Episodes, Moment, evaluate};
 use crate::load::Loaded;
 use crate::pace::Pace;
+use crate::robustness::robustness;
 use crate::run::{self, Requests};
 use crate::see::{Film, HAS_WINDOWS, Window, task_to_see};
 use crate::sim::Quality;
@@ -46,6 +47,9 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if let (Some(loaded), false) = (&loaded, args.json) {
         run::say(&format!("playing {}", loaded.name));
     }
+    if let (Some(loaded), true) = (&loaded, args.robustness) {
+        return robustness(args, loaded, &actor_of(loaded, args), requests);
+    }
     if wants_window(args) && show(args, &config, loaded.as_ref())? {
         return Ok(ExitCode::SUCCESS);
     }
@@ -55,8 +59,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
 /// Plays without a window and prints the score.
 fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<ExitCode> {
     let actor = match (loaded, args.policy) {
-        (Some(loaded), _) if args.stochastic => Actor::Stochastic(loaded.policy.freeze()),
-        (Some(loaded), _) => Actor::Mean(loaded.policy.freeze()),
+        (Some(loaded), _) => actor_of(loaded, args),
         (None, Some(Baseline::Random)) => Actor::Random,
         (None, _) => Actor::Zero,
     };
@@ -109,8 +112,14 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     Ok(ExitCode::SUCCESS)
 }
 
+/// Returns the actor that a policy is played as.
+fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
+    let policy = loaded.policy.freeze();
+    if args.stochastic { Actor::Stochastic(policy) } else { Actor::Mean(policy) }
+}
+
 fn wants_window(args: &PlayArgs) -> bool {
-    let otherwise = args.headless || args.json || args.trace.is_some() || args.video.is_some();
+    let otherwise = args.robustness || args.headless || args.json || args.trace.is_some() || args.video.is_some();
     args.window || !otherwise && HAS_WINDOWS && run::has_display()
 }
 

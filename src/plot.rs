@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, ensure};
 
 use crate::cli::{Along, PlotArgs};
-use crate::run::{self, Chart, Curve, OutputFile, Subplot};
+use crate::run::{self, Chart, Curve, OutputFile, Picture, Subplot};
 
 /// The metrics that are drawn by default: the headline, and what explains it.
 const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];

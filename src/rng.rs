@@ -21,6 +21,20 @@ pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     rng
 }
 
+/// Returns the generator for another purpose under the seed and index of `rng`.
+pub fn beside(rng: &Rng, purpose: &str) -> Rng {
+    let [seed, ..] = position(rng);
+    stream(seed, purpose, rng.get_stream())
+}
+
+/// Returns the generator for another purpose and one of its places. Those of different places share no numbers as long as fewer
+/// than 2¹⁶ words are drawn.
+pub fn beside_at(rng: &Rng, purpose: &str, place: u32) -> Rng {
+    let mut beside = beside(rng, purpose);
+    beside.set_word_pos(u128::from(place) << 16);
+    beside
+}
+
 /// The key, stream and position of a generator: its complete state.
 pub type Position = [u64; 6];
 
@@ -74,6 +88,21 @@ mod tests {
             again.random::<u32>();
             assert_ne!(position(&again), position(&rng));
         }
+    }
+
+    #[test]
+    fn what_is_beside_a_generator_does_not_depend_on_its_position() {
+        let mut rng = stream(3, "episode", 1 << 40);
+        let draws = |rng: &Rng| {
+            [beside(rng, "randomization"), beside_at(rng, "noise", 0), beside_at(rng, "noise", 7)]
+                .map(|mut r| r.random::<u64>())
+        };
+        let before = draws(&rng);
+        assert_eq!(before[0], stream(3, "randomization", 1 << 40).random::<u64>());
+        assert_eq!(before[1], stream(3, "noise", 1 << 40).random::<u64>());
+        assert_ne!(before[1], before[2]);
+        rng.random::<u64>();
+        assert_eq!(draws(&rng), before);
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub struct Trace {
 impl Trace {
     /// Creates an empty trace of the task with these settings, played by the policy in `checkpoint`.
     pub fn new(config: &EnvConfig, checkpoint: Option<&str>) -> Self {
-        let header = json!({
+        let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
             "act_moving_average": config.act_moving_average,
@@ -41,6 +41,7 @@ impl Trace {
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
         });
+        config.varied().for_each(|(key, value)| header[key] = json!(value));
         Self { header, episodes: Vec::new(), last: usize::MAX }
     }
 

@@ -49,15 +49,10 @@ class Hand:
     def __init__(self, policy, scene):
         env = tomllib.loads(policy.facts["config"])["env"]
         self.env = env
-        self.model = mujoco.MjModel.from_xml_path(str(scene))
-        self.model.opt.timestep = env["sim_dt"]
-        cube = self.model.body("cube")
-        cube.mass[:] *= env["cube_mass_scale"]
-        cube.inertia[:] *= env["cube_mass_scale"]
-        self.model.geom_friction[:] *= env["friction_scale"]
-        self.model.pair_friction[:] *= env["friction_scale"]
+        self.model = varied_model(env, scene)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_setConst(self.model, self.data)
+        cube = self.model.body("cube")
         self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
         joints = [self.model.joint("rh_" + name) for name in JOINTS]
         self.angle = np.array([joint.qposadr[0] for joint in joints])
@@ -103,6 +98,7 @@ class Hand:
         names = [actuator.name.removeprefix("rh_A_") for actuator in self.actuators]
         sums = [angles[name[:2] + "J2"] + angles[name[:2] + "J1"] if name.endswith("J0") else angles[name] for name in names]
         self.targets = np.clip(sums, self.low, self.high)
+        self.under_way = [self.targets] * env["action_delay"]
 
     def observe(self):
         """Returns the 157 values that the policy sees, in the order of `observation_names`."""
@@ -133,7 +129,9 @@ class Hand:
         self.previous_action = np.clip(action, -1, 1).astype(float)
         asked = self.offset + self.scale * self.previous_action
         self.targets = np.clip(self.alpha * asked + (1 - self.alpha) * self.targets, self.low, self.high)
-        self.data.ctrl[self.controls] = self.targets
+        # With env.action_delay, they take effect later.
+        self.under_way.append(self.targets)
+        self.data.ctrl[self.controls] = self.under_way.pop(0)
         for _ in range(self.substeps):
             # mj_step in the other order, so that bodies and joints end at the same instant.
             mujoco.mj_step2(self.model, self.data)
@@ -147,6 +145,41 @@ class Hand:
     def dropped(self):
         """Returns whether the cube is out of the hand."""
         return np.linalg.norm(self.data.qpos[self.cube:self.cube + 3] - self.env["goal_position"]) >= self.env["fall_dist"]
+
+
+def varied_model(env, scene):
+    """Compiles the scene with the physics that the settings ask for; without changes, it is the scene itself."""
+    for key in ("noise", "bias"):
+        if env[key]:
+            sys.exit(f"error: the policy was exported with env.{key}, which this program does not simulate")
+    spec = mujoco.MjSpec.from_file(str(scene))
+    cube, size = spec.body("cube"), env["cube_size_scale"]
+    if any(env["cube_com"]):
+        cube.simple = False  # MuJoCo's shortcut for bodies whose centre of mass is their origin
+    if size != 1:
+        for geom in cube.geoms:
+            geom.size, geom.pos, geom.density = geom.size * size, geom.pos * size, geom.density / size**3
+    model = spec.compile()
+    model.opt.timestep = env["sim_dt"]
+    model.opt.gravity += env["gravity"]
+    if env["cone"] != "scene":
+        model.opt.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[env["cone"]]
+    model.geom_friction[:] *= env["friction_scale"]
+    model.pair_friction[:] *= env["friction_scale"]
+    cube = model.body("cube")
+    of_cube = model.body_rootid == cube.id
+    of_hand = model.body_rootid == model.body(FINGERTIPS[0]).rootid[0]
+    for bodies, factor in (of_cube, env["cube_mass_scale"]), (of_hand, env["hand_mass_scale"]):
+        model.body_mass[bodies] *= factor
+        model.body_inertia[bodies] *= factor
+    cube.ipos[:] += env["cube_com"]
+    model.actuator_gainprm[:, 0] *= env["gains_scale"]
+    model.actuator_biasprm[:, 1] *= env["gains_scale"]
+    speeds = [model.joint("rh_" + name).dofadr[0] for name in JOINTS]
+    model.dof_damping[speeds] *= env["damping_scale"]
+    model.dof_dampingpoly[speeds] *= env["damping_scale"]
+    model.dof_frictionloss[speeds] *= env["frictionloss_scale"]
+    return model
 
 
 def product(a, b):
@@ -207,6 +240,8 @@ def score(played):
 def check(policy, hand, trace):
     """Puts the hand into each state of a trace, and compares what is seen and done there. Returns the largest differences."""
     header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
+    if header.get("noise") or header.get("bias"):
+        sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
     largest, compared = [0.0, 0.0], 0
     for record, after in zip(records, records[1:] + [None]):
         same = after is not None and after["episode"] == record["episode"]

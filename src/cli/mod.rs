@@ -228,6 +228,12 @@ pub struct PlayArgs {
     /// Print only the score, as one JSON object
     #[arg(long, help_heading = OUTPUT)]
     pub json: bool,
+    /// Play under changed physics, noise and delays, one change at a time, and print a table of what is kept
+    #[arg(long, conflicts_with_all = ["window", "trace", "video", "policy"], help_heading = OUTPUT)]
+    pub robustness: bool,
+    /// Picture of that table to write: .svg or .png
+    #[arg(long, value_name = "FILE", requires = "robustness", help_heading = OUTPUT)]
+    pub out: Option<PathBuf>,
     /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub trace: Option<PathBuf>,

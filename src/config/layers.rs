@@ -349,7 +349,7 @@ mod tests {
             ("env.goal_position=[1,2]", "goal_position"),
             ("nonsense=1", "nonsense: unknown key"),
             ("learning_rate=1", "did you mean ppo.learning_rate?"),
-            ("env.foo=1", "env.foo: unknown key; configs/repose.toml"),
+            ("env.quixotic=1", "env.quixotic: unknown key; configs/repose.toml"),
             ("env.success_tolerance=3.2", "must be at most 3.14"),
             (
                 "env.goal_position=[1e3,0,0]",

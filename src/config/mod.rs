@@ -20,7 +20,7 @@ pub const BASE: &str = include_str!("../../configs/repose.toml");
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use settings::{
-    Activation, BUILTIN_MODEL, Backend, Config, EnvConfig, NetConfig, PpoConfig, Precision, RunConfig, SuccessHold,
-    Symmetry, TrainingConfig,
+    Activation, BUILTIN_MODEL, Backend, ByGroup, ConeSetting, Config, EnvConfig, NetConfig, PpoConfig, Precision,
+    RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig, VARIED,
 };
 pub use used::expect_used;

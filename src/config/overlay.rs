@@ -53,6 +53,14 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 let constant = Table::from_iter(parts.into_iter().chain([("steps".to_owned(), Value::Integer(0))]));
                 overlay(merged, &Table::from_iter([(key.clone(), constant.into())]), base, prefix, problems);
             }
+            // A table of values by names that are checked elsewhere.
+            (Some(Value::Table(expected)), Value::Table(inner)) if expected.is_empty() => {
+                let zeros = Table::from_iter(inner.keys().map(|name| (name.clone(), Value::Float(0.0))));
+                let Some(Value::Table(target)) = merged.get_mut(key) else {
+                    unreachable!("the merged tables are those of the base")
+                };
+                overlay(target, inner, &zeros, &format!("{name}."), problems);
+            }
             (Some(Value::Table(expected)), Value::Table(inner)) => {
                 let Some(Value::Table(target)) = merged.get_mut(key) else {
                     unreachable!("the merged tables are those of the base")
@@ -95,6 +103,9 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Array(_), _) => Err(format!("an array, e.g. {expected}")),
         (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = … }".into()),
+        (Value::Table(table), _) if table.is_empty() => {
+            Err("a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }".into())
+        }
         (Value::Table(_), _) => Err("a section with keys".into()),
         _ => Err("of another type".into()),
     }

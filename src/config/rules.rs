@@ -9,20 +9,20 @@ use super::settings::{Backend, Config, Precision};
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule.
 
 /// Settings that must be above 0.
-const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.act_moving_average env.rot_eps \
-    env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm \
+const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.hand_mass_scale \
+    env.cube_size_scale env.gains_scale env.damping_scale env.frictionloss_scale env.act_moving_average env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm \
     ppo.reward_scale ppo.max_std";
 
 /// Settings that must be at least 0.
-const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise training.task_reward \
+const NOT_NEGATIVE: &str = "randomization.cube_com randomization.gravity randomization.push env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise training.task_reward \
     ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.min_std ppo.away_std";
 
 /// Settings that must be at least 1.
 const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.hold ppo.horizon ppo.epochs ppo.minibatches \
-    run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
+    randomization.push_steps run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
 
 /// Settings that must be from 0 to 1.
-const SHARES: &str = "env.act_moving_average ppo.gamma ppo.lambda";
+const SHARES: &str = "env.act_moving_average randomization.share randomization.each ppo.gamma ppo.lambda";
 
 /// The largest valid values of settings.
 const AT_MOST: &[(&str, f64)] = &[
@@ -30,13 +30,15 @@ const AT_MOST: &[(&str, f64)] = &[
     ("training.hold", 1e9),
     ("run.eval_episodes", 1048576.0),
     ("run.threads", 4096.0),
+    // Actions that are under way are kept for each hand.
+    ("env.action_delay", 1000.0),
     // No rotation error is larger.
     ("env.success_tolerance", PI),
     // Observed values are squared in `f32`.
     ("env.vel_obs_scale", 1e6),
 ];
 
-/// The largest magnitude of a value in `[env]` and `[training]` that is not a count: anything near it is a mistake.
+/// The largest magnitude of a value in `[env]`, `[training]` and `[randomization]` that is not a count: anything near it is a mistake.
 const LARGEST: f64 = 1e9;
 
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
@@ -62,7 +64,9 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     for (key, only) in FIXED {
         rules.number(&table, key, |x| x == *only, &format!("be {only}, fixed by the layout of the task"));
     }
-    for (section, keys) in table.iter().filter(|(section, _)| ["env", "training"].contains(&section.as_str())) {
+    for (section, keys) in
+        table.iter().filter(|(section, _)| ["env", "training", "randomization"].contains(&section.as_str()))
+    {
         for (key, value) in keys.as_table().into_iter().flatten() {
             let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
             if let Some(x) = too_large.filter(|_| key != "hold") {
@@ -71,6 +75,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
         }
     }
     env(config, &mut rules);
+    randomization(config, &mut rules);
     nets(config, &mut rules);
     learning(config, &mut rules);
     noise(config, &mut rules);
@@ -100,6 +105,42 @@ fn env(config: &Config, rules: &mut Rules) {
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
     let rule = "last between one and 1e9 steps of env.ctrl_dt";
     rules.check((1.0..=1e9).contains(&steps), "env.max_episode_seconds", env.max_episode_seconds, rule);
+}
+
+fn randomization(config: &Config, rules: &mut Rules) {
+    let drawn = &config.randomization;
+    for (key, [low, high]) in [
+        ("friction", drawn.friction),
+        ("cube_mass", drawn.cube_mass),
+        ("hand_mass", drawn.hand_mass),
+        ("cube_size", drawn.cube_size),
+        ("gains", drawn.gains),
+        ("damping", drawn.damping),
+        ("frictionloss", drawn.frictionloss),
+    ] {
+        let range = format!("[{low}, {high}]");
+        let rule = "be [low, high] with 0 < low <= high";
+        rules.check(0.0 < low && low <= high, &format!("randomization.{key}"), range, rule);
+    }
+    let [low, high] = drawn.delay;
+    let range = format!("[{low}, {high}]");
+    rules.check(low <= high, "randomization.delay", &range, "be [low, high] with low <= high");
+    let env = &config.env;
+    let steps = if env.max_episode_seconds >= env.ctrl_dt { env.max_episode_steps() } else { u32::MAX };
+    let rule = format!("be shorter than an episode, which lasts {steps} steps");
+    rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, &rule);
+    let rule = format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
+    let fits = high == 0 || env.action_delay.saturating_add(high) < steps;
+    rules.check(fits, "randomization.delay", range, &rule);
+    let tables = [("env", &env.noise, &env.bias), ("randomization", &drawn.noise, &drawn.bias)];
+    for (section, noise, bias) in tables {
+        for (name, table) in [("noise", noise), ("bias", bias)] {
+            let negative = table.iter().find(|(_, value)| **value < 0.0);
+            if let Some((group, value)) = negative {
+                rules.check(false, &format!("{section}.{name}.{group}"), value, "not be negative");
+            }
+        }
+    }
 }
 
 fn nets(config: &Config, rules: &mut Rules) {

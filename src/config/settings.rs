@@ -1,8 +1,10 @@
 //! The settings as types; `configs/repose.toml` documents the meaning and the unit of each key.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
 
 use super::ramp::Ramp;
 
@@ -17,6 +19,8 @@ pub struct Config {
     pub env: EnvConfig,
     /// Changes to the task and additions to its reward that only training uses.
     pub training: TrainingConfig,
+    /// Random physics, noise and delays of a share of the episodes of a training.
+    pub randomization: RandomizationConfig,
     /// The learner.
     pub ppo: PpoConfig,
     /// The run: length, checkpoints, evaluations, seed, threads.
@@ -36,6 +40,17 @@ pub struct EnvConfig {
     pub ctrl_dt: f64,
     pub friction_scale: f64,
     pub cube_mass_scale: f64,
+    pub hand_mass_scale: f64,
+    pub cube_size_scale: f64,
+    pub gains_scale: f64,
+    pub damping_scale: f64,
+    pub frictionloss_scale: f64,
+    pub cube_com: [f64; 3],
+    pub gravity: [f64; 3],
+    pub cone: ConeSetting,
+    pub action_delay: u32,
+    pub noise: ByGroup,
+    pub bias: ByGroup,
     pub max_episode_seconds: f64,
     pub goal_position: [f64; 3],
     pub target_height: f64,
@@ -54,6 +69,39 @@ pub struct EnvConfig {
     pub reset_dof_pos_noise: f64,
     pub reset_dof_vel_noise: f64,
     pub vel_obs_scale: f64,
+}
+
+/// Values by the name of a group of the observation; groups that are not named have 0.
+pub type ByGroup = BTreeMap<String, f64>;
+
+/// The settings of the task that vary its physics, what is observed, and when actions take effect. A policy file or a checkpoint
+/// without one of them means its default: the nominal hand.
+pub const VARIED: [&str; 13] = [
+    "friction_scale",
+    "cube_mass_scale",
+    "hand_mass_scale",
+    "cube_size_scale",
+    "gains_scale",
+    "damping_scale",
+    "frictionloss_scale",
+    "cube_com",
+    "gravity",
+    "cone",
+    "action_delay",
+    "noise",
+    "bias",
+];
+
+/// The shape of the friction cones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ConeSetting {
+    /// That of the scene.
+    Scene,
+    /// Pyramids.
+    Pyramidal,
+    /// Cones.
+    Elliptic,
 }
 
 /// The effect of a step outside the tolerance on the counter of steps within it.
@@ -78,6 +126,29 @@ pub struct TrainingConfig {
     pub tolerance: Ramp,
     pub hold: Ramp,
     pub goal_lifetime: u64,
+}
+
+/// Random physics, noise and delays of a share of the episodes of a training. Intervals are [low, high].
+#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RandomizationConfig {
+    pub share: f64,
+    pub each: f64,
+    pub friction: [f64; 2],
+    pub cube_mass: [f64; 2],
+    pub hand_mass: [f64; 2],
+    pub cube_size: [f64; 2],
+    pub cube_com: f64,
+    pub gains: [f64; 2],
+    pub damping: [f64; 2],
+    pub frictionloss: [f64; 2],
+    pub gravity: f64,
+    pub delay: [u32; 2],
+    pub noise: ByGroup,
+    pub bias: ByGroup,
+    pub push: f64,
+    pub push_steps: u32,
 }
 
 /// The learner.
@@ -226,6 +297,12 @@ impl EnvConfig {
     /// Returns the number of control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
         (self.max_episode_seconds / self.ctrl_dt).round() as u32
+    }
+
+    /// Returns the settings of [`VARIED`] by name.
+    pub fn varied(&self) -> impl Iterator<Item = (&'static str, Value)> {
+        let mut table = Table::try_from(self).expect("settings are a table");
+        VARIED.into_iter().map(move |key| (key, table.remove(key).expect("a setting")))
     }
 
     /// Returns the path of the user's own scene, or `None` for the built-in one.

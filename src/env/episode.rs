@@ -21,6 +21,8 @@ pub struct EpisodeStats {
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
+    /// Whether it was randomised. This follows from the seed and its number, so it is not saved.
+    pub randomized: bool,
 }
 
 impl EpisodeStats {
@@ -45,7 +47,8 @@ impl EpisodeStats {
         let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
         ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
         let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);
-        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped: dropped != 0, diverged: diverged != 0 })
+        let [dropped, diverged] = [dropped, diverged].map(|flag| flag != 0);
+        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped, diverged, randomized: false })
     }
 }
 

@@ -2,13 +2,17 @@
 //!
 //! This module knows physics, not learning: actions come in and observations go out as `f32` slices.
 
+mod conditions;
 mod episode;
 mod hand;
 mod lesson;
 mod observation;
 mod pool;
+mod randomization;
 mod repose;
 mod reward;
+mod sensing;
+mod servos;
 mod state;
 mod tail;
 mod task;
@@ -18,6 +22,7 @@ pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::{Lesson, Shaping};
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use pool::{EnvBlock, EnvPool, StepBuffers, stepping};
+pub use randomization::{Draw, Randomization};
 pub use repose::{Diverged, Repose, StepDetails};
 pub use reward::RewardTerms;
 pub use state::{EnvState, SavedEnv};

@@ -20,14 +20,18 @@ pub struct Group {
 const JOINT_POS: Group = Group { name: "joint_pos", start: 0, length: JOINTS.len(), unit: "rad" };
 const JOINT_VEL: Group = JOINT_POS.then("joint_vel", JOINTS.len(), "rad/s * vel_obs_scale");
 const CUBE_POS: Group = JOINT_VEL.then("cube_pos", 3, "m");
-const CUBE_QUAT: Group = CUBE_POS.then("cube_quat", 4, "1");
+pub(super) const CUBE_QUAT: Group = CUBE_POS.then("cube_quat", 4, "1");
 const CUBE_LINVEL: Group = CUBE_QUAT.then("cube_linvel", 3, "m/s");
 const CUBE_ANGVEL: Group = CUBE_LINVEL.then("cube_angvel", 3, "rad/s * vel_obs_scale");
 const GOAL_POS: Group = CUBE_ANGVEL.then("goal_pos", 3, "m");
-const GOAL_QUAT: Group = GOAL_POS.then("goal_quat", 4, "1");
-const RELATIVE_QUAT: Group = GOAL_QUAT.then("relative_quat", 4, "1");
+pub(super) const GOAL_QUAT: Group = GOAL_POS.then("goal_quat", 4, "1");
+pub(super) const RELATIVE_QUAT: Group = GOAL_QUAT.then("relative_quat", 4, "1");
+/// The number of values of a fingertip.
+pub(super) const TIP_SIZE: usize = 13;
+/// The index of its quaternion among them.
+pub(super) const TIP_QUAT: usize = 3;
 const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
-const TIPS: Group = RELATIVE_QUAT.then("fingertips", 13 * FINGERTIPS.len(), OF_FINGERTIPS);
+pub(super) const TIPS: Group = RELATIVE_QUAT.then("fingertips", TIP_SIZE * FINGERTIPS.len(), OF_FINGERTIPS);
 const PREVIOUS_ACTION: Group = TIPS.then("previous_action", ACTION_SIZE, "1");
 
 /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z; all but those of the

@@ -7,7 +7,10 @@ use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 
+use super::conditions::Conditions;
 use super::observation::{Cells, SPACES};
+use super::randomization::{Draw, Randomization};
+use super::servos::{Servos, Targets};
 use super::tail::{Recorder, Tail};
 use super::task::Task;
 use super::{
@@ -29,8 +32,8 @@ pub struct Repose {
     goal: Quat,
     /// The previous action as observed: clipped to [-1, 1].
     previous_action: [f32; ACTION_SIZE],
-    /// The last actuator targets, rad, in action order.
-    targets: [f64; ACTION_SIZE],
+    servos: Servos,
+    conditions: Conditions,
     /// Control steps since the reset, plus those skipped by `skip_ahead`.
     age: u32,
     held: u32,
@@ -46,6 +49,8 @@ pub struct Repose {
 pub struct Diverged {
     /// The length of the episode in control steps, including the last one.
     pub length: u32,
+    /// What the episode has drawn, if it was randomised.
+    pub draw: Option<Draw>,
     /// The last steps of the episode.
     pub tail: Tail,
 }
@@ -63,19 +68,28 @@ pub struct StepDetails {
     pub reward: RewardTerms,
     /// Whether the physics diverged.
     pub diverged: bool,
+    /// The random force on the cube in the step, N, if there are such forces in the episode.
+    pub push: Option<[f64; 3]>,
 }
 
 impl Repose {
     /// Creates an environment of `task`; it must be reset before it is stepped.
     pub fn new(task: &Arc<Task>) -> Self {
+        Self::randomized(task, None)
+    }
+
+    /// Creates an environment of `task` some of whose episodes are randomised.
+    pub fn randomized(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
+        let conditions = Conditions::new(randomization);
         Self {
-            sim: Simulation::new(&task.scene),
+            sim: Simulation::new(conditions.nominal(task)),
+            servos: Servos::new(),
+            conditions,
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
             previous_action: [0.0; ACTION_SIZE],
-            targets: [0.0; ACTION_SIZE],
             age: 0,
             held: 0,
             episode: EpisodeStats::default(),
@@ -116,6 +130,11 @@ impl Repose {
         &mut self.sim
     }
 
+    /// Returns what this episode has drawn, if it is randomised.
+    pub fn draw(&self) -> Option<&Draw> {
+        self.conditions.draw()
+    }
+
     /// Returns the settings of the task.
     pub fn config(&self) -> &EnvConfig {
         &self.task.config
@@ -149,23 +168,18 @@ impl Repose {
         Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
     }
 
-    /// Clips the action, converts it to actuator targets and writes them as controls.
-    fn actuate(&mut self, action: &[f32]) {
-        let alpha = self.task.config.act_moving_average;
-        for (i, actuator) in self.task.hand.actuators.iter().enumerate() {
-            let clipped = action[i].clamp(-1.0, 1.0);
-            let [low, high] = actuator.range;
-            let asked = low + (f64::from(clipped) + 1.0) / 2.0 * (high - low);
-            let target = (alpha * asked + (1.0 - alpha) * self.targets[i]).clamp(low, high);
-            self.previous_action[i] = clipped;
-            self.targets[i] = target;
-        }
-        self.send_targets();
+    /// Clips the action, writes as controls the targets that take effect now, and returns those.
+    fn actuate(&mut self, action: &[f32]) -> Targets {
+        self.previous_action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        let due =
+            self.servos.take(&self.previous_action, &self.task.hand.actuators, self.task.config.act_moving_average);
+        self.send(due);
+        due
     }
 
-    fn send_targets(&mut self) {
+    fn send(&mut self, targets: Targets) {
         let ctrl = self.sim.ctrl_mut();
-        for (actuator, target) in self.task.hand.actuators.iter().zip(self.targets) {
+        for (actuator, target) in self.task.hand.actuators.iter().zip(targets) {
             ctrl[actuator.ctrl] = target;
         }
     }
@@ -228,6 +242,7 @@ impl Repose {
         }
         cells.put("previous_action", self.previous_action.map(f64::from));
         cells.finish();
+        self.conditions.disturb(&self.rng, self.episode.length, &self.task, observation);
     }
 }
 
@@ -244,6 +259,7 @@ impl Env for Repose {
         let task = self.task.clone();
         let (hand, config) = (&task.hand, &task.config);
         self.rng = rng;
+        self.conditions.begin(&self.rng, &mut self.sim, &task);
         self.sim.reset();
         for joint in &hand.joints {
             let noise = rng::uniform(&mut self.rng, -config.reset_dof_pos_noise, config.reset_dof_pos_noise);
@@ -261,14 +277,16 @@ impl Env for Repose {
         let orientation = self.draw_rotation();
         self.sim.qpos_mut()[hand.cube.qpos + 3..hand.cube.qpos + 7].copy_from_slice(&orientation);
         self.set_goal();
-        for (i, actuator) in hand.actuators.iter().enumerate() {
-            let angle: f64 = hand.driven[i].iter().map(|&joint| self.sim.qpos()[hand.joints[joint].qpos]).sum();
-            self.targets[i] = angle.clamp(actuator.range[0], actuator.range[1]);
+        let mut targets = [0.0; ACTION_SIZE];
+        for ((target, actuator), driven) in targets.iter_mut().zip(&hand.actuators).zip(&hand.driven) {
+            let angle: f64 = driven.iter().map(|&joint| self.sim.qpos()[hand.joints[joint].qpos]).sum();
+            *target = angle.clamp(actuator.range[0], actuator.range[1]);
         }
-        self.send_targets();
+        self.send(targets);
+        self.servos.reset(targets, self.conditions.delay(&self.task));
         self.previous_action = [0.0; ACTION_SIZE];
         (self.age, self.held) = (0, 0);
-        self.episode = EpisodeStats::default();
+        self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
         self.last = StepDetails::default();
         self.recorder.clear();
         self.sim.refresh();
@@ -281,12 +299,13 @@ impl Env for Repose {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         let rot_dist_before = self.rot_dist();
-        self.actuate(action);
-        self.recorder.record(&self.sim, action);
+        let sent = self.actuate(action);
+        let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
+        self.recorder.record(&self.sim, action, push);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls; restore what was sent for anyone who reads them.
-            self.send_targets();
+            self.send(sent);
         }
 
         let config = &self.task.config;
@@ -298,7 +317,7 @@ impl Env for Repose {
             true => RewardTerms::default(),
             false => RewardTerms::of_step(config, rot_dist, goal_dist, &self.previous_action),
         };
-        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged };
+        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged, push };
 
         self.age += 1;
         self.episode.length += 1;
@@ -310,8 +329,8 @@ impl Env for Repose {
         self.recent.diverged += u64::from(diverged);
         let (mut shaping, mut reached) = (Shaping::default(), false);
         if diverged {
-            let length = self.episode.length;
-            self.diverged = self.recorder.tail().map(|tail| Diverged { length, tail });
+            let (length, draw) = (self.episode.length, self.conditions.draw().cloned());
+            self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
         } else {
             self.episode.rot_dist_sum += rot_dist;
             self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
@@ -352,28 +371,36 @@ impl Resumable for Repose {
         state.numbers.extend(self.sim.state().numbers());
         state.numbers.extend(self.goal);
         state.numbers.extend(self.previous_action.map(f64::from));
-        state.numbers.extend(self.targets);
+        state.numbers.extend(self.servos.last());
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
         self.episode.save(state);
+        // Always the same number of values.
+        state.numbers.extend(self.servos.under_way(self.conditions.most_delay(&self.task)).flatten());
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
-        self.sim.restore(state.numbers_but::<{ 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS }>()?)?;
+        self.rng = rng::at(state.counters()?);
+        self.conditions.begin(&self.rng, &mut self.sim, &self.task);
+        let fixed = 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS;
+        // A fork may have other delays than its parent.
+        let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / ACTION_SIZE;
+        self.sim.restore(state.numbers_but(fixed + under_way * ACTION_SIZE)?)?;
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
         self.previous_action = state.numbers()?.map(|x| x as f32);
         let clipped = self.previous_action.iter().all(|action| (-1.0..=1.0).contains(action));
         ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.previous_action);
-        self.targets = state.numbers()?;
-        self.rng = rng::at(state.counters()?);
+        let targets = state.numbers()?;
         let [age, held] = state.counters()?;
         // `age` has no tighter limit: a fork may have shorter episodes.
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
         ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
-        self.episode = EpisodeStats::saved(state)?;
+        self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
+        let under_way: Vec<Targets> = (0..under_way).map(|_| state.numbers()).collect::<Result<_>>()?;
+        self.servos.restore(targets, &under_way, self.conditions.delay(&self.task));
         self.recent = Recent::default();
         self.last = StepDetails::default();
         self.recorder.clear();

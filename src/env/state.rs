@@ -46,12 +46,17 @@ impl<'a> SavedEnv<'a> {
         Ok(*first)
     }
 
-    /// Reads all numbers except the last `N`.
+    /// Returns how many numbers are left.
+    pub fn numbers_left(&self) -> usize {
+        self.numbers.len()
+    }
+
+    /// Reads all numbers except the last `kept`.
     ///
     /// # Errors
-    /// Fails if fewer than `N` are left.
-    pub fn numbers_but<const N: usize>(&mut self) -> Result<&'a [f64]> {
-        let count = self.numbers.len().checked_sub(N).context("the state has too few numbers")?;
+    /// Fails if fewer than `kept` are left.
+    pub fn numbers_but(&mut self, kept: usize) -> Result<&'a [f64]> {
+        let count = self.numbers.len().checked_sub(kept).context("the state has too few numbers")?;
         let (first, rest) = self.numbers.split_at(count);
         self.numbers = rest;
         Ok(first)

@@ -15,6 +15,8 @@ pub struct Tail {
     pub controls: Vec<[f64; ACTION_SIZE]>,
     /// The policy's action in each step.
     pub actions: Vec<[f32; ACTION_SIZE]>,
+    /// The random force on the cube in each step, N; empty where there is none.
+    pub pushes: Vec<[f64; 3]>,
 }
 
 /// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
@@ -31,14 +33,15 @@ impl Recorder {
     }
 
     /// Records a step that is about to be taken, after its controls have been set.
-    pub(super) fn record(&mut self, sim: &Simulation, action: &[f32]) {
+    pub(super) fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>) {
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS) {
             let (controls, actions) = (Vec::with_capacity(STEPS), Vec::with_capacity(STEPS));
-            self.before = self.now.replace(Tail { start: sim.state(), controls, actions });
+            self.before = self.now.replace(Tail { start: sim.state(), controls, actions, pushes: Vec::new() });
         }
         let tail = self.now.as_mut().expect("just begun");
         tail.controls.push(*sim.ctrl().first_chunk().expect("one control per actuator"));
         tail.actions.push(*action.first_chunk().expect("a complete action"));
+        tail.pushes.extend(push);
     }
 
     /// Returns the recorded steps; `None` before the first step.
@@ -48,6 +51,7 @@ impl Recorder {
             Some(mut tail) => {
                 tail.controls.extend(now.controls);
                 tail.actions.extend(now.actions);
+                tail.pushes.extend(now.pushes);
                 tail
             }
             None => now,

@@ -2,27 +2,33 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 
 use super::Hand;
 use super::hand::CUBE;
-use crate::config::EnvConfig;
-use crate::sim::{Look, Scene, Variation};
+use super::sensing::Spread;
+use crate::config::{ConeSetting, EnvConfig};
+use crate::sim::{Compilation, Cone, Look, Scene, Variation};
 
 /// A scene, the hand in it, and the settings.
 pub struct Task {
     pub(super) scene: Scene,
     pub(super) hand: Hand,
     pub(super) config: EnvConfig,
+    /// The standard deviation of white noise on an observation.
+    pub(super) noise: Spread,
+    /// The standard deviation of the offset of an observation that lasts an episode.
+    pub(super) bias: Spread,
 }
 
 impl Task {
     /// Loads the scene that `config` names and binds the hand in it.
     ///
     /// # Errors
-    /// Fails with the scene's file if the scene cannot be loaded or lacks a name.
+    /// Fails with the scene's file if the scene cannot be loaded or lacks a name, or if a setting names an unknown group of the
+    /// observation.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::of(Scene::load(config.model_file(), variation(config))?, config)
+        Self::of(Scene::load(config.model_file(), &compilation(config))?, config)
     }
 
     /// Loads the same task in a scene for display.
@@ -30,12 +36,15 @@ impl Task {
     /// # Errors
     /// Fails like [`Task::new`], or if meshes cannot be read.
     pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::of(Scene::load_to_see(config.model_file(), variation(config), look)?, config)
+        Self::of(Scene::load_to_see(config.model_file(), &compilation(config), look)?, config)
     }
 
     fn of(scene: Scene, config: &EnvConfig) -> Result<Arc<Self>> {
         let hand = Hand::bind(&scene)?;
-        Ok(Arc::new(Self { scene, hand, config: config.clone() }))
+        let scene = scene.varied(&variation(config, &scene, &hand));
+        let noise = Spread::of(&config.noise).context("env.noise")?;
+        let bias = Spread::of(&config.bias).context("env.bias")?;
+        Ok(Arc::new(Self { scene, hand, config: config.clone(), noise, bias }))
     }
 
     /// Returns the settings.
@@ -52,8 +61,46 @@ impl Task {
     pub fn scene(&self) -> &Scene {
         &self.scene
     }
+
+    /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's), and with a centre
+    /// of mass that can be shifted.
+    ///
+    /// # Errors
+    /// Fails like [`Task::new`].
+    pub(super) fn scene_with(&self, size: f64, shifts: bool) -> Result<Scene> {
+        let config = &self.config;
+        let mut compilation = compilation(config);
+        compilation.size *= size;
+        compilation.shifts |= shifts;
+        let scene = Scene::load(config.model_file(), &compilation)?;
+        Ok(scene.varied(&variation(config, &scene, &self.hand)))
+    }
 }
 
-fn variation(config: &EnvConfig) -> Variation {
-    Variation { timestep: config.sim_dt, friction: config.friction_scale, load: (CUBE, config.cube_mass_scale) }
+/// Returns how the scene is compiled for a task.
+fn compilation(config: &EnvConfig) -> Compilation {
+    let cone = match config.cone {
+        ConeSetting::Scene => None,
+        ConeSetting::Pyramidal => Some(Cone::Pyramidal),
+        ConeSetting::Elliptic => Some(Cone::Elliptic),
+    };
+    let shifts = config.cube_com != [0.0; 3];
+    Compilation { timestep: config.sim_dt, cone, object: CUBE, size: config.cube_size_scale, shifts }
+}
+
+/// Returns how a task varies the physics of its scene; what is not varied is not listed.
+fn variation(config: &EnvConfig, scene: &Scene, hand: &Hand) -> Variation {
+    let (cube, root) = (hand.cube.body, scene.root(hand.fingertips[0]));
+    let masses = [(cube, config.cube_mass_scale), (root, config.hand_mass_scale)];
+    let of_joints = |factor: f64| hand.joints.into_iter().map(move |joint| (joint, factor)).filter(|&(_, x)| x != 1.0);
+    let gains = hand.actuators.into_iter().map(|actuator| (actuator, config.gains_scale));
+    Variation {
+        friction: config.friction_scale,
+        masses: masses.into_iter().filter(|&(_, factor)| factor != 1.0).collect(),
+        shift: Some((cube, config.cube_com)).filter(|&(_, offset)| offset != [0.0; 3]),
+        gains: gains.filter(|&(_, factor)| factor != 1.0).collect(),
+        damping: of_joints(config.damping_scale).collect(),
+        frictionloss: of_joints(config.frictionloss_scale).collect(),
+        gravity: config.gravity,
+    }
 }

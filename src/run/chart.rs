@@ -34,10 +34,10 @@ pub struct Chart {
 }
 
 /// The colour of the grid. Opaque, since not every SVG viewer supports opacity.
-const GRID: RGBColor = RGBColor(225, 225, 225);
+pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
 
 /// Colours of the curves, distinguishable with red-green colour blindness: M. Okabe, K. Ito, "Color universal design" (2008).
-const COLOURS: [RGBColor; 7] = [
+pub(super) const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -56,13 +56,23 @@ fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
     dashes.flat_map(|dash| COLOURS.iter().map(move |colour| (colour.stroke_width(2), dash)))
 }
 
-impl Chart {
+/// A picture that is drawn in the same way in each format.
+pub trait Picture {
+    /// Returns its width and height in pixels.
+    fn size(&self) -> [u32; 2];
+
+    /// Draws it.
+    ///
+    /// # Errors
+    /// Fails if the picture is too small for what it shows.
+    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()>;
+
     /// Writes the picture in the format given by the extension of its name.
     ///
     /// # Errors
-    /// Fails for any other format, if the file cannot be written, or if the picture is too small for its panels.
-    pub fn write(&self, output: OutputFile) -> Result<()> {
-        let [width, height] = self.size;
+    /// Fails for any other format than SVG and PNG, if the file cannot be written, or as [`Picture::draw`] does.
+    fn write(&self, output: OutputFile) -> Result<()> {
+        let [width, height] = self.size();
         #[cfg(feature = "video")]
         {
             // With this feature, text is measured for SVG too, which needs the font. Registering it twice has no effect.
@@ -79,12 +89,18 @@ impl Chart {
             Some("png") => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
                 self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
-                super::write_png(output, self.size, &rgb)
+                super::write_png(output, self.size(), &rgb)
             }
             #[cfg(not(feature = "video"))]
             Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display()),
             _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
         }
+    }
+}
+
+impl Picture for Chart {
+    fn size(&self) -> [u32; 2] {
+        self.size
     }
 
     fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {

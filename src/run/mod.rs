@@ -1,5 +1,6 @@
 //! The I/O of a run: its folder, its logs, the terminal, signals. Independent of environments and learning.
 
+mod bar_chart;
 mod chart;
 mod checkpoints;
 mod events;
@@ -19,7 +20,8 @@ mod progress;
 mod records;
 mod report;
 
-pub use chart::{Chart, Curve, Subplot};
+pub use bar_chart::{BarChart, HeatMap, NamedBar};
+pub use chart::{Chart, Curve, Picture, Subplot};
 pub use checkpoints::Checkpoints;
 pub use file::{read_bytes, read_text, same_file};
 #[cfg(feature = "video")]

@@ -10,6 +10,7 @@ use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_model::MjtTexture;
 
+use super::compilation::Compilation;
 use super::look::VISUAL;
 
 /// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours.
@@ -26,7 +27,7 @@ const PLATE: f64 = 0.02;
 ///
 /// # Errors
 /// Fails if MuJoCo refuses the scene.
-pub(super) fn furnished(file: &Path, model: &MjModel) -> Result<Option<MjModel>> {
+pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&MjtTexture::mjTEXTURE_SKYBOX);
     let boxes: Vec<_> =
@@ -35,6 +36,7 @@ pub(super) fn furnished(file: &Path, model: &MjModel) -> Result<Option<MjModel>>
         return Ok(None);
     }
     let mut spec = MjSpec::from_xml(file).map_err(|error| anyhow!("{error}"))?;
+    compilation.edit(&mut spec)?;
     if is_dark {
         let light = spec.world_body_mut().add_light();
         light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(MjtLightType::mjLIGHT_DIRECTIONAL);

@@ -7,6 +7,8 @@ use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
+use super::compilation::{BUILTIN, Compilation};
+
 /// The group of geoms that are not drawn.
 const HIDDEN: i32 = 3;
 /// The group of geoms that are drawn and by convention collide with nothing.
@@ -109,8 +111,9 @@ impl Look {
     ///
     /// # Errors
     /// Fails if MuJoCo cannot read a file as a mesh.
-    pub(super) fn dress(&self, scene: &str) -> Result<MjModel> {
-        let mut spec = MjSpec::from_xml_string(scene).map_err(|error| anyhow!("{error}"))?;
+    pub(super) fn dress(&self, compilation: &Compilation) -> Result<MjModel> {
+        let mut spec = MjSpec::from_xml_string(BUILTIN).map_err(|error| anyhow!("{error}"))?;
+        compilation.edit(&mut spec)?;
         let mut files = MjVfs::new();
         for (name, content) in mesh_files().into_iter().zip(&self.meshes) {
             files.add_from_buffer(name, content).map_err(|error| anyhow!("{name}: {error}"))?;

@@ -2,6 +2,7 @@
 //!
 //! Nothing outside this folder names `mujoco_rs`; nothing inside it knows the task. Angles in rad, lengths in m, world frame.
 
+mod compilation;
 mod fatal;
 mod finite;
 mod furnish;
@@ -14,14 +15,17 @@ mod panel;
 mod renderer;
 mod scene;
 mod simulation;
+mod variation;
 #[cfg(feature = "viewer")]
 mod viewer;
 
+pub use compilation::{Compilation, Cone};
 pub use fatal::before_fatal_error;
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
-pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene, Variation};
+pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
 pub use simulation::{BareSimulation, Physics, Pose, Simulation, SimulationState, Velocity};
+pub use variation::{Variants, Variation};
 
 #[cfg(feature = "viewer")]
 pub use panel::{Controls, Gauge, Readout, SPEEDS, Trend};

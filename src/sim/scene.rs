@@ -5,64 +5,20 @@ use std::sync::Arc;
 
 use anyhow::{Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{
-    MjData, MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
+    MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
 
 use super::Look;
+use super::compilation::{Compilation, origin};
 use super::fatal::quieten_mujoco;
 use super::finite::not_finite;
 use super::furnish::furnished;
-
-/// The scene built into the program.
-const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
 /// A compiled MuJoCo model that any number of simulations can share.
 #[derive(Clone)]
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
-    origin: String,
-}
-
-/// The physics parameters that are set from outside; all others come from the scene.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Variation {
-    /// The physics timestep, s.
-    pub timestep: f64,
-    /// The factor on the friction coefficients of every geom and every pair of geoms.
-    pub friction: f64,
-    /// The name of a body, and the factor on the mass and inertia of it and its descendants.
-    pub load: (&'static str, f64),
-}
-
-impl Variation {
-    /// Returns the variation that keeps the scene's own physics, with a timestep in s.
-    pub fn none(timestep: f64) -> Self {
-        Self { timestep, friction: 1.0, load: ("", 1.0) }
-    }
-
-    fn apply(self, model: &mut MjModel) {
-        model.opt_mut().timestep = self.timestep;
-        let scale = |factors: &mut [f64]| factors.iter_mut().for_each(|x| *x *= self.friction);
-        scale(model.geom_friction_mut().as_flattened_mut());
-        scale(model.pair_friction_mut().as_flattened_mut());
-        let (name, load) = self.load;
-        if load != 1.0 {
-            // Every body has a higher number than its parent.
-            let mut loaded = vec![false; model.nbody() as usize];
-            for body in 0..loaded.len() {
-                let named = model.id_to_name(MjtObjBase::mjOBJ_BODY, body) == Some(name);
-                loaded[body] = named || loaded[model.body_parentid()[body] as usize];
-                if loaded[body] {
-                    model.body_mass_mut()[body] *= load;
-                    model.body_inertia_mut()[body].iter_mut().for_each(|x| *x *= load);
-                }
-            }
-            // Update what MuJoCo derives from the masses at compile time, such as the scale of contact forces.
-            let mut data = MjData::new(Box::new(model.clone()));
-            data.set_const();
-            *model = data.model().clone();
-        }
-    }
+    pub(super) origin: String,
 }
 
 /// A hinge joint with limits.
@@ -79,6 +35,8 @@ pub struct Hinge {
 /// A free joint: position and orientation w,x,y,z from `qpos`, linear (world) and angular (body frame) velocity from `dof`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FreeJoint {
+    /// The body that it moves.
+    pub body: Body,
     /// Index of the first of its seven values in `qpos`.
     pub qpos: usize,
     /// Index of the first of its six values in `qvel`.
@@ -96,6 +54,8 @@ pub struct Mocap(pub(super) usize);
 /// An actuator with one control.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Actuator {
+    /// Its number.
+    pub(super) id: usize,
     /// Index of its control in `ctrl`.
     pub ctrl: usize,
     /// Control limits, rad.
@@ -103,52 +63,39 @@ pub struct Actuator {
 }
 
 impl Scene {
-    /// Loads the built-in scene (`None`) or a user's MJCF file, and applies `variation` to its physics.
+    /// Loads the built-in scene (`None`) or a user's MJCF file.
     ///
     /// # Errors
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
-    pub fn load(file: Option<&Path>, variation: Variation) -> Result<Self> {
+    pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
         quieten_mujoco();
-        let model = match file {
-            None => MjModel::from_xml_string(BUILTIN),
-            Some(path) => {
-                ensure!(
-                    path.is_file(),
-                    "{}: env.model must name a MuJoCo scene, but there is no such file",
-                    path.display()
-                );
-                MjModel::from_xml(path)
-            }
-        };
-        let origin = file.map_or("the built-in scene".into(), |path| path.display().to_string());
-        let model = model.map_err(|error| anyhow!("{origin}: MuJoCo refuses this scene: {error}"))?;
-        Self::of(model, origin, variation)
+        Self::of(compilation.compile(file)?, origin(file), compilation)
     }
 
     /// Loads the same scene, with the same physics, for display.
     ///
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
-    pub fn load_to_see(file: Option<&Path>, variation: Variation, look: &Look) -> Result<Self> {
-        let mut scene = Self::load(file, variation)?;
+    pub fn load_to_see(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
+        let mut scene = Self::load(file, compilation)?;
         if file.is_none() && !look.meshes.is_empty() {
-            scene = Self::of(look.dress(BUILTIN)?, scene.origin, variation)?;
+            scene = Self::of(look.dress(compilation)?, scene.origin, compilation)?;
         }
         // A scene that cannot be given more is shown as it is.
         if let Some(file) = file
-            && let Ok(Some(model)) = furnished(file, &scene.model)
+            && let Ok(Some(model)) = furnished(file, &scene.model, compilation)
         {
-            scene = Self::of(model, scene.origin, variation)?;
+            scene = Self::of(model, scene.origin, compilation)?;
         }
         look.set_up(Arc::get_mut(&mut scene.model).expect("a new scene is not shared"));
         Ok(scene)
     }
 
-    fn of(mut model: MjModel, origin: String, variation: Variation) -> Result<Self> {
+    fn of(mut model: MjModel, origin: String, compilation: &Compilation) -> Result<Self> {
         if let Some(culprit) = not_finite(&model) {
             bail!("{origin}: {culprit} is not a finite number");
         }
-        variation.apply(&mut model);
+        compilation.set_options(&mut model);
         let scene = Self { model: Arc::new(model), origin };
         if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {
             bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);
@@ -200,11 +147,12 @@ impl Scene {
     /// # Errors
     /// Fails if there is no such body or its first joint is not a free joint.
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
-        let Body(body) = self.body(name)?;
-        let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
+        let body = self.body(name)?;
+        let joint = usize::try_from(self.model.body_jntadr()[body.0]).ok();
         let free = joint.filter(|&j| self.model.jnt_type()[j] == MjtJoint::mjJNT_FREE);
         let joint = free.ok_or_else(|| anyhow!("{}: body `{name}` must have a free joint", self.origin))?;
-        Ok(FreeJoint { qpos: self.model.jnt_qposadr()[joint] as usize, dof: self.model.jnt_dofadr()[joint] as usize })
+        let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
+        Ok(FreeJoint { body, qpos, dof })
     }
 
     /// Finds the body `name`.
@@ -213,6 +161,11 @@ impl Scene {
     /// Fails if there is no such body.
     pub fn body(&self, name: &str) -> Result<Body> {
         Ok(Body(self.find(MjtObjBase::mjOBJ_BODY, "body", name)?))
+    }
+
+    /// Returns the first body of the kinematic tree to which `body` belongs.
+    pub fn root(&self, Body(body): Body) -> Body {
+        Body(self.model.body_rootid()[body] as usize)
     }
 
     /// Finds the mocap body `name`.
@@ -256,7 +209,7 @@ impl Scene {
             "{}: actuator `{name}` must have one control with a ctrlrange",
             self.origin
         );
-        Ok(Actuator { ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
+        Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
     }
 
     /// Returns the scene's file, for messages.

@@ -35,12 +35,34 @@ const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
     pub(super) data: MjData<Arc<MjModel>>,
+    /// The model of the scene while the simulation uses one of its own.
+    shared: Option<Arc<MjModel>>,
+    /// Its own model while it uses the shared one.
+    spare: Option<MjModel>,
 }
 
 impl Simulation {
     /// Creates a simulation of `scene` in its default state.
     pub fn new(scene: &Scene) -> Self {
-        Self { data: MjData::new(scene.model.clone()) }
+        Self { data: MjData::new(scene.model.clone()), shared: None, spare: None }
+    }
+
+    /// Goes back to the model of the scene, if it was given another one; the state must be reset after it.
+    pub fn share_model(&mut self) {
+        self.spare = self.take_own_model();
+    }
+
+    /// Returns its own model, if there is one, and uses the model of the scene in its place.
+    pub(super) fn take_own_model(&mut self) -> Option<MjModel> {
+        match self.shared.take() {
+            Some(shared) => Arc::into_inner(self.data.swap_model(shared)),
+            None => self.spare.take(),
+        }
+    }
+
+    /// Uses a model of its own.
+    pub(super) fn set_own_model(&mut self, model: MjModel) {
+        self.shared = Some(self.data.swap_model(Arc::new(model)));
     }
 
     /// Resets to the default state and clears warm start and warnings; call [`Simulation::refresh`] after changing the state.
@@ -106,6 +128,11 @@ impl Simulation {
         self.data.ctrl_mut()
     }
 
+    /// Returns the number of values of a state.
+    pub fn state_size(&self) -> usize {
+        self.data.model().state_size(EVERYTHING)
+    }
+
     /// Returns a copy of the state.
     pub fn state(&self) -> SimulationState {
         SimulationState(self.data.state(EVERYTHING))
@@ -117,7 +144,7 @@ impl Simulation {
     /// # Errors
     /// Fails if the state is of another scene or has diverged.
     pub fn restore(&mut self, numbers: &[f64]) -> Result<()> {
-        let size = self.data.model().state_size(EVERYTHING);
+        let size = self.state_size();
         ensure!(numbers.len() == size, "the state has {} values, but this scene needs {size}", numbers.len());
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
@@ -136,6 +163,11 @@ impl Simulation {
         // XBODY is the frame's origin; BODY would be the centre of mass.
         let [wx, wy, wz, x, y, z] = self.data.object_velocity(MjtObjBase::mjOBJ_XBODY, id, false);
         Velocity { linear: [x, y, z], angular: [wx, wy, wz] }
+    }
+
+    /// Applies a force (N, world frame) to the centre of mass of a body in all steps until it is replaced or the state is reset.
+    pub fn push(&mut self, Body(id): Body, [x, y, z]: [f64; 3]) {
+        self.data.xfrc_applied_mut()[id] = [x, y, z, 0.0, 0.0, 0.0];
     }
 
     /// Sets the pose of a mocap body.
@@ -174,12 +206,18 @@ impl BareSimulation {
         Self { data: MjData::new(scene.model.clone()) }
     }
 
-    /// Starts from the state of a simulation of the same scene.
+    /// Starts from the state of a simulation of `scene`: that of this world, or a variation of it.
     ///
     /// # Panics
-    /// Panics if the state is of another scene.
-    pub fn start(&mut self, state: &SimulationState) {
+    /// Panics if the scene or the state is of another kind.
+    pub fn start(&mut self, state: &SimulationState, scene: &Scene) {
+        self.data.swap_model(scene.model.clone());
         self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
+    }
+
+    /// Applies a force (N, world frame) to the centre of mass of a body in all steps until it is replaced or a state is set.
+    pub fn push(&mut self, Body(id): Body, [x, y, z]: [f64; 3]) {
+        self.data.xfrc_applied_mut()[id] = [x, y, z, 0.0, 0.0, 0.0];
     }
 
     /// Takes `substeps` physics steps with the controls `ctrl`.

@@ -1,14 +1,35 @@
 //! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
 
 use crate::agent::Iteration;
-use crate::env::{Lesson, Recent, Score};
+use crate::env::{EpisodeStats, Lesson, Recent, Score};
 use crate::ppo::UpdateStats;
+
+/// The scores of the episodes that ended in an iteration.
+pub(super) struct Ended {
+    /// Those that were the task as it is.
+    pub nominal: Score,
+    /// Those that were randomised, if the training has such.
+    pub randomized: Option<Score>,
+}
+
+impl Ended {
+    /// Computes the scores of `episodes`, in a training with or `without` randomised ones.
+    pub(super) fn of(episodes: Vec<EpisodeStats>, randomizes: bool) -> Self {
+        let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.into_iter().partition(|episode| episode.randomized);
+        Self { nominal: Score::of(&nominal), randomized: randomizes.then(|| Score::of(&drawn)) }
+    }
+
+    /// Returns the score to show: that of the task as it is, where such episodes ended.
+    pub(super) fn shown(&self) -> &Score {
+        self.randomized.as_ref().filter(|_| self.nominal.episodes == 0).unwrap_or(&self.nominal)
+    }
+}
 
 /// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
 /// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings.
 pub(super) fn row(
     iteration: &Iteration<Lesson>,
-    ended: &Score,
+    ended: &Ended,
     recent: &Recent,
     evaluation: &Score,
 ) -> Vec<(String, f64)> {
@@ -16,7 +37,10 @@ pub(super) fn row(
     let mut put = |group: &str, values: &[(&str, f64)]| {
         row.extend(values.iter().map(|(name, value)| (format!("{group}{name}"), *value)));
     };
-    put("episode/", &ended.named());
+    put("episode/", &ended.nominal.named());
+    if let Some(randomized) = &ended.randomized {
+        put("randomized/", &randomized.named());
+    }
     put("reward/", &recent.reward_named());
     put("training/", &recent.shaping_named());
     put("training/", &iteration.lesson.named());
@@ -27,10 +51,10 @@ pub(super) fn row(
     row
 }
 
-/// Returns the names of the values of any iteration.
-pub(super) fn tags(lesson: Lesson) -> Vec<String> {
+/// Returns the names of the values of any iteration, in a training with or without randomised episodes.
+pub(super) fn tags(lesson: Lesson, randomizes: bool) -> Vec<String> {
     let iteration = Iteration { lesson, update: UpdateStats::default(), steps: 0, collect_s: 0.0, update_s: 0.0 };
-    let empty = row(&iteration, &Score::of(&[]), &Recent::default(), &Score::of(&[]));
+    let empty = row(&iteration, &Ended::of(Vec::new(), randomizes), &Recent::default(), &Score::of(&[]));
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -38,7 +62,7 @@ pub(super) fn tags(lesson: Lesson) -> Vec<String> {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::env::{EpisodeStats, RewardTerms, Shaping};
+    use crate::env::{RewardTerms, Shaping};
 
     /// All logged values are different, so that swapped values are detected.
     #[test]
@@ -69,9 +93,10 @@ mod tests {
             rot_dist_sum: 1.5 * f64::from(length),
             reward,
             dropped: length < 100,
-            diverged: false,
+            ..Default::default()
         };
-        let ended = Score::of(&[episode(reward, 80, 2)]);
+        let other = EpisodeStats { randomized: true, ..episode(RewardTerms::default(), 200, 8) };
+        let ended = |randomizes| Ended::of(vec![episode(reward, 80, 2), other], randomizes);
         let evaluation = Score::of(&[episode(RewardTerms::default(), 1000, 5), episode(reward, 50, 0)]);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
             episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
@@ -81,10 +106,22 @@ mod tests {
             policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \
             value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, \
             time/steps_per_s 2, sim/diverged 28";
-        let found = row(&iteration, &ended, &recent, &evaluation);
-        let found: Vec<String> = found.iter().map(|(name, value)| format!("{name} {value}")).collect();
-        assert_eq!(found.join(", "), expected);
-        let names: Vec<&str> = expected.split(", ").map(|cell| cell.split_once(' ').unwrap().0).collect();
-        assert_eq!(tags(lesson), names);
+        let row = |randomizes| {
+            let row = row(&iteration, &ended(randomizes), &recent, &evaluation);
+            row.iter().map(|(name, value)| format!("{name} {value}")).collect::<Vec<_>>().join(", ")
+        };
+        let names =
+            |row: &str| row.split(", ").map(|cell| cell.split_once(' ').unwrap().0.to_owned()).collect::<Vec<_>>();
+        assert_eq!(row(false), expected);
+        assert_eq!(tags(lesson, false), names(expected));
+        // Randomised episodes are apart, in columns that only such a training has.
+        let apart = "randomized/return 0, randomized/length 200, randomized/goals 8, randomized/in_tolerance 0.25, \
+            randomized/drop_rate 0, randomized/rot_dist 1.5, randomized/steps_per_goal 25, ";
+        let place = expected.find("reward/").unwrap();
+        let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
+        assert_eq!(row(true), expected);
+        assert_eq!(tags(lesson, true), names(&expected));
+        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::of(all, true).shown().goals);
+        assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }
 }

@@ -23,7 +23,7 @@ use crate::ppo::Evaluation;
 use crate::run::{self, Report, Requests, RunFolder, Status, StatusLine};
 use crate::schedule::panic_message;
 use hints::hints;
-use log::{row, tags};
+use log::{Ended, row, tags};
 use saver::Saver;
 use session::Session;
 
@@ -146,13 +146,13 @@ impl Session {
     }
 
     fn report(&mut self, report: &mut Report, (iteration, evaluation): &Made) {
-        let episodes = Score::of(&self.agent.pool.take_finished());
+        let ended = Ended::of(self.agent.pool.take_finished(), randomizes(&self.config));
         let mut recent = Recent::default();
         for env in self.agent.pool.envs_mut() {
             recent += env.take_recent();
         }
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
-        let (goals, drop_rate) = (episodes.goals, episodes.drop_rate);
+        let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
         let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
         self.diverged += recent.diverged;
         let warning = divergence(recent.diverged, recent.steps).or_else(|| evaluation.divergence());
@@ -161,7 +161,7 @@ impl Session {
             self.warned = true;
             report.warn(&warning);
         }
-        report.iteration(self.agent.iteration, &row(iteration, &episodes, &recent, evaluation), &status);
+        report.iteration(self.agent.iteration, &row(iteration, &ended, &recent, evaluation), &status);
     }
 
     /// Prints the total number of diverged steps at the end, if there was a warning.
@@ -192,8 +192,13 @@ fn evaluates(iteration: u64, every: u64) -> bool {
     iteration.is_multiple_of(every) || iteration == EARLY && every > EARLY
 }
 
+/// Returns whether a training has randomised episodes.
+fn randomizes(config: &Config) -> bool {
+    config.randomization.share > 0.0
+}
+
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
-    let tags = tags(Lesson::task(&session.config.env));
+    let tags = tags(Lesson::task(&session.config.env), randomizes(&session.config));
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
     Report::new(saver.folder().path(), &tags, progress)
 }

@@ -18,6 +18,7 @@ mod pace;
 mod pictures;
 mod point_mass;
 mod pool;
+mod randomization;
 mod ranks;
 mod resume;
 mod run_folder;

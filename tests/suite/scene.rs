@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use shadow_repose::env::{Env, Hand, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::sim::{BareSimulation, Physics, Scene, Simulation, Variation};
+use shadow_repose::sim::{BareSimulation, Compilation, Physics, Scene, Simulation};
 
 use crate::support::{SCENE, env_config, started, task};
 
@@ -37,7 +37,7 @@ fn assert_range(found: [f64; 2], expected: [f64; 2]) {
 
 #[test]
 fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
-    let scene = Scene::load(None, Variation::none(0.01)).unwrap();
+    let scene = Scene::load(None, &Compilation::plain(0.01)).unwrap();
     let hand = Hand::bind(&scene).unwrap();
     assert_eq!(scene.controls(), 20);
     for (name, range) in [
@@ -82,7 +82,7 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
         let _ = env.step(&[0.3; 20], &mut observation);
     }
     let mut bare = BareSimulation::new(task.scene());
-    bare.start(&env.simulation().state());
+    bare.start(&env.simulation().state(), task.scene());
     let simulation = env.simulation_mut();
     for step in 0..50 {
         let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();

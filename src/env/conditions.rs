@@ -1,0 +1,82 @@
+//! The conditions of an episode beside the task itself: the physics that it has drawn, forces on the cube, delay and noise.
+
+use std::sync::Arc;
+
+use super::randomization::{Draw, Randomization};
+use super::sensing;
+use super::task::Task;
+use crate::rng::{self, Rng};
+use crate::sim::{Scene, Simulation};
+
+/// The conditions of the current episode of one hand.
+pub(super) struct Conditions {
+    randomization: Option<Arc<Randomization>>,
+    /// What the episode has drawn, if it is randomised.
+    draw: Option<Draw>,
+    /// What is added to the values of every observation of the episode, by index.
+    bias: Vec<(usize, f32)>,
+}
+
+impl Conditions {
+    pub(super) fn new(randomization: Option<&Arc<Randomization>>) -> Self {
+        Self { randomization: randomization.cloned(), draw: None, bias: Vec::new() }
+    }
+
+    /// Returns the scene of the episodes that are not randomised.
+    pub(super) fn nominal<'a>(&'a self, task: &'a Task) -> &'a Scene {
+        self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
+    }
+
+    /// Draws the conditions of the episode of `rng`, and gives the simulation its physics; the state must be reset after it.
+    pub(super) fn begin(&mut self, rng: &Rng, sim: &mut Simulation, task: &Task) {
+        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng));
+        self.bias.clear();
+        self.bias.extend(task.bias.draw(&mut rng::beside(rng, "bias")));
+        match (&self.randomization, &self.draw) {
+            (Some(randomization), Some(draw)) => {
+                randomization.vary(sim, draw, task);
+                self.bias.extend(randomization.draw_bias(draw, rng));
+            }
+            _ => sim.share_model(),
+        }
+    }
+
+    /// Returns what the episode has drawn, if it is randomised.
+    pub(super) fn draw(&self) -> Option<&Draw> {
+        self.draw.as_ref()
+    }
+
+    /// Returns the control steps between an action and its effect.
+    pub(super) fn delay(&self, task: &Task) -> usize {
+        (task.config.action_delay + self.draw.as_ref().map_or(0, |draw| draw.delay)) as usize
+    }
+
+    /// Returns the largest delay of any episode.
+    pub(super) fn most_delay(&self, task: &Task) -> usize {
+        let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.most_delay());
+        (task.config.action_delay + drawn) as usize
+    }
+
+    /// Applies the random force on the cube that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
+    pub(super) fn push(&self, rng: &Rng, step: u32, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+        let force = self.randomization.as_ref()?.push(self.draw.as_ref()?, rng, step)?;
+        sim.push(task.hand.cube.body, force);
+        Some(force)
+    }
+
+    /// Adds to an observation the noise after a number of steps of the episode of `rng`, and the offset of the episode.
+    pub(super) fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
+        let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
+        let spreads = [Some(&task.noise), drawn.and_then(|(randomization, draw)| randomization.noise(draw))];
+        let noises = spreads.into_iter().flatten().filter(|spread| !spread.is_empty());
+        let mut noise_rng = None;
+        for noise in noises {
+            let rng = noise_rng.get_or_insert_with(|| rng::beside_at(rng, "noise", steps));
+            noise.draw(rng).for_each(|(i, added)| observation[i] += added);
+        }
+        if noise_rng.is_some() || !self.bias.is_empty() {
+            self.bias.iter().for_each(|&(i, added)| observation[i] += added);
+            sensing::make_consistent(observation);
+        }
+    }
+}

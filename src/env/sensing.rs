@@ -1,0 +1,119 @@
+//! What a real sensor would add to an observation: white noise, and an offset that stays the same through an episode.
+
+use anyhow::{Result, bail};
+use rand_distr::{Distribution, StandardNormal};
+
+use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, OBSERVATION, RELATIVE_QUAT, TIP_QUAT, TIP_SIZE, TIPS};
+use crate::config::ByGroup;
+use crate::quat::{self, Quat};
+use crate::rng::Rng;
+
+/// The groups that are measured. The others are known exactly, or follow from these.
+const MEASURED: [&str; 7] =
+    ["joint_pos", "joint_vel", "cube_pos", "cube_quat", "cube_linvel", "cube_angvel", "fingertips"];
+
+/// The standard deviation of what is added to each value of an observation: those that are not 0, by index.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Spread(Vec<(usize, f32)>);
+
+impl Spread {
+    /// Spreads the values of groups over the values of an observation.
+    ///
+    /// # Errors
+    /// Fails on the name of a group that does not exist or is not measured.
+    pub(super) fn of(groups: &ByGroup) -> Result<Self> {
+        for name in groups.keys() {
+            if !MEASURED.contains(&name.as_str()) {
+                let known = OBSERVATION.iter().any(|group| group.name == name);
+                let what = if known { "is not measured" } else { "is not a group of the observation" };
+                bail!("`{name}` {what}; those that can have noise are {}", MEASURED.join(", "));
+            }
+        }
+        let of_group = |Group { name, start, length, .. }: Group| {
+            let std = groups.get(name).copied().unwrap_or(0.0) as f32;
+            (start..start + length).map(move |i| (i, std))
+        };
+        Ok(Self(OBSERVATION.into_iter().flat_map(of_group).filter(|&(_, std)| std != 0.0).collect()))
+    }
+
+    /// Returns whether nothing is added to any value.
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Draws what is added: independent normal numbers.
+    pub(super) fn draw<'a>(&'a self, rng: &'a mut Rng) -> impl Iterator<Item = (usize, f32)> + 'a {
+        self.0.iter().map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
+    }
+}
+
+/// Makes an observation consistent after something was added to its values: quaternions have length 1 and their usual sign, and
+/// the orientation relative to the goal follows from that of the cube.
+pub(super) fn make_consistent(observation: &mut [f32]) {
+    let read = |observation: &[f32], at: usize| {
+        let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
+        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        // Noise this close to the negative of a quaternion leaves no orientation.
+        if length > 1e-6 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
+    };
+    let write = |observation: &mut [f32], at: usize, q: Quat| {
+        observation[at..at + 4].iter_mut().zip(q).for_each(|(cell, x)| *cell = x as f32);
+    };
+    let cube = quat::canonical(read(observation, CUBE_QUAT.start));
+    let goal = read(observation, GOAL_QUAT.start);
+    write(observation, CUBE_QUAT.start, cube);
+    write(observation, RELATIVE_QUAT.start, quat::canonical(quat::mul(cube, quat::conj(goal))));
+    for tip in observation[TIPS.start..][..TIPS.length].chunks_exact_mut(TIP_SIZE) {
+        let orientation = read(tip, TIP_QUAT);
+        write(tip, TIP_QUAT, orientation);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::OBSERVATION_SIZE;
+    use super::*;
+    use crate::rng;
+
+    fn spread(groups: &[(&str, f64)]) -> Result<Spread> {
+        Spread::of(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect())
+    }
+
+    #[test]
+    fn noise_has_the_deviation_that_was_asked_in_the_groups_that_were_named_and_nowhere_else() {
+        let spread = spread(&[("joint_pos", 0.5), ("cube_pos", 0.0)]).unwrap();
+        let mut rng = rng::stream(1, "noise", 0);
+        let drawn: Vec<(usize, f32)> = (0..1000).flat_map(|_| spread.draw(&mut rng).collect::<Vec<_>>()).collect();
+        assert!(drawn.len() == 24_000 && drawn.iter().all(|&(i, _)| i < 24));
+        let variance = drawn.iter().map(|&(_, x)| f64::from(x).powi(2)).sum::<f64>() / drawn.len() as f64;
+        assert!((variance.sqrt() - 0.5).abs() < 0.01, "{variance}");
+    }
+
+    #[test]
+    fn groups_that_do_not_exist_or_are_not_measured_are_refused() {
+        for (name, why) in [("joint_positions", "is not a group"), ("goal_quat", "is not measured")] {
+            let error = spread(&[(name, 0.1)]).unwrap_err().to_string();
+            assert!(error.contains(name) && error.contains(why) && error.contains("joint_pos, joint_vel"), "{error}");
+        }
+    }
+
+    #[test]
+    fn quaternions_stay_of_length_one_and_the_relative_one_is_that_of_the_seen_cube() {
+        let mut observation = vec![0.1; OBSERVATION_SIZE];
+        observation[GOAL_QUAT.start..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
+        observation[CUBE_QUAT.start..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
+        for (i, added) in [(CUBE_QUAT.start, -0.4), (TIPS.start + TIP_QUAT, 3.0), (3, 0.25)] {
+            observation[i] += added;
+        }
+        make_consistent(&mut observation);
+        let part = |at: usize| [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
+        let cube = part(CUBE_QUAT.start);
+        assert!(cube[0] > 0.0 && cube[1] < 0.0, "{cube:?}");
+        for at in [CUBE_QUAT.start, RELATIVE_QUAT.start, TIPS.start + TIP_QUAT, TIPS.start + TIP_SIZE + TIP_QUAT] {
+            assert!((part(at).iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-6);
+        }
+        let relative = quat::canonical(quat::mul(cube, quat::conj([0.0, 1.0, 0.0, 0.0])));
+        assert!(part(RELATIVE_QUAT.start).iter().zip(relative).all(|(a, b)| (a - b).abs() < 1e-6));
+        assert_eq!((observation[3], observation[4]), (0.35, 0.1));
+    }
+}

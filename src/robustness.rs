@@ -1,0 +1,255 @@
+//! How a policy fares on hands and cubes that it was not made for: its score under one change of the physics, of what it observes or
+//! of when its actions take effect at a time, as a table, JSON and a picture.
+
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use serde_json::{Map, Value, json};
+
+use crate::cli::PlayArgs;
+use crate::config::{EnvConfig, Override};
+use crate::env::{Score, Task};
+use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::load::Loaded;
+use crate::run::{self, Bar, BarChart, HeatMap, OutputFile, Picture, Requests};
+
+/// Single changes: the start of the name of a row, the setting, and its values.
+const CHANGES: [(&str, &str, &[&str]); 8] = [
+    ("friction", FRICTION, &["0.5", "0.7", "1.3"]),
+    ("cube mass", MASS, &["0.5", "2.0"]),
+    ("gains", "env.gains_scale", &["0.75", "1.5"]),
+    ("damping", "env.damping_scale", &["0.3", "3.0"]),
+    ("delay", "env.action_delay", &["1", "2", "3"]),
+    ("noise", "env.noise", &[NOISE, TWICE_THE_NOISE]),
+    ("sim_dt", "env.sim_dt", &["0.005", "0.002"]),
+    ("cone", "env.cone", &["\"elliptic\""]),
+];
+
+const FRICTION: &str = "env.friction_scale";
+const MASS: &str = "env.cube_mass_scale";
+const NOISE: &str = "{ joint_pos = 0.01, joint_vel = 0.02, cube_pos = 0.002, cube_quat = 0.02, fingertips = 0.002 }";
+const TWICE_THE_NOISE: &str =
+    "{ joint_pos = 0.02, joint_vel = 0.04, cube_pos = 0.004, cube_quat = 0.04, fingertips = 0.004 }";
+
+/// The values of friction and mass that are combined.
+const GRID: [[&str; 4]; 2] = [["0.5", "0.7", "1.0", "1.3"], ["0.5", "1.0", "2.0", ""]];
+
+/// A row of the table: what is changed.
+#[derive(Clone, Debug, PartialEq)]
+struct Condition {
+    name: String,
+    sets: Vec<Override>,
+    /// Its friction and mass, if it belongs to the grid.
+    cell: Option<[&'static str; 2]>,
+}
+
+/// A row of the table with its score.
+struct Row {
+    condition: Condition,
+    config: EnvConfig,
+    score: Score,
+    /// The goals as a fraction of those without any change.
+    kept: f64,
+}
+
+/// Plays the policy under each condition and prints the table. If interrupted, prints the rows so far.
+///
+/// # Errors
+/// Fails if a setting does not fit the policy's task, if an episode panics, or if the picture cannot be written.
+pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
+    let output = args.out.as_deref().map(OutputFile::create).transpose()?;
+    let config = |condition: &Condition| {
+        let sets = [&args.set[..], &condition.sets].concat();
+        loaded.config_with(&sets).with_context(|| format!("row `{}`", condition.name))
+    };
+    let conditions = conditions();
+    let configs: Vec<EnvConfig> = conditions.iter().map(config).collect::<Result<_>>()?;
+    // Found out now rather than after minutes.
+    let tasks: Vec<Arc<Task>> = configs.iter().map(Task::new).collect::<Result<_>>()?;
+    let count = args.episodes.unwrap_or(256) as usize;
+    let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
+    requests.wait_for_end();
+    let bar = Bar::new((different * count) as u64, "episodes", "robustness");
+    let mut rows: Vec<Row> = Vec::new();
+    for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
+        let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
+        bar.say(condition.name.clone());
+        let Some(score) =
+            known.map_or_else(|| score(&task, actor, args.seed, count, requests, &bar), |known| Ok(Some(known)))?
+        else {
+            break;
+        };
+        if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
+            run::say(&format!("warning: {}: {warning}", condition.name));
+        }
+        let kept = score.goals / rows.first().map_or(score.goals, |nominal| nominal.score.goals);
+        rows.push(Row { condition, config, score, kept });
+    }
+    drop(bar);
+    let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
+    if args.json {
+        run::print(&format!("{}\n", as_json(&rows, count, args.seed, &loaded.origin.to_string())))?;
+    } else {
+        run::print(&table(&rows, count, args.seed, &loaded.origin.to_string()))?;
+    }
+    match output {
+        Some(output) if interrupted => run::say(&format!("{}: interrupted, not written", output.path().display())),
+        Some(output) => picture(&rows, count, &loaded.origin.to_string()).write(output)?,
+        None => {}
+    }
+    Ok(if interrupted { requests.exit_code() } else { ExitCode::SUCCESS })
+}
+
+/// Plays the episodes of a row; returns `None` if interrupted.
+fn score(
+    task: &Arc<Task>,
+    actor: &Actor,
+    seed: u64,
+    count: usize,
+    requests: &Requests,
+    bar: &Bar,
+) -> Result<Option<Score>> {
+    let episodes = Episodes { seed, purpose: "score", first: 0, count };
+    let played = evaluate(task, actor, episodes, requests.stop(), &mut |moment| {
+        if moment.step.is_some_and(|(_, end)| end.is_some()) {
+            bar.count();
+        }
+        Ok(())
+    })?;
+    Ok(played.map(|played| Score::of(&played)))
+}
+
+/// Returns all rows: the task itself, the single changes, and the grid.
+fn conditions() -> Vec<Condition> {
+    let set = |key: &str, value: &str| Override { key: key.into(), value: value.into() };
+    let mut conditions = vec![Condition { name: "nominal".into(), sets: Vec::new(), cell: None }];
+    for (name, key, values) in CHANGES {
+        for value in values {
+            let name = match *value {
+                NOISE => "noise".to_owned(),
+                TWICE_THE_NOISE => "twice the noise".to_owned(),
+                value => format!("{name} {}", value.trim_matches('"')),
+            };
+            conditions.push(Condition { name, sets: vec![set(key, value)], cell: None });
+        }
+    }
+    let [frictions, masses] = GRID.map(|values| values.into_iter().filter(|value| !value.is_empty()));
+    for friction in frictions {
+        for mass in masses.clone() {
+            let name = format!("friction {friction}, cube mass {mass}");
+            let sets = vec![set(FRICTION, friction), set(MASS, mass)];
+            conditions.push(Condition { name, sets, cell: Some([friction, mass]) });
+        }
+    }
+    conditions
+}
+
+/// Returns the mean of what is kept over the single changes, each counted as at most 1.
+fn mean_kept(rows: &[Row]) -> f64 {
+    let single = rows.iter().skip(1).filter(|row| row.condition.cell.is_none());
+    let kept: Vec<f64> = single.map(|row| row.kept.min(1.0)).collect();
+    kept.iter().sum::<f64>() / kept.len() as f64
+}
+
+fn as_json(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> Value {
+    let of_row = |row: &Row| {
+        let value = |set: &Override| {
+            let table: toml::Table = format!("value = {}", set.value).parse().expect("the values are TOML");
+            (set.key.clone(), json!(table["value"]))
+        };
+        json!({
+            "name": row.condition.name,
+            "set": Map::from_iter(row.condition.sets.iter().map(value)),
+            "goals_per_episode": row.score.goals,
+            "goals_ci95": row.score.goals_ci95,
+            "drop_rate": row.score.drop_rate,
+            "kept": row.kept,
+        })
+    };
+    let list: Vec<Value> = rows.iter().map(of_row).collect();
+    json!({
+        "episodes": episodes, "seed": seed, "checkpoint": checkpoint, "rows": list, "mean_kept": mean_kept(rows),
+    })
+}
+
+fn number(value: f64, decimals: usize) -> String {
+    if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") }
+}
+
+fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
+    let mut text = format!("checkpoint {checkpoint}\n{episodes} episodes a row, seed {seed}\n\n");
+    text += &format!("{:<30} {:>5}  {:<15} {:>7} {:>6}\n", "", "goals", "95 % interval", "drops", "kept");
+    for Row { condition, score, kept, .. } in rows {
+        let [low, high] = score.goals_ci95.map(|goals| number(goals, 2));
+        let drops = format!("{:.1} %", 100.0 * score.drop_rate);
+        let (goals, kept) = (number(score.goals, 2), number(*kept, 2));
+        text += &format!("{:<30} {goals:>5}  {:<15} {drops:>7} {kept:>6}\n", condition.name, format!("{low} … {high}"));
+    }
+    text + &format!("\nkept on average over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
+}
+
+fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
+    let bars = rows.iter().filter(|row| row.condition.cell.is_none()).map(|row| {
+        let nominal = rows[0].score.goals;
+        let note = format!("{:.2} goals, {:.0} % drops", row.score.goals, 100.0 * row.score.drop_rate);
+        let interval = row.score.goals_ci95.map(|goals| goals / nominal);
+        run::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
+    });
+    let [frictions, masses] =
+        GRID.map(|values| values.into_iter().filter(|value| !value.is_empty()).collect::<Vec<_>>());
+    let kept = |friction: &str, mass: &str| {
+        let cell = rows.iter().find(|row| row.condition.cell.is_some_and(|[f, m]| [f, m] == [friction, mass]));
+        cell.map_or(f64::NAN, |row| row.kept)
+    };
+    let cells = masses.iter().map(|mass| frictions.iter().map(|friction| kept(friction, mass)).collect()).collect();
+    let named = |name: &str, values: &[&str]| values.iter().map(|value| format!("{name} {value}")).collect();
+    BarChart {
+        title: format!("Goals kept under a change: {checkpoint}, {episodes} episodes a row"),
+        bars: bars.collect(),
+        map: HeatMap { columns: named("friction", &frictions), rows: named("mass", &masses), cells },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::env::EpisodeStats;
+
+    fn row(condition: Condition, goals: u32, kept: f64) -> Row {
+        let config = Config::resolve(None, &condition.sets).unwrap().env;
+        let episode = EpisodeStats { length: 10, goals, ..Default::default() };
+        Row { condition, config, score: Score::of(&[episode, episode]), kept }
+    }
+
+    #[test]
+    fn the_rows_are_those_that_are_published_and_each_changes_the_task() {
+        let conditions = conditions();
+        let names: Vec<&str> = conditions[..18].iter().map(|condition| condition.name.as_str()).collect();
+        let expected = "nominal, friction 0.5, friction 0.7, friction 1.3, cube mass 0.5, cube mass 2.0, gains 0.75, gains 1.5, \
+                        damping 0.3, damping 3.0, delay 1, delay 2, delay 3, noise, twice the noise, sim_dt 0.005, \
+                        sim_dt 0.002, cone elliptic";
+        assert_eq!(names.join(", "), expected);
+        assert_eq!(conditions.len(), 18 + 12);
+        let nominal = Config::resolve(None, &[]).unwrap();
+        for condition in &conditions[1..18] {
+            assert_ne!(Config::resolve(None, &condition.sets).unwrap(), nominal, "{}", condition.name);
+        }
+    }
+
+    #[test]
+    fn what_is_kept_is_averaged_over_the_single_changes_and_never_more_than_all() {
+        let conditions = conditions();
+        let kept = [1.0, 0.5, 1.2, f64::NAN];
+        let mut rows: Vec<Row> = conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
+        rows.push(row(conditions[20].clone(), 2, 0.1));
+        assert_eq!(mean_kept(&rows), 0.75);
+        let value = as_json(&rows, 2, 3, "x");
+        assert_eq!(value["rows"][1]["set"], json!({ "env.friction_scale": 0.5 }));
+        assert_eq!(value["rows"][2]["kept"], 1.2);
+        let keys: Vec<&str> = value["rows"][0].as_object().unwrap().keys().map(String::as_str).collect();
+        assert_eq!(keys, ["name", "set", "goals_per_episode", "goals_ci95", "drop_rate", "kept"]);
+        assert!(table(&rows, 2, 3, "x").lines().any(|line| line.starts_with("friction 0.5") && line.ends_with("0.50")));
+    }
+}

@@ -1,0 +1,148 @@
+//! A chart of values by name, with a map of values over two quantities below it.
+
+use anyhow::{Result, anyhow};
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+use super::chart::{COLOURS, GRID, Picture};
+
+/// A value with its name, its interval and a note.
+pub struct NamedBar {
+    /// The name, to the left.
+    pub name: String,
+    /// The value; `NaN` if it is not known.
+    pub value: f64,
+    /// The interval in which it lies.
+    pub interval: [f64; 2],
+    /// The note, to the right.
+    pub note: String,
+}
+
+/// Values over two quantities.
+pub struct HeatMap {
+    /// The names of the columns.
+    pub columns: Vec<String>,
+    /// The names of the rows.
+    pub rows: Vec<String>,
+    /// The values, from 0 to about 1, row by row.
+    pub cells: Vec<Vec<f64>>,
+}
+
+/// Bars from 0 to about 1, and a map.
+pub struct BarChart {
+    /// The title.
+    pub title: String,
+    /// The bars, from top to bottom.
+    pub bars: Vec<NamedBar>,
+    /// The map.
+    pub map: HeatMap,
+}
+
+// Lengths in pixels.
+const WIDTH: i32 = 800;
+const TITLE: i32 = 40;
+const ROW: i32 = 24;
+const NAMES: i32 = 150;
+const NOTES: i32 = 190;
+const CELL: i32 = 34;
+const GAP: i32 = 24;
+
+/// The value at the right end of the bars' axis.
+const MOST: f64 = 1.25;
+
+/// The values at which there is a line.
+const LINES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
+
+const BAR: RGBColor = COLOURS[0];
+
+impl Picture for BarChart {
+    fn size(&self) -> [u32; 2] {
+        let map = GAP + CELL * (1 + self.map.rows.len() as i32);
+        [WIDTH as u32, (TITLE + ROW * (1 + self.bars.len() as i32) + map + GAP) as u32]
+    }
+
+    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+        let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
+        area.fill(&WHITE).map_err(failed)?;
+        let text = |content: &str, at: (i32, i32), across: HPos, size: i32, colour: RGBColor| {
+            let style = ("sans-serif", size).into_font().color(&colour).pos(Pos::new(across, VPos::Center));
+            area.draw(&Text::new(content.to_owned(), at, style)).map_err(failed)
+        };
+        let x = |value: f64| NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32;
+        let bottom = TITLE + ROW * self.bars.len() as i32;
+        text(&self.title, (WIDTH / 2, TITLE / 2), HPos::Center, 16, BLACK)?;
+        for value in LINES {
+            let line = PathElement::new([(x(value), TITLE), (x(value), bottom)], GRID);
+            area.draw(&line).map_err(failed)?;
+            text(&format!("{value}"), (x(value), bottom + ROW / 2), HPos::Center, 12, BLACK)?;
+        }
+        for (i, bar) in self.bars.iter().enumerate() {
+            let middle = TITLE + ROW * i as i32 + ROW / 2;
+            text(&bar.name, (NAMES - 8, middle), HPos::Right, 13, BLACK)?;
+            text(&bar.note, (WIDTH - NOTES + 8, middle), HPos::Left, 12, BLACK)?;
+            let corners = [(x(0.0), middle - 7), (x(bar.value), middle + 7)];
+            area.draw(&Rectangle::new(corners, BAR.filled())).map_err(failed)?;
+            let whisker = PathElement::new(bar.interval.map(|value| (x(value), middle)).to_vec(), BLACK);
+            area.draw(&whisker).map_err(failed)?;
+        }
+        let top = bottom + ROW + GAP;
+        let columns = self.map.columns.len() as i32;
+        let width = (WIDTH - NAMES - NOTES) / columns.max(1);
+        for (i, name) in self.map.columns.iter().enumerate() {
+            text(name, (NAMES + width * i as i32 + width / 2, top + CELL / 2), HPos::Center, 13, BLACK)?;
+        }
+        for (i, (name, cells)) in self.map.rows.iter().zip(&self.map.cells).enumerate() {
+            let upper = top + CELL * (1 + i as i32);
+            text(name, (NAMES - 8, upper + CELL / 2), HPos::Right, 13, BLACK)?;
+            for (j, &value) in cells.iter().enumerate() {
+                let left = NAMES + width * j as i32;
+                let share = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
+                let corners = [(left, upper), (left + width - 2, upper + CELL - 2)];
+                area.draw(&Rectangle::new(corners, blended(share).filled())).map_err(failed)?;
+                let colour = if share > 0.6 { WHITE } else { BLACK };
+                let known = if value.is_nan() { "-".to_owned() } else { format!("{value:.2}") };
+                text(&known, (left + width / 2, upper + CELL / 2), HPos::Center, 13, colour)?;
+            }
+        }
+        area.present().map_err(failed)
+    }
+}
+
+/// Returns the colour for a value from 0 (grey) to 1 (that of the bars).
+fn blended(share: f64) -> RGBColor {
+    let mix = |from: u8, to: u8| (f64::from(from) * (1.0 - share) + f64::from(to) * share) as u8;
+    RGBColor(mix(240, BAR.0), mix(240, BAR.1), mix(240, BAR.2))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::OutputFile;
+    use super::*;
+
+    #[test]
+    fn a_bar_is_as_long_as_its_value_and_unknown_ones_are_drawn_too() {
+        let bar = |name: &str, value: f64| NamedBar {
+            name: name.into(),
+            value,
+            interval: [value - 0.1, value + 0.1],
+            note: "some".into(),
+        };
+        let map = HeatMap { columns: vec!["a".into()], rows: vec!["b".into()], cells: vec![vec![0.5]] };
+        let bars = vec![bar("whole", 1.0), bar("half", 0.5), bar("unknown", f64::NAN)];
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("bars.svg");
+        BarChart { title: "title".into(), bars, map }.write(OutputFile::create(&path).unwrap()).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        let colour = format!("fill=\"#{:02X}{:02X}{:02X}\"", BAR.0, BAR.1, BAR.2);
+        let width =
+            |line: &str| line.split("width=\"").nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();
+        let widths: Vec<f64> =
+            svg.lines().filter(|line| line.starts_with("<rect") && line.contains(&colour)).map(width).collect();
+        assert_eq!(widths.len(), 3, "{svg}");
+        assert!((widths[0] - 2.0 * widths[1]).abs() <= 2.0 && widths[2] <= 1.0, "{widths:?}");
+        for text in ["whole", "unknown", "0.50", "title"] {
+            assert!(svg.contains(text), "{text}");
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! How a scene is compiled: what MuJoCo cannot change in a compiled model, and the options.
+
+use std::path::Path;
+
+use anyhow::{Result, anyhow, bail, ensure};
+use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
+use mujoco_rs::wrappers::mj_editing::MjsBody;
+
+/// The scene built into the program.
+pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
+
+/// The shape of friction cones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cone {
+    /// Four-sided pyramids inside the cones: faster.
+    Pyramidal,
+    /// The cones themselves.
+    Elliptic,
+}
+
+/// How a scene is compiled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Compilation {
+    /// The physics timestep, s.
+    pub timestep: f64,
+    /// The friction cones, if not those of the scene.
+    pub cone: Option<Cone>,
+    /// The name of the body that `size` and `shifts` are about.
+    pub object: &'static str,
+    /// The factor on the lengths of the object: its shapes, and the places of what is attached to it. Its mass stays the same.
+    pub size: f64,
+    /// Whether the object's centre of mass may later be shifted. MuJoCo has a shortcut for bodies whose centre of mass is the
+    /// origin of their frame; without it, results differ in rounding.
+    pub shifts: bool,
+}
+
+impl Compilation {
+    /// Returns the compilation that keeps all of a scene but its timestep in s.
+    pub fn plain(timestep: f64) -> Self {
+        Self { timestep, cone: None, object: "", size: 1.0, shifts: false }
+    }
+
+    /// Compiles the built-in scene (`None`) or a user's file.
+    ///
+    /// # Errors
+    /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
+    pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
+        let origin = origin(file);
+        let refused = |error: &dyn std::fmt::Display| anyhow!("{origin}: MuJoCo refuses this scene: {error}");
+        if let Some(path) = file {
+            ensure!(
+                path.is_file(),
+                "{}: env.model must name a MuJoCo scene, but there is no such file",
+                path.display()
+            );
+        }
+        if self.size == 1.0 && !self.shifts {
+            let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
+            return model.map_err(|error| refused(&error));
+        }
+        let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
+        let mut spec = spec.map_err(|error| refused(&error))?;
+        self.edit(&mut spec).map_err(|error| anyhow!("{origin}: {error}"))?;
+        spec.compile().map_err(|error| refused(&error))
+    }
+
+    /// Resizes the object of a scene that is about to be compiled.
+    ///
+    /// # Errors
+    /// Fails if there is no such body, or if it has a mesh.
+    pub(super) fn edit(&self, spec: &mut MjSpec) -> Result<()> {
+        if self.size == 1.0 && !self.shifts {
+            return Ok(());
+        }
+        let name = self.object;
+        let body = spec.body_mut(name).ok_or_else(|| anyhow!("has no body `{name}`"))?;
+        body.set_simple(!self.shifts);
+        if self.size != 1.0 {
+            resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Sets the options of a compiled scene.
+    pub(super) fn set_options(&self, model: &mut MjModel) {
+        model.opt_mut().timestep = self.timestep;
+        match self.cone {
+            None => {}
+            Some(Cone::Pyramidal) => model.opt_mut().cone = MjtCone::mjCONE_PYRAMIDAL as i32,
+            Some(Cone::Elliptic) => model.opt_mut().cone = MjtCone::mjCONE_ELLIPTIC as i32,
+        }
+    }
+}
+
+/// Returns the name of a scene's file, for messages.
+pub(super) fn origin(file: Option<&Path>) -> String {
+    file.map_or("the built-in scene".into(), |path| path.display().to_string())
+}
+
+/// Multiplies the lengths of a body and its descendants by `factor` and leaves their masses as they are.
+fn resize(body: &mut MjsBody, factor: f64) -> Result<()> {
+    let scale = |lengths: &mut [f64], by: f64| lengths.iter_mut().for_each(|x| *x *= by);
+    // Values that a scene does not give are NaN and stay so.
+    scale(body.ipos_mut(), factor);
+    scale(body.inertia_mut(), factor * factor);
+    scale(body.fullinertia_mut(), factor * factor);
+    for geom in body.geom_iter_mut(false) {
+        let kind = geom.type_();
+        if matches!(kind, MjtGeomBase::mjGEOM_MESH | MjtGeomBase::mjGEOM_SDF | MjtGeomBase::mjGEOM_HFIELD) {
+            bail!("has a mesh, whose size cannot be set here; scale the mesh in the scene");
+        }
+        scale(geom.pos_mut(), factor);
+        scale(geom.size_mut(), factor);
+        scale(geom.fromto_mut(), factor);
+        geom.set_density(geom.density() / factor.powi(3));
+    }
+    body.site_iter_mut(false).for_each(|site| scale(site.pos_mut(), factor));
+    body.joint_iter_mut(false).for_each(|joint| scale(joint.pos_mut(), factor));
+    for child in body.body_iter_mut() {
+        scale(child.pos_mut(), factor);
+        resize(child, factor)?;
+    }
+    Ok(())
+}

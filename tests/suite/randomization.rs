@@ -1,0 +1,390 @@
+//! Varied physics, noise and delays: as settings of the task, and drawn anew for each episode of a training.
+
+use std::fs;
+use std::io::Read;
+use std::path::Path;
+use std::process::Stdio;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+use shadow_repose::config::Config;
+use shadow_repose::env::{Draw, Env, EnvState, OBSERVATION_SIZE, Randomization, Repose, Resumable, Score, Task};
+use shadow_repose::evaluate::{Actor, Episodes, evaluate};
+use shadow_repose::load::Loaded;
+use shadow_repose::rng;
+
+use crate::support::{SCENE, config, metrics, program, started, stderr, succeeded, task, train, weights};
+use crate::survival::send;
+
+/// The settings of configs/randomization-all.toml.
+const ALL: &str = include_str!("../../configs/randomization-all.toml");
+
+/// Multiplies the numbers in all attributes `name` of a scene.
+fn scaled(scene: &str, name: &str, factor: f64) -> String {
+    let start = format!(" {name}=\"");
+    let mut parts = scene.split(&start);
+    let mut text = parts.next().unwrap().to_owned();
+    for part in parts {
+        let (numbers, rest) = part.split_once('"').unwrap();
+        let numbers: Vec<String> =
+            numbers.split(' ').map(|x| (factor * x.parse::<f64>().unwrap()).to_string()).collect();
+        text += &format!("{start}{}\"{rest}", numbers.join(" "));
+    }
+    assert!(text != scene, "{name}");
+    text
+}
+
+/// Returns all joint positions after a second of a swinging hand.
+fn after_a_second(settings: &[&str]) -> Vec<f64> {
+    let task = task(settings);
+    let (mut env, mut observation) = started(&task);
+    for step in 0..100 {
+        let _ = env.step(&[0.3 * (step as f32 / 15.0).sin(); 20], &mut observation);
+    }
+    env.simulation().qpos().to_vec()
+}
+
+#[test]
+fn each_quantity_is_varied_as_if_the_scene_said_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let unchanged = after_a_second(&[]);
+    let (before, of_cube) = SCENE.split_once("<body name=\"cube\"").unwrap();
+    let (cube, after) = of_cube.split_once("</body>").unwrap();
+    let cube_of = |cube: String| format!("{before}<body name=\"cube\"{cube}</body>{after}");
+    let larger = cube_of(
+        scaled(&scaled(cube, "size", 1.25), "pos", 1.25).replace("pos=\"0.4125 0 0.36875\"", "pos=\".33 0 .295\""),
+    );
+    let hand = format!("{}<body name=\"cube\"{of_cube}", scaled(&scaled(before, "mass", 1.5), "diaginertia", 1.5));
+    let inertia =
+        "inertial pos=\".004 -.002 .003\" mass=\".028\" diaginertia=\".00001166667 .00001166667 .00001166667\"";
+    let joint = "<freejoint name=\"cube\"/>";
+    let shifted = cube_of(cube.replace(joint, &format!("{joint}<{inertia}/>")));
+    let option = "<option timestep=\"0.01\"";
+    let falling = SCENE.replace(option, "<option gravity=\"0.5 -0.25 -8.81\" timestep=\"0.01\"");
+    for (setting, scene) in [
+        ("env.gains_scale=1.5", scaled(SCENE, "kp", 1.5)),
+        ("env.damping_scale=0.3", scaled(SCENE, "damping", 0.3)),
+        ("env.frictionloss_scale=3", scaled(SCENE, "frictionloss", 3.0)),
+        ("env.hand_mass_scale=1.5", hand),
+        ("env.cube_size_scale=1.25", larger),
+        ("env.cube_com=[0.004,-0.002,0.003]", shifted),
+        ("env.gravity=[0.5,-0.25,1]", falling),
+        ("env.cone=elliptic", SCENE.replace("cone=\"pyramidal\"", "cone=\"elliptic\"")),
+    ] {
+        let path = folder.path().join("scene.xml");
+        fs::write(&path, scene).unwrap();
+        let (set, said) = (after_a_second(&[setting]), after_a_second(&[&format!("env.model={}", path.display())]));
+        assert!(apart(&set, &said) < 1e-4, "{setting}: {}", apart(&set, &said));
+        assert!(apart(&set, &unchanged) > 1e-4, "{setting} changes nothing");
+    }
+}
+
+#[test]
+fn an_action_takes_effect_after_the_delay() {
+    let controls = |delay: u32| {
+        let task = task(&[&format!("env.action_delay={delay}")]);
+        let (mut env, mut observation) = started(&task);
+        let mut sent = vec![env.simulation().ctrl().to_vec()];
+        for step in 0..12 {
+            let _ = env.step(&[0.1 * step as f32; 20], &mut observation);
+            sent.push(env.simulation().ctrl().to_vec());
+        }
+        sent
+    };
+    let (now, later) = (controls(0), controls(3));
+    assert!(later[..4].iter().all(|ctrl| ctrl == &now[0]), "nothing moves at first");
+    assert_eq!(later[3..], now[..10]);
+}
+
+#[test]
+fn noise_and_bias_are_seen_but_the_hand_is_where_it_is() {
+    let seen = |settings: &[&str]| {
+        let task = task(settings);
+        let (mut env, mut observation) = started(&task);
+        let mut seen = Vec::new();
+        for _ in 0..200 {
+            let _ = env.step(&[0.1; 20], &mut observation);
+            let joints = task.hand().joints;
+            let off = |i: usize| f64::from(observation[i]) - env.simulation().qpos()[joints[i].qpos];
+            seen.push((off(0), observation[30], env.simulation().qpos().to_vec()));
+        }
+        seen
+    };
+    let spread = |of: &[(f64, f32, Vec<f64>)]| {
+        let mean = of.iter().map(|(off, ..)| off).sum::<f64>() / of.len() as f64;
+        (mean, (of.iter().map(|(off, ..)| (off - mean).powi(2)).sum::<f64>() / of.len() as f64).sqrt())
+    };
+    let (exact, noisy) = (seen(&[]), seen(&["env.noise={joint_pos=0.05}"]));
+    let biased = seen(&["env.bias.joint_pos=0.05"]);
+    assert!(exact.iter().all(|(off, ..)| off.abs() < 1e-6));
+    let ((noise_mean, noise), (bias, bias_spread)) = (spread(&noisy), spread(&biased));
+    assert!((0.04..0.06).contains(&noise) && noise_mean.abs() < 0.015, "{noise_mean} ± {noise}");
+    assert!(bias.abs() > 1e-4 && bias_spread < 1e-6, "{bias} ± {bias_spread}");
+    for other in [noisy, biased] {
+        assert!(other.iter().zip(&exact).all(|(a, b)| a.1 == b.1 && a.2 == b.2), "other groups and the physics");
+    }
+}
+
+/// Returns an environment in which all is randomised, and the draws of episodes.
+fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<Draw>) {
+    let mut config = Config::from_text(Path::new("all.toml"), ALL, &[]).unwrap();
+    let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
+    config = config.changed(None, &sets).unwrap();
+    let task = task(&[]);
+    let randomization = Randomization::new(&task, &config.randomization).unwrap();
+    let env = Repose::randomized(&task, randomization.as_ref());
+    let draw = move |episode| {
+        randomization.as_ref().and_then(|randomization| randomization.draw(&rng::stream(0, "episode", episode)))
+    };
+    (env, draw)
+}
+
+#[test]
+fn draws_fill_their_ranges_in_the_share_of_the_episodes_that_was_asked() {
+    let (_, draw) = randomized(&["randomization.share=0.75"]);
+    let draws: Vec<Draw> = (0..4000).filter_map(draw).collect();
+    assert!((2900..3100).contains(&draws.len()), "{}", draws.len());
+    let check = |name: &str, values: Vec<f64>, [low, high]: [f64; 2], middle: f64| {
+        let (least, most) = values.iter().fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(*x), b.max(*x)));
+        let near = 0.02 * (high - low);
+        assert!(least >= low && least < low + near && most <= high && most > high - near, "{name}: {least} to {most}");
+        let below = values.iter().filter(|x| **x < middle).count() as f64 / values.len() as f64;
+        assert!((below - 0.5).abs() < 0.05, "{name}: {below} below {middle}");
+    };
+    let of = |value: &dyn Fn(&Draw) -> f64| draws.iter().map(value).collect::<Vec<f64>>();
+    check("friction", of(&|draw| draw.friction), [0.7, 1.3], 1.0);
+    check("cube_mass", of(&|draw| draw.cube_mass), [0.5, 1.5], 1.0);
+    check("cube_com", of(&|draw| draw.cube_com[1]), [-0.003, 0.003], 0.0);
+    // Uniform in the logarithm: as often below the geometric mean as above it.
+    check("gains", of(&|draw| draw.gains[7]), [0.75, 1.5], 1.125_f64.sqrt());
+    check("damping", of(&|draw| draw.damping[20]), [0.3, 3.0], 0.9_f64.sqrt());
+    let sizes: std::collections::BTreeSet<u64> = draws.iter().map(|draw| (1000.0 * draw.cube_size) as u64).collect();
+    assert_eq!(sizes.into_iter().collect::<Vec<_>>(), [950, 975, 1000, 1025, 1050]);
+    let delays = [0, 1, 2, 3].map(|delay| draws.iter().filter(|draw| draw.delay == delay).count());
+    assert!(delays.iter().all(|count| (600..900).contains(count)), "{delays:?}");
+    let alike = draws.iter().filter(|draw| draw.damping.iter().all(|factor| *factor == draw.damping[0])).count();
+    assert!((0.45..0.55).contains(&(alike as f64 / draws.len() as f64)), "one factor for all joints: {alike}");
+    let gravity = (draws.iter().map(|draw| draw.gravity[2].powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
+    assert!((gravity - 0.4).abs() < 0.02, "{gravity}");
+}
+
+#[test]
+fn one_setting_does_not_change_what_is_drawn_for_another() {
+    let [(_, draw), (_, other)] =
+        [&[][..], &["randomization.friction=[1,1]", "randomization.delay=[0,1]"]].map(randomized);
+    for episode in 0..20 {
+        let (draw, other) = (draw(episode).unwrap(), other(episode).unwrap());
+        assert_eq!((draw.cube_mass, &draw.damping, draw.gravity), (other.cube_mass, &other.damping, other.gravity));
+        assert_eq!(other.friction, 1.0);
+    }
+    let (_, few) = randomized(&["randomization.each=0.25"]);
+    let varied =
+        |draw: Draw| u32::from(draw.friction != 1.0) + u32::from(draw.damping[0] != 1.0) + u32::from(draw.noise);
+    let mean = (0..2000).map(|episode| varied(few(episode).unwrap())).sum::<u32>() as f64 / 2000.0;
+    assert!((mean - 0.75).abs() < 0.1, "{mean} of three are varied");
+}
+
+/// Plays some steps of an episode and returns the last observation.
+fn played(env: &mut Repose, episode: u64) -> Vec<f32> {
+    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    env.reset(rng::stream(0, "episode", episode), &mut observation);
+    for step in 0..30 {
+        let _ = env.step(&[0.2 * (step as f32 / 4.0).sin(); 20], &mut observation);
+    }
+    observation
+}
+
+#[test]
+fn nothing_of_an_episode_stays_in_the_next() {
+    let (mut used, _) = randomized(&["randomization.share=0.7"]);
+    for episode in 0..12 {
+        let (mut fresh, draw) = randomized(&["randomization.share=0.7"]);
+        assert_eq!(played(&mut used, episode), played(&mut fresh, episode), "episode {episode}");
+        assert_eq!(used.draw(), draw(episode).as_ref());
+    }
+    // An episode that draws nothing is the task, bit for bit. Without shifts of the centre of mass, which MuJoCo computes otherwise.
+    let (mut env, draw) = randomized(&["randomization.share=0.5", "randomization.cube_com=0"]);
+    let mut plain = Repose::new(&task(&[]));
+    let nominal = (0..20).filter(|episode| draw(*episode).is_none()).collect::<Vec<u64>>();
+    assert!(nominal.len() > 4);
+    nominal.into_iter().for_each(|episode| assert_eq!(played(&mut env, episode), played(&mut plain, episode)));
+}
+
+#[test]
+fn a_saved_environment_goes_on_with_its_draw_its_noise_and_the_actions_under_way() {
+    let (mut env, _) = randomized(&[]);
+    for episode in 0..4 {
+        played(&mut env, episode);
+        let mut state = EnvState::default();
+        env.save(&mut state);
+        let (mut other, _) = randomized(&[]);
+        let [mut expected, mut found] = [vec![0.0; OBSERVATION_SIZE], vec![0.0; OBSERVATION_SIZE]];
+        let mut rows = state.rows(1).unwrap();
+        other.restore(&mut rows.next().unwrap(), &mut found).unwrap();
+        env.observe(&mut expected);
+        assert_eq!(found, expected);
+        for step in 0..30 {
+            let action = [0.2 * (step as f32 / 3.0).cos(); 20];
+            assert_eq!(env.step(&action, &mut expected), other.step(&action, &mut found));
+            assert_eq!(found, expected, "episode {episode}, step {step}");
+        }
+    }
+}
+
+#[test]
+fn a_randomised_training_has_the_same_bits_when_resumed_and_on_any_number_of_threads() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("all.toml"), ALL).unwrap();
+    let trained = |run: &str, more: &[&str]| {
+        let args = ["--config", "all.toml", "--run-dir", run, "--set", "env.max_episode_seconds=0.4"];
+        succeeded(program(folder, &train(&[&args[..], more].concat())));
+        weights(folder.join(run).join("checkpoints/latest.safetensors"))
+    };
+    let whole = trained("one", &["--total-steps", "2560", "--threads", "1"]);
+    assert!(whole == trained("eight", &["--total-steps", "2560", "--threads", "8"]));
+    trained("part", &["--total-steps", "1280"]);
+    succeeded(program(folder, &["train", "--resume", "part", "--total-steps", "2560"]));
+    assert!(whole == weights(folder.join("part/checkpoints/latest.safetensors")));
+    let columns =
+        |run: &str| metrics(&folder.join(run))[0].iter().filter(|name| name.starts_with("randomized/")).count();
+    assert_eq!(columns("one"), 7);
+    // A fork of a training without any of this, with delays that its environments did not have.
+    succeeded(program(folder, &train(&["--total-steps", "1280", "--run-dir", "plain"])));
+    let fork = ["train", "--fork", "plain/checkpoints/latest.safetensors", "--config", "all.toml", "--run-dir", "fork"];
+    succeeded(program(folder, &[&fork[..], &["--total-steps", "2560"]].concat()));
+    assert_eq!((columns("plain"), columns("fork")), (0, 7));
+}
+
+#[test]
+fn evaluations_stay_nominal_while_training_is_randomised() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("all.toml"), ALL).unwrap();
+    let args = ["--config", "all.toml", "--total-steps", "128", "--run-dir", "run", "--set", "run.eval_every=1"];
+    succeeded(program(folder.path(), &train(&args)));
+    let run = folder.path().join("run");
+    let rows = metrics(&run);
+    let column = rows[0].iter().position(|name| name == "eval/rot_dist").unwrap();
+    let logged: f64 = rows[1][column].parse().unwrap();
+    let place = run.join("checkpoints/latest.safetensors");
+    let count = config_of(&run).run.eval_episodes;
+    let rot_dist = |settings: &[&str]| {
+        let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
+        let loaded = Loaded::find(Some(&place), &sets).unwrap();
+        let episodes = Episodes { seed: 0, purpose: "evaluation", first: 0, count };
+        let (task, actor) = (Task::new(&loaded.config).unwrap(), Actor::Mean(loaded.policy.freeze()));
+        let played = evaluate(&task, &actor, episodes, &AtomicBool::new(false), &mut |_| Ok(())).unwrap().unwrap();
+        Score::of(&played).rot_dist
+    };
+    assert_eq!(rot_dist(&[]), logged);
+    assert_ne!(rot_dist(&["env.friction_scale=0.9"]), logged);
+}
+
+fn config_of(run: &Path) -> Config {
+    let text = fs::read_to_string(run.join("config.toml")).unwrap();
+    Config::from_text(Path::new("config.toml"), &text, &[]).unwrap()
+}
+
+#[test]
+fn what_cannot_be_varied_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let mesh = SCENE.replace(
+        "<geom name=\"cube\" type=\"box\" size=\".025 .025 .025\"",
+        "<geom name=\"cube\" type=\"mesh\" mesh=\"cube\"",
+    );
+    let vertices = "<mesh name=\"cube\" vertex=\"-.02 -.02 -.02 .02 -.02 -.02 0 .02 -.02 0 0 .02\"/>";
+    let asset = SCENE.find("<asset>").map(|_| mesh.replace("<asset>", &format!("<asset>{vertices}")));
+    fs::write(folder.path().join("mesh.xml"), asset.expect("the scene has assets")).unwrap();
+    for (sets, parts) in [
+        (&["randomization.friction=[1.3,0.7]"][..], &["randomization.friction = [1.3, 0.7]: must be [low, high]"][..]),
+        (&["randomization.gains=[-1,1]"], &["randomization.gains = [-1, 1]: must be [low, high] with 0 < low"]),
+        (&["randomization.delay=[3,2]"], &["randomization.delay = [3, 2]: must be [low, high]"]),
+        (&["randomization.delay=[0,1000]"], &["randomization.delay = [0, 1000]: must be", "shorter than an episode"]),
+        (
+            &["env.action_delay=1000"],
+            &["env.action_delay = 1000: must be shorter than an episode, which lasts 20 steps"],
+        ),
+        (&["randomization.share=1.5"], &["randomization.share = 1.5: must lie in [0, 1]"]),
+        (&["randomization.push=-1"], &["randomization.push = -1: must not be negative"]),
+        (&["randomization.push_steps=0"], &["randomization.push_steps = 0: must be at least 1"]),
+        (
+            &["randomization.noise={joints=1}"],
+            &["randomization.noise: `joints` is not a group", "joint_pos, joint_vel"],
+        ),
+        (&["env.bias.goal_quat=1"], &["env.bias: `goal_quat` is not measured", "cube_quat"]),
+        (&["env.noise.joint_pos=-1"], &["env.noise.joint_pos = -1: must not be negative"]),
+        (&["env.noise.joint_pos=much"], &["env.noise.joint_pos = \"much\": must be a number"]),
+        (&["env.noise=0.1"], &["env.noise = 0.1: must be a table of numbers by group"]),
+        (&["env.cone=round"], &["env.cone = \"round\": unknown variant", "`elliptic`"]),
+        (&["env.gains_scale=0"], &["env.gains_scale = 0: must be above 0"]),
+        (&["env.model=mesh.xml", "env.cube_size_scale=2"], &["mesh.xml: body `cube` has a mesh"]),
+        (
+            &["env.model=mesh.xml", "randomization.share=1", "randomization.cube_size=[0.9,1.1]"],
+            &["randomization.cube_size: ", "mesh.xml: body `cube` has a mesh"],
+        ),
+    ] {
+        let mut args = train(&["--total-steps", "128", "--run-dir", "run"]);
+        sets.iter().for_each(|set| args.extend(["--set", set]));
+        let output = program(folder.path(), &args);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{sets:?}: {said}");
+        parts.iter().for_each(|part| assert!(said.contains(part), "{part:?} is not in\n{said}"));
+        assert!(!folder.path().join("run").exists(), "nothing is started");
+    }
+    let output = program(folder.path(), &["play", "--ckpt", "builtin", "--json", "--set", "randomization.share=1"]);
+    assert!(stderr(&output).contains("`play` does not use randomization.share"), "{}", stderr(&output));
+}
+
+#[test]
+fn the_robustness_table_has_a_row_for_each_change_and_a_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let short = ["--set", "env.max_episode_seconds=0.1"];
+    let table = ["play", "--ckpt", "builtin", "--robustness", "--episodes", "3"];
+    let output = succeeded(program(folder.path(), &[&table[..], &short, &["--json", "--out", "table.svg"]].concat()));
+    let value: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let rows = value["rows"].as_array().unwrap();
+    assert_eq!(
+        (rows.len(), &value["episodes"], &value["checkpoint"]),
+        (30, &3.into(), &"built into the program".into())
+    );
+    assert_eq!(rows[6]["set"], serde_json::json!({ "env.gains_scale": 0.75 }));
+    assert_eq!(rows[13]["set"]["env.noise"]["joint_vel"], 0.02);
+    assert!(fs::read_to_string(folder.path().join("table.svg")).unwrap().contains("damping 0.3"));
+    let output = succeeded(program(folder.path(), &[&table[..], &short].concat()));
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.lines().any(|line| line.starts_with("friction 0.5, cube mass 2.0 ")), "{text}");
+    let output =
+        program(folder.path(), &[&table[..], &["--set", "env.ctrl_dt=0.004", "--set", "env.sim_dt=0.004"]].concat());
+    assert!(output.status.code() == Some(1) && stderr(&output).contains("row `sim_dt 0.005`"), "{}", stderr(&output));
+    let output = program(folder.path(), &["play", "--policy", "zero", "--robustness"]);
+    assert_eq!(output.status.code(), Some(2));
+}
+
+#[test]
+fn an_interrupted_robustness_table_has_the_rows_so_far() {
+    let folder = tempfile::tempdir().unwrap();
+    // Rows of a second or so; the first one may be missing on a slow machine.
+    let args = ["play", "--ckpt", "builtin", "--robustness", "--json", "--episodes", "8", "--out", "table.svg"];
+    let mut child =
+        crate::support::command(folder.path(), &args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let begun = Instant::now();
+    // The picture's file is opened before the settings are read, and the signal is waited for only then.
+    std::thread::sleep(Duration::from_secs(3));
+    send("INT", &child);
+    let status = child.wait().unwrap();
+    assert!(begun.elapsed() < Duration::from_secs(60));
+    let mut text = String::new();
+    child.stdout.take().unwrap().read_to_string(&mut text).unwrap();
+    let value: Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(status.code(), Some(130), "{text}");
+    assert!(value["rows"].as_array().unwrap().len() < 30, "{text}");
+    assert!(!folder.path().join("table.svg").exists());
+}
+
+#[test]
+fn the_defaults_vary_nothing() {
+    let config = config(&[]);
+    assert!(Randomization::new(&task(&[]), &config.randomization).unwrap().is_none());
+}
