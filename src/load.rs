@@ -16,35 +16,58 @@ use crate::run;
 /// The key of the only setting that is a path.
 pub const MODEL: &str = "env.model";
 
-/// The name of the built-in policy, which is accepted in place of a file or a run.
-const BUILTIN: &str = "builtin";
+/// A policy that is built into the program.
+#[derive(Debug, PartialEq, Eq)]
+pub struct BuiltIn {
+    /// The name that is accepted in place of a file or a run.
+    name: &'static str,
+    /// What a user is told that it is.
+    title: &'static str,
+    /// What a score names as its checkpoint.
+    place: &'static str,
+    bytes: &'static [u8],
+}
 
-/// The built-in policy.
-const BUILTIN_POLICY: &[u8] = include_bytes!("../assets/policies/repose.safetensors");
+/// The built-in policies; the first one is played where there is no run.
+static BUILTIN: [BuiltIn; 2] = [
+    BuiltIn {
+        name: "builtin",
+        title: "the built-in policy, repose.safetensors",
+        place: "built into the program",
+        bytes: include_bytes!("../assets/policies/repose.safetensors"),
+    },
+    BuiltIn {
+        name: "robust",
+        title: "the built-in policy for other hands, robust.safetensors",
+        place: "robust, built into the program",
+        bytes: include_bytes!("../assets/policies/robust.safetensors"),
+    },
+];
 
 /// The source of a policy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// The policy that is built into the program.
-    BuiltIn,
+    /// A policy that is built into the program.
+    BuiltIn(&'static BuiltIn),
     /// A checkpoint, or a file with only a policy.
     File(PathBuf),
 }
 
 impl Origin {
-    /// Returns the origin that `place` names: `builtin`, a file, or a run folder, which stands for its best checkpoint or, if
+    /// Returns the origin that `place` names: `builtin`, `robust`, a file, or a run folder, which stands for its best checkpoint or, if
     /// there is none yet, its latest.
     ///
     /// # Errors
     /// Fails if there is no such file, run folder or checkpoint.
     pub fn of(place: &Path) -> Result<Self> {
-        if place == Path::new(BUILTIN) { Ok(Self::BuiltIn) } else { run::resolve_checkpoint(place).map(Self::File) }
+        let built_in = BUILTIN.iter().find(|policy| place == Path::new(policy.name)).map(Self::BuiltIn);
+        built_in.map_or_else(|| run::resolve_checkpoint(place).map(Self::File), Ok)
     }
 
     /// Returns the file, or the name of what is built in.
     fn path(&self) -> &Path {
         match self {
-            Self::BuiltIn => Path::new(BUILTIN),
+            Self::BuiltIn(policy) => Path::new(policy.name),
             Self::File(path) => path,
         }
     }
@@ -56,11 +79,14 @@ impl Origin {
     pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, PolicyConfig)> {
         let path = self.path();
         let checkpoint = match self {
-            Self::BuiltIn => Checkpoint::parse(BUILTIN_POLICY)?,
+            Self::BuiltIn(policy) => Checkpoint::parse(policy.bytes)?,
             Self::File(path) => read(path)?,
         };
         let config = for_playing(&checkpoint, path, overrides);
-        let config = if *self == Self::BuiltIn { config } else { config.with_context(|| cannot_use(path)) }?;
+        let config = match self {
+            Self::BuiltIn(_) => config?,
+            Self::File(_) => config.with_context(|| cannot_use(path))?,
+        };
         Ok((checkpoint, config))
     }
 }
@@ -68,7 +94,7 @@ impl Origin {
 impl fmt::Display for Origin {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
-            Self::BuiltIn => f.write_str("built into the program"),
+            Self::BuiltIn(policy) => f.write_str(policy.place),
             Self::File(path) => path.display().fmt(f),
         }
     }
@@ -99,14 +125,14 @@ impl Loaded {
             (None, Some(newest)) => Origin::of(&newest)?,
             (None, None) => {
                 run::say("there is no run here: taking the built-in policy");
-                Origin::BuiltIn
+                Origin::BuiltIn(&BUILTIN[0])
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
         let policy = Policy::load(&config.net, SPACES, &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let name = match &origin {
-            Origin::BuiltIn => "the built-in policy, repose.safetensors".to_owned(),
+            Origin::BuiltIn(policy) => policy.title.to_owned(),
             Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
         Ok(Self { origin, name, config: config.env, policy, checkpoint })

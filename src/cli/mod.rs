@@ -172,9 +172,9 @@ pub struct TrainArgs {
     /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
-    /// Start from the policy (weights and normaliser) of this checkpoint or run, or from the built-in one; everything else is as
-    /// in any new run
-    #[arg(long, value_name = "FILE|RUN|builtin", conflicts_with = "resume", help_heading = START)]
+    /// Start from the policy (weights and normaliser) of this checkpoint or run, or of builtin or robust, which come with the program; all else
+    /// is as in any new run
+    #[arg(long, value_name = "FILE|RUN|NAME", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
     /// Start a new run from the full state of this run or checkpoint (weights, hands, counters; ramps continue), with changed
     /// settings
@@ -197,9 +197,9 @@ pub struct TrainArgs {
 /// The options of `play`.
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest) or builtin, the policy that comes
-    /// with the program [default: the newest run, or builtin if there is none]
-    #[arg(long, value_name = "FILE|RUN|builtin", help_heading = POLICY)]
+    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest), or one that comes with
+    /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film, 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
@@ -251,9 +251,9 @@ pub struct PlayArgs {
 /// The options of `export`.
 #[derive(Args, Debug)]
 pub struct ExportArgs {
-    /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest) or builtin, the policy that comes
-    /// with the program [default: the newest run, or builtin if there is none]
-    #[arg(long, value_name = "FILE|RUN|builtin", help_heading = POLICY)]
+    /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or one that comes with
+    /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Change one env.* setting that the file tells, e.g. env.model=my_scene.xml; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]

@@ -224,6 +224,15 @@ mod tests {
         assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
         assert_eq!((going_on.ppo.std_bounds(0), going_on.ppo.value_clip()), ([0.2; 2], f64::INFINITY));
         assert_eq!(going_on.training.goal_lifetime, 300);
+        let all = include_str!("../../configs/randomization-all.toml");
+        let [all, nothing] = [all, ""].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
+        let keys = |config: &Config| Table::try_from(&config.randomization).unwrap();
+        let same = |(key, value): &(String, Value)| keys(&nothing)[key] == *value;
+        let same: Vec<String> = keys(&all).into_iter().filter(same).map(|(key, _)| key).collect();
+        assert_eq!(same, ["each", "push_steps"], "everything else is on");
+        let source = include_str!("../../configs/randomization-source.toml");
+        let source = Config::from_text(Path::new("x.toml"), source, &[]).unwrap().randomization;
+        assert_eq!((source.friction, source.cube_mass, source.cube_com), ([0.8, 1.2], [0.8, 1.2], 0.01));
     }
 
     #[test]

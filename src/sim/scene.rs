@@ -116,6 +116,11 @@ impl Scene {
         Ok(crc32fast::hash(&bytes).into())
     }
 
+    /// Returns the size of the compiled scene in bytes.
+    pub fn size(&self) -> usize {
+        self.model.size()
+    }
+
     /// Returns the number of geoms.
     pub fn geoms(&self) -> usize {
         self.model.ngeom() as usize

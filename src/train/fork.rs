@@ -21,10 +21,9 @@ impl Session {
     /// # Errors
     /// Fails if the checkpoint cannot be resumed from, if the settings do not fit it, or if the folder cannot be created.
     pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
-        if matches!(Origin::of(place), Ok(Origin::BuiltIn)) {
-            bail!(
-                "--fork builtin: a policy alone, without the state of a training; use --init builtin to start from it"
-            );
+        if matches!(Origin::of(place), Ok(Origin::BuiltIn(_))) {
+            let name = place.display();
+            bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
         }
         let places = if place.is_dir() {
             RunFolder::containing(place)?.checkpoints().newest_first()

@@ -8,8 +8,11 @@ const SMALL_MINIBATCH: usize = 1024;
 /// The smallest weight of the task's reward at which its scales matter.
 const LITTLE: f64 = 0.1;
 
-/// Returns the notes about these settings, compared with the `default`.
-pub(super) fn hints(config: &Config, default: &Config) -> Vec<String> {
+/// The memory for the models of randomised hands above which there is a note, bytes.
+const MUCH: usize = 2 << 30;
+
+/// Returns the notes about these settings, compared with the `default`, for a scene of this size in bytes.
+pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
     let mut hints = Vec::new();
     let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
     let ramps = [
@@ -45,6 +48,14 @@ pub(super) fn hints(config: &Config, default: &Config) -> Vec<String> {
             hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight} at the end"));
         }
     }
+    let models = scene.saturating_mul(config.env.num_envs);
+    if config.randomization.share > 0.0 && models > MUCH {
+        let gib = models as f64 / f64::from(1 << 30);
+        hints.push(format!(
+            "[randomization]: each of {} hands gets its own model of this scene: {gib:.1} GiB in all",
+            config.env.num_envs
+        ));
+    }
     hints
 }
 
@@ -58,7 +69,7 @@ mod tests {
     fn of(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
         let default = Config::resolve(None, &[]).unwrap();
-        hints(&Config::resolve(None, &sets).unwrap(), &default)
+        hints(&Config::resolve(None, &sets).unwrap(), &default, 1 << 23)
     }
 
     #[test]
@@ -77,16 +88,24 @@ mod tests {
             "{line}"
         );
         assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
+        let [line] = &of(&["randomization.share=0.5"])[..] else { panic!("one line") };
+        assert!(line.contains("each of 1024 hands gets its own model of this scene: 8.0 GiB"), "{line}");
     }
 
     #[test]
     fn no_settings_that_come_with_the_program_cause_a_line() {
-        let files =
-            ["", include_str!("../../configs/repose-large.toml"), include_str!("../../configs/repose-continue.toml")];
+        let files = [
+            "",
+            include_str!("../../configs/repose-large.toml"),
+            include_str!("../../configs/repose-continue.toml"),
+            include_str!("../../configs/repose-robust.toml"),
+            include_str!("../../configs/randomization-all.toml"),
+            include_str!("../../configs/randomization-source.toml"),
+        ];
         let default = Config::resolve(None, &[]).unwrap();
         for text in files {
             let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
-            assert_eq!(hints(&config, &default), [""; 0]);
+            assert_eq!(hints(&config, &default, 1 << 19), [""; 0]);
         }
     }
 }

@@ -45,7 +45,8 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     requests.wait_for_end();
     run::say(&format!("run folder: {place}"));
     if !args.quiet {
-        hints(&session.config, &Config::resolve(None, &[])?).iter().for_each(|hint| run::say(&format!("note: {hint}")));
+        let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
+        hints.iter().for_each(|hint| run::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if !saver.resumes()

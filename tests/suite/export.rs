@@ -41,6 +41,64 @@ fn an_exported_policy_sees_and_does_in_python_what_it_does_here() {
     runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--episodes", "2", "--json"]);
 }
 
+/// Steps the hand of deploy.py from each state of a trace, and prints how far it then is from the next state: the median, since the
+/// solver starts from the last step's forces, which a trace does not have.
+const REPLAY: &str = "
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import deploy, mujoco, numpy
+hand = deploy.Hand(deploy.Policy('policy.onnx'), deploy.SCENE)
+records, off = [json.loads(line) for line in open('trace.jsonl')][1:], []
+for before, after in zip(records, records[1:]):
+    if not after.get('reset'):
+        hand.place(before['qpos'], before['qvel'])
+        hand.data.ctrl[hand.controls] = [after['ctrl'][i] for i in hand.controls]
+        for _ in range(hand.substeps):
+            mujoco.mj_step2(hand.model, hand.data)
+            mujoco.mj_step1(hand.model, hand.data)
+        off.append(abs(hand.data.qpos - after['qpos']).max())
+sys.exit(None if numpy.median(off) < 1e-12 else f'{numpy.median(off)} off')
+";
+
+#[test]
+fn a_varied_hand_moves_in_python_as_it_does_here() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let examples = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy");
+    let varied = [
+        "env.friction_scale=0.8",
+        "env.cube_mass_scale=1.5",
+        "env.hand_mass_scale=1.3",
+        "env.cube_size_scale=1.05",
+        "env.gains_scale=1.2",
+        "env.damping_scale=0.7",
+        "env.frictionloss_scale=2",
+        "env.cube_com=[0.003,-0.002,0.001]",
+        "env.gravity=[0.3,0,0.5]",
+        "env.action_delay=1",
+    ];
+    let sets: Vec<&str> = varied.iter().flat_map(|set| ["--set", set]).collect();
+    succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
+    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+    succeeded(program(folder.path(), &[&play[..], &sets].concat()));
+    runs(&python, folder.path(), &["-c", REPLAY, examples]);
+    let check = ["policy.onnx", "--check", "trace.jsonl"];
+    runs(&python, folder.path(), &[&[&format!("{examples}/deploy.py")[..]], &check[..]].concat());
+    // Without one of the settings it is another hand, so the comparison would notice.
+    succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..sets.len() - 4]].concat()));
+    let output = Command::new(&python).args(["-c", REPLAY, examples]).current_dir(folder.path()).output().unwrap();
+    assert!(!output.status.success() && stderr(&output).contains(" off"), "{}", stderr(&output));
+    // What it cannot simulate or compare is refused in words.
+    let noisy = ["--set", "env.noise.joint_pos=0.01"];
+    succeeded(program(folder.path(), &[&play[..], &noisy].concat()));
+    let output = Command::new(&python)
+        .args([&[&format!("{examples}/deploy.py")[..]], &check[..]].concat())
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert!(!output.status.success() && stderr(&output).contains("noise or bias"), "{}", stderr(&output));
+}
+
 #[test]
 fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_know() {
     let folder = tempfile::tempdir().unwrap();

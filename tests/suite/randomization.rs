@@ -14,8 +14,8 @@ use shadow_repose::evaluate::{Actor, Episodes, evaluate};
 use shadow_repose::load::Loaded;
 use shadow_repose::rng;
 
-use crate::support::{SCENE, config, metrics, program, started, stderr, succeeded, task, train, weights};
-use crate::survival::send;
+use crate::support::{SCENE, config, metrics, names, program, started, stderr, succeeded, task, train, weights};
+use crate::survival::{send, unstable_scene};
 
 /// The settings of configs/randomization-all.toml.
 const ALL: &str = include_str!("../../configs/randomization-all.toml");
@@ -256,6 +256,33 @@ fn a_randomised_training_has_the_same_bits_when_resumed_and_on_any_number_of_thr
     let fork = ["train", "--fork", "plain/checkpoints/latest.safetensors", "--config", "all.toml", "--run-dir", "fork"];
     succeeded(program(folder, &[&fork[..], &["--total-steps", "2560"]].concat()));
     assert_eq!((columns("plain"), columns("fork")), (0, 7));
+}
+
+#[test]
+fn a_dump_of_a_randomised_hand_tells_what_it_has_drawn() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("all.toml"), ALL).unwrap();
+    fs::write(folder.path().join("unstable.xml"), unstable_scene()).unwrap();
+    let mut args = train(&["--config", "all.toml", "--total-steps", "640", "--run-dir", "run", "--dump-diverged"]);
+    args.extend([
+        "--set",
+        "env.max_episode_seconds=5",
+        "--set",
+        "env.model=unstable.xml",
+        "--set",
+        "env.hand_mass_scale=1.25",
+    ]);
+    succeeded(program(folder.path(), &args));
+    let place = folder.path().join("run/diverged");
+    let dumps = names(&place);
+    assert!(dumps.len() > 4);
+    for dump in dumps {
+        let dump: Value = serde_json::from_slice(&fs::read(place.join(dump)).unwrap()).unwrap();
+        let (drawn, steps) = (&dump["randomization"], dump["ctrl"].as_array().unwrap().len());
+        assert!((0.5..=1.5).contains(&drawn["cube_mass"].as_f64().unwrap()) && dump["hand_mass_scale"] == 1.25);
+        assert_eq!((drawn["gains"].as_array().unwrap().len(), drawn["damping"].as_array().unwrap().len()), (20, 24));
+        assert_eq!((steps, dump["pushes"].as_array().unwrap().len()), (steps, steps));
+    }
 }
 
 #[test]

@@ -320,7 +320,7 @@ fn a_time_limit_saves_and_exits_with_0() {
 }
 
 /// Returns the built-in scene with a mass on a spring of negative stiffness, which diverges after twenty steps.
-fn unstable_scene() -> String {
+pub(crate) fn unstable_scene() -> String {
     let mass = "<body name=\"unstable\" pos=\"5 5 5\"><joint type=\"slide\" axis=\"0 0 1\" stiffness=\"-10000\"/>\
                 <geom type=\"sphere\" size=\".1\" mass=\"1\" contype=\"0\" conaffinity=\"0\"/></body></worldbody>";
     SCENE.replace("</worldbody>", mass)
