@@ -54,14 +54,17 @@ pub enum Origin {
 }
 
 impl Origin {
-    /// Returns the origin that `place` names: `builtin`, `robust`, a file, or a run folder, which stands for its best checkpoint or, if
+    /// Returns the origin that `place` names: `builtin`, `robust` unless there is such a file or folder, a file, or a run folder, which stands for its best checkpoint or, if
     /// there is none yet, its latest.
     ///
     /// # Errors
     /// Fails if there is no such file, run folder or checkpoint.
     pub fn of(place: &Path) -> Result<Self> {
-        let built_in = BUILTIN.iter().find(|policy| place == Path::new(policy.name)).map(Self::BuiltIn);
-        built_in.map_or_else(|| run::resolve_checkpoint(place).map(Self::File), Ok)
+        match BUILTIN.iter().position(|policy| place == Path::new(policy.name)) {
+            // Other names may be those of runs, made before a policy had them.
+            Some(i) if i == 0 || !place.exists() => Ok(Self::BuiltIn(&BUILTIN[i])),
+            _ => run::resolve_checkpoint(place).map(Self::File),
+        }
     }
 
     /// Returns the file, or the name of what is built in.

@@ -44,6 +44,9 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         None => Config::resolve(None, &args.set)?.env,
     };
     run::start_threads(args.threads)?;
+    if args.robustness {
+        requests.wait_for_end();
+    }
     if let (Some(loaded), false) = (&loaded, args.json) {
         run::say(&format!("playing {}", loaded.name));
     }

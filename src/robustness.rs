@@ -1,5 +1,5 @@
-//! How a policy fares on hands and cubes that it was not made for: its score under one change of the physics, of what it observes or
-//! of when its actions take effect at a time, as a table, JSON and a picture.
+//! How a policy fares on hands and cubes that it was not made for: its score under one change at a time of the physics, of what it
+//! observes, or of when its actions take effect, as a table, JSON and a picture.
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -33,7 +33,8 @@ const TWICE_THE_NOISE: &str =
     "{ joint_pos = 0.02, joint_vel = 0.04, cube_pos = 0.004, cube_quat = 0.04, fingertips = 0.004 }";
 
 /// The values of friction and mass that are combined.
-const GRID: [[&str; 4]; 2] = [["0.5", "0.7", "1.0", "1.3"], ["0.5", "1.0", "2.0", ""]];
+const FRICTIONS: [&str; 4] = ["0.5", "0.7", "1.0", "1.3"];
+const MASSES: [&str; 3] = ["0.5", "1.0", "2.0"];
 
 /// A row of the table: what is changed.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,7 +70,6 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     let tasks: Vec<Arc<Task>> = configs.iter().map(Task::new).collect::<Result<_>>()?;
     let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
-    requests.wait_for_end();
     let bar = Bar::new((different * count) as u64, "episodes", "robustness");
     let mut rows: Vec<Row> = Vec::new();
     for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
@@ -83,7 +83,9 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             run::say(&format!("warning: {}: {warning}", condition.name));
         }
-        let kept = score.goals / rows.first().map_or(score.goals, |nominal| nominal.score.goals);
+        let nominal = rows.first().map_or(score.goals, |nominal| nominal.score.goals);
+        // Of nothing, no share is kept.
+        let kept = if nominal > 0.0 { score.goals / nominal } else { f64::NAN };
         rows.push(Row { condition, config, score, kept });
     }
     drop(bar);
@@ -134,9 +136,8 @@ fn conditions() -> Vec<Condition> {
             conditions.push(Condition { name, sets: vec![set(key, value)], cell: None });
         }
     }
-    let [frictions, masses] = GRID.map(|values| values.into_iter().filter(|value| !value.is_empty()));
-    for friction in frictions {
-        for mass in masses.clone() {
+    for friction in FRICTIONS {
+        for mass in MASSES {
             let name = format!("friction {friction}, cube mass {mass}");
             let sets = vec![set(FRICTION, friction), set(MASS, mass)];
             conditions.push(Condition { name, sets, cell: Some([friction, mass]) });
@@ -148,7 +149,7 @@ fn conditions() -> Vec<Condition> {
 /// Returns the mean of what is kept over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Row]) -> f64 {
     let single = rows.iter().skip(1).filter(|row| row.condition.cell.is_none());
-    let kept: Vec<f64> = single.map(|row| row.kept.min(1.0)).collect();
+    let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();
     kept.iter().sum::<f64>() / kept.len() as f64
 }
 
@@ -196,18 +197,16 @@ fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
         let interval = row.score.goals_ci95.map(|goals| goals / nominal);
         run::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
     });
-    let [frictions, masses] =
-        GRID.map(|values| values.into_iter().filter(|value| !value.is_empty()).collect::<Vec<_>>());
     let kept = |friction: &str, mass: &str| {
         let cell = rows.iter().find(|row| row.condition.cell.is_some_and(|[f, m]| [f, m] == [friction, mass]));
         cell.map_or(f64::NAN, |row| row.kept)
     };
-    let cells = masses.iter().map(|mass| frictions.iter().map(|friction| kept(friction, mass)).collect()).collect();
+    let cells = MASSES.iter().map(|mass| FRICTIONS.iter().map(|friction| kept(friction, mass)).collect()).collect();
     let named = |name: &str, values: &[&str]| values.iter().map(|value| format!("{name} {value}")).collect();
     BarChart {
         title: format!("Goals kept under a change: {checkpoint}, {episodes} episodes a row"),
         bars: bars.collect(),
-        map: HeatMap { columns: named("friction", &frictions), rows: named("mass", &masses), cells },
+        map: HeatMap { columns: named("friction", &FRICTIONS), rows: named("mass", &MASSES), cells },
     }
 }
 
@@ -241,10 +240,12 @@ mod tests {
     #[test]
     fn what_is_kept_is_averaged_over_the_single_changes_and_never_more_than_all() {
         let conditions = conditions();
-        let kept = [1.0, 0.5, 1.2, f64::NAN];
+        let kept = [1.0, 0.5, 1.2];
         let mut rows: Vec<Row> = conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
         rows.push(row(conditions[20].clone(), 2, 0.1));
         assert_eq!(mean_kept(&rows), 0.75);
+        let of_nothing: Vec<Row> = conditions[..3].iter().map(|of| row(of.clone(), 0, f64::NAN)).collect();
+        assert!(mean_kept(&of_nothing).is_nan() && as_json(&of_nothing, 2, 3, "x")["mean_kept"].is_null());
         let value = as_json(&rows, 2, 3, "x");
         assert_eq!(value["rows"][1]["set"], json!({ "env.friction_scale": 0.5 }));
         assert_eq!(value["rows"][2]["kept"], 1.2);

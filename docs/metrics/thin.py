@@ -10,6 +10,8 @@ from pathlib import Path
 
 MEANS = ["episode/goals", "episode/in_tolerance", "episode/drop_rate", "episode/rot_dist", "episode/length", "training/progress"]
 MEANS += ["policy/std", "eval/goals", "eval/drop_rate", "eval/rot_dist"]
+# Only a training with randomised episodes has these.
+RANDOMIZED = ["randomized/goals", "randomized/drop_rate", "randomized/rot_dist"]
 SUMS = ["time/collect_s", "time/update_s"]
 STEPS = 400_000
 
@@ -31,10 +33,11 @@ def main(run, table):
     Path(table).parent.mkdir(parents=True, exist_ok=True)
     with open(table, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["env_steps", *MEANS, *SUMS])
+        columns = MEANS + [column for column in RANDOMIZED if column in rows[0]]
+        writer.writerow(["env_steps", *columns, *SUMS])
         # The last group has too few iterations for a mean.
         for group in groups[:-1]:
-            found = [numbers(group, column) for column in MEANS]
+            found = [numbers(group, column) for column in columns]
             means = [f"{sum(values) / len(values):.5g}" if values else "" for values in found]
             writer.writerow([group[-1]["env_steps"], *means, *(f"{sum(numbers(group, column)):.2f}" for column in SUMS)])
 

@@ -21,7 +21,11 @@ SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
 HAND = "right Shadow Hand, 24 joints, 20 actuators"
 JOINTS = """THJ5 THJ4 THJ3 THJ2 THJ1 FFJ4 FFJ3 FFJ2 FFJ1 MFJ4 MFJ3 MFJ2 MFJ1 RFJ4 RFJ3 RFJ2 RFJ1
             LFJ5 LFJ4 LFJ3 LFJ2 LFJ1 WRJ2 WRJ1""".split()
+ACTUATORS = """THJ5 THJ4 THJ3 THJ2 THJ1 FFJ4 FFJ3 FFJ0 MFJ4 MFJ3 MFJ0 RFJ4 RFJ3 RFJ0 LFJ5 LFJ4 LFJ3 LFJ0 WRJ2 WRJ1""".split()
 FINGERTIPS = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"]
+# Settings that older files do not have.
+NOMINAL = dict.fromkeys(["hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale"], 1.0)
+NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "action_delay": 0, "noise": {}, "bias": {}}
 OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
 
 
@@ -47,11 +51,13 @@ class Hand:
     """The simulated hand: what the policy sees of it, and what its actions do."""
 
     def __init__(self, policy, scene):
-        env = tomllib.loads(policy.facts["config"])["env"]
+        env = NOMINAL | tomllib.loads(policy.facts["config"])["env"]
         self.env = env
+        for key in ("noise", "bias"):
+            if env[key]:
+                sys.exit(f"error: the policy was exported with env.{key}, which this program does not simulate")
         self.model = varied_model(env, scene)
         self.data = mujoco.MjData(self.model)
-        mujoco.mj_setConst(self.model, self.data)
         cube = self.model.body("cube")
         self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
         joints = [self.model.joint("rh_" + name) for name in JOINTS]
@@ -147,38 +153,47 @@ class Hand:
         return np.linalg.norm(self.data.qpos[self.cube:self.cube + 3] - self.env["goal_position"]) >= self.env["fall_dist"]
 
 
-def varied_model(env, scene):
-    """Compiles the scene with the physics that the settings ask for; without changes, it is the scene itself."""
-    for key in ("noise", "bias"):
-        if env[key]:
-            sys.exit(f"error: the policy was exported with env.{key}, which this program does not simulate")
+def varied_model(env, scene, drawn=None):
+    """Compiles the scene with the physics that the settings ask for; without changes, it is the scene itself. `drawn` is what an
+    episode of a training has drawn besides: `randomization` in a dump."""
+    drawn = drawn or {}
+    factor = {key: env[key + "_scale"] * np.array(drawn.get(key, 1.0))
+              for key in ("friction", "cube_mass", "hand_mass", "cube_size", "gains", "damping", "frictionloss")}
+    offset = {key: np.array(env[key]) + drawn.get(key, [0, 0, 0]) for key in ("cube_com", "gravity")}
     spec = mujoco.MjSpec.from_file(str(scene))
-    cube, size = spec.body("cube"), env["cube_size_scale"]
-    if any(env["cube_com"]):
+    cube, size = spec.body("cube"), float(factor["cube_size"])
+    if any(offset["cube_com"]):
         cube.simple = False  # MuJoCo's shortcut for bodies whose centre of mass is their origin
     if size != 1:
+        if cube.bodies or cube.frames or any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in cube.geoms):
+            sys.exit(f"error: {scene}: this program resizes only cubes of simple shapes")
         for geom in cube.geoms:
             geom.size, geom.pos, geom.density = geom.size * size, geom.pos * size, geom.density / size**3
     model = spec.compile()
     model.opt.timestep = env["sim_dt"]
-    model.opt.gravity += env["gravity"]
+    model.opt.gravity += offset["gravity"]
     if env["cone"] != "scene":
         model.opt.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[env["cone"]]
-    model.geom_friction[:] *= env["friction_scale"]
-    model.pair_friction[:] *= env["friction_scale"]
+    model.geom_friction[:] *= factor["friction"]
+    model.pair_friction[:] *= factor["friction"]
     cube = model.body("cube")
     of_cube = model.body_rootid == cube.id
     of_hand = model.body_rootid == model.body(FINGERTIPS[0]).rootid[0]
-    for bodies, factor in (of_cube, env["cube_mass_scale"]), (of_hand, env["hand_mass_scale"]):
-        model.body_mass[bodies] *= factor
-        model.body_inertia[bodies] *= factor
-    cube.ipos[:] += env["cube_com"]
-    model.actuator_gainprm[:, 0] *= env["gains_scale"]
-    model.actuator_biasprm[:, 1] *= env["gains_scale"]
+    for bodies, mass in (of_cube, factor["cube_mass"]), (of_hand, factor["hand_mass"]):
+        model.body_mass[bodies] *= mass
+        model.body_inertia[bodies] *= mass
+    # The boxes that are tested for contacts are kept in the frame of the inertia, and must not move with it.
+    cube.ipos[:] += offset["cube_com"]
+    boxes = slice(model.body_bvhadr[cube.id], model.body_bvhadr[cube.id] + model.body_bvhnum[cube.id])
+    model.bvh_aabb[boxes, :3] -= rotated(conjugate(cube.iquat), offset["cube_com"])
+    servos = [model.actuator("rh_A_" + name).id for name in ACTUATORS]
+    model.actuator_gainprm[servos, 0] *= factor["gains"]
+    model.actuator_biasprm[servos, 1] *= factor["gains"]
     speeds = [model.joint("rh_" + name).dofadr[0] for name in JOINTS]
-    model.dof_damping[speeds] *= env["damping_scale"]
-    model.dof_dampingpoly[speeds] *= env["damping_scale"]
-    model.dof_frictionloss[speeds] *= env["frictionloss_scale"]
+    model.dof_damping[speeds] *= factor["damping"]
+    model.dof_dampingpoly[speeds] *= factor["damping"][..., None] if factor["damping"].ndim else factor["damping"]
+    model.dof_frictionloss[speeds] *= factor["frictionloss"]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

@@ -7,7 +7,7 @@ use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::BASE;
-use super::overlay::{overlay, table_of};
+use super::overlay::{overlay, table_of, with_the_others};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use crate::run;
@@ -163,9 +163,12 @@ impl Source {
 fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Result<Config> {
     let base: Table = BASE.parse().expect("the built-in configuration is TOML");
     let (mut merged, mut problems) = (base.clone(), Vec::new());
-    let singles = overrides.iter().map(|set| table_of(&set.key, &set.value, &base));
-    for table in tables.iter().cloned().chain(singles) {
-        overlay(&mut merged, &table, &base, "", &mut problems);
+    for table in tables {
+        overlay(&mut merged, table, &base, "", &mut problems);
+    }
+    for Override { key, value } in overrides {
+        let single = with_the_others(table_of(key, value, &base), key, &merged, &base);
+        overlay(&mut merged, &single, &base, "", &mut problems);
     }
     // Unknown words and wrong array sizes: each key is deserialized alone among the defaults, so that the one that fails can be
     // named. It is replaced by its default so that the other rules can be checked.
@@ -252,6 +255,27 @@ mod tests {
         // Part of a ramp that was set to a constant before.
         let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
         assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0 });
+    }
+
+    #[test]
+    fn a_table_by_group_is_set_whole_or_one_group_at_a_time() {
+        let file = |text: &str| Source { path: "x.toml".into(), text: text.into() };
+        let noise = |text: &str, sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            let noise = Config::resolve(Some(&file(text)), &sets).unwrap().env.noise;
+            noise.into_iter().map(|(group, std)| format!("{group} {std}")).collect::<Vec<_>>().join(", ")
+        };
+        let both = "[env]\nnoise = { joint_pos = 1, cube_pos = 0.5 }";
+        assert_eq!(noise("", &[]), "");
+        assert_eq!(noise(both, &[]), "cube_pos 0.5, joint_pos 1");
+        assert_eq!(noise(both, &["env.noise={cube_quat=2}"]), "cube_quat 2");
+        assert_eq!(noise(both, &["env.noise={}"]), "");
+        assert_eq!(
+            noise(both, &["env.noise.joint_pos=3", "env.noise.cube_quat=2"]),
+            "cube_pos 0.5, cube_quat 2, joint_pos 3"
+        );
+        let fork = Config::resolve(Some(&file(both)), &[]).unwrap();
+        assert!(fork.changed(Some(&file("[env]\nnoise = {}")), &[]).unwrap().env.noise.is_empty());
     }
 
     #[test]

@@ -22,6 +22,21 @@ pub(super) fn table_of(key: &str, text: &str, base: &Table) -> Table {
     Table::from_iter([(parts[0].to_owned(), value)])
 }
 
+/// Returns `table`, which sets `key` alone, with the other values of the free table in which it is, if it is in one:
+/// `env.noise.joint_pos` changes one value of `env.noise`.
+pub(super) fn with_the_others(mut table: Table, key: &str, merged: &Table, base: &Table) -> Table {
+    let whole = key.rsplit_once('.').map(|(whole, _)| whole);
+    let of = |table: &Table| whole.and_then(|whole| lookup(table, whole)).and_then(Value::as_table).cloned();
+    if of(base).is_some_and(|free| free.is_empty())
+        && let (Some(others), Some((section, name))) = (of(merged), whole.and_then(|whole| whole.split_once('.')))
+        && let Some(Value::Table(own)) = table.get_mut(section).and_then(|section| section.get_mut(name))
+    {
+        let given = std::mem::replace(own, others);
+        own.extend(given);
+    }
+    table
+}
+
 fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     let (first, rest) = key.split_once('.').unwrap_or((key, ""));
     match (table.get(first)?, rest) {
@@ -53,9 +68,10 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 let constant = Table::from_iter(parts.into_iter().chain([("steps".to_owned(), Value::Integer(0))]));
                 overlay(merged, &Table::from_iter([(key.clone(), constant.into())]), base, prefix, problems);
             }
-            // A table of values by names that are checked elsewhere.
+            // A table of values by names that are checked elsewhere replaces the one before.
             (Some(Value::Table(expected)), Value::Table(inner)) if expected.is_empty() => {
                 let zeros = Table::from_iter(inner.keys().map(|name| (name.clone(), Value::Float(0.0))));
+                merged.insert(key.clone(), Table::new().into());
                 let Some(Value::Table(target)) = merged.get_mut(key) else {
                     unreachable!("the merged tables are those of the base")
                 };

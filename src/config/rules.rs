@@ -9,12 +9,13 @@ use super::settings::{Backend, Config, Precision};
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule.
 
 /// Settings that must be above 0.
-const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.hand_mass_scale \
-    env.cube_size_scale env.gains_scale env.damping_scale env.frictionloss_scale env.act_moving_average env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm \
-    ppo.reward_scale ppo.max_std";
+const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.hand_mass_scale env.cube_size_scale \
+    env.gains_scale env.damping_scale env.frictionloss_scale env.act_moving_average env.rot_eps env.success_tolerance \
+    env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.max_std";
 
 /// Settings that must be at least 0.
-const NOT_NEGATIVE: &str = "randomization.cube_com randomization.gravity randomization.push env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise training.task_reward \
+const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
+    randomization.cube_com randomization.gravity randomization.push training.task_reward \
     ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.min_std ppo.away_std";
 
 /// Settings that must be at least 1.
@@ -30,16 +31,18 @@ const AT_MOST: &[(&str, f64)] = &[
     ("training.hold", 1e9),
     ("run.eval_episodes", 1048576.0),
     ("run.threads", 4096.0),
-    // Actions that are under way are kept for each hand.
-    ("env.action_delay", 1000.0),
     // No rotation error is larger.
     ("env.success_tolerance", PI),
     // Observed values are squared in `f32`.
     ("env.vel_obs_scale", 1e6),
 ];
 
-/// The largest magnitude of a value in `[env]`, `[training]` and `[randomization]` that is not a count: anything near it is a mistake.
+/// The largest magnitude of a value in `[env]`, `[training]` and `[randomization]` that is not a count: anything near it is a
+/// mistake.
 const LARGEST: f64 = 1e9;
+
+/// The longest delay, control steps: the actions that are under way are kept, and saved, for each hand.
+const LONGEST_DELAY: u32 = 1000;
 
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
 const FARTHEST: f64 = 100.0;
@@ -130,8 +133,10 @@ fn randomization(config: &Config, rules: &mut Rules) {
     let rule = format!("be shorter than an episode, which lasts {steps} steps");
     rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, &rule);
     let rule = format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
-    let fits = high == 0 || env.action_delay.saturating_add(high) < steps;
-    rules.check(fits, "randomization.delay", range, &rule);
+    let longest = env.action_delay.saturating_add(high);
+    rules.check(high == 0 || longest < steps, "randomization.delay", &range, &rule);
+    let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
+    rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, &rule);
     let tables = [("env", &env.noise, &env.bias), ("randomization", &drawn.noise, &drawn.bias)];
     for (section, noise, bias) in tables {
         for (name, table) in [("noise", noise), ("bias", bias)] {

@@ -13,7 +13,7 @@ pub(super) struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
     draw: Option<Draw>,
-    /// What is added to the values of every observation of the episode, by index.
+    /// What is added to the values of every observation of the episode, in the order of the values.
     bias: Vec<(usize, f32)>,
 }
 
@@ -31,11 +31,11 @@ impl Conditions {
     pub(super) fn begin(&mut self, rng: &Rng, sim: &mut Simulation, task: &Task) {
         self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng));
         self.bias.clear();
-        self.bias.extend(task.bias.draw(&mut rng::beside(rng, "bias")));
+        sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {
             (Some(randomization), Some(draw)) => {
                 randomization.vary(sim, draw, task);
-                self.bias.extend(randomization.draw_bias(draw, rng));
+                sensing::combine(&mut self.bias, randomization.draw_bias(draw, rng).into_iter());
             }
             _ => sim.share_model(),
         }
@@ -75,7 +75,7 @@ impl Conditions {
             noise.draw(rng).for_each(|(i, added)| observation[i] += added);
         }
         if noise_rng.is_some() || !self.bias.is_empty() {
-            self.bias.iter().for_each(|&(i, added)| observation[i] += added);
+            sensing::offset(observation, &self.bias);
             sensing::make_consistent(observation);
         }
     }

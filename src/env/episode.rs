@@ -119,8 +119,8 @@ pub struct Score {
 pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
     (diverged * 100 > steps).then(|| {
         format!(
-            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of masses, \
-             friction, env.sim_dt and scene cannot be simulated"
+            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of scene, \
+             env.sim_dt, masses, friction, gains and damping cannot be simulated"
         )
     })
 }

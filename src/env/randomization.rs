@@ -62,11 +62,11 @@ pub struct Draw {
     /// Control steps between an action and its effect, in addition to those of the task.
     pub delay: u32,
     /// Whether there is noise on the observations.
-    pub noise: bool,
+    pub has_noise: bool,
     /// Whether there is an offset of the observations.
-    pub bias: bool,
+    pub has_bias: bool,
     /// Whether there are forces on the cube.
-    pub push: bool,
+    pub has_pushes: bool,
 }
 
 impl Randomization {
@@ -90,7 +90,7 @@ impl Randomization {
         let scene = |&size: &f64| if size == 1.0 { Ok(nominal.clone()) } else { task.scene_with(size, shifts) };
         let scenes = sizes.iter().map(scene).collect::<Result<_>>().context("randomization.cube_size")?;
         Ok(Some(Arc::new(Self {
-            variants: Variants::new(scenes),
+            variants: Variants::new(scenes)?,
             hand: nominal.root(task.hand.fingertips[0]),
             config: config.clone(),
             nominal,
@@ -135,8 +135,8 @@ impl Randomization {
         };
         let cube_com = around_zero(&|rng| rng::uniform(rng, -of.cube_com, of.cube_com), rng);
         let gravity = around_zero(&|rng| normal(rng, of.gravity), rng);
-        // In every other episode all joints have the same factor. Independent draws alone would leave their mean near the middle, and
-        // a policy that has met only such hands fails on one whose joints are all damped little.
+        // With probability ½ all joints have the same factor. Independent draws alone would leave their mean near the middle, and a
+        // policy that has met only such hands fails on one whose joints are all damped little.
         let mut factors = |[low, high]: [f64; 2], count: usize| {
             let together = rng::uniform(rng, 0.0, 1.0) < 0.5;
             let own: Vec<f64> = (0..count).map(|_| rng::uniform(rng, low.ln(), high.ln()).exp()).collect();
@@ -145,7 +145,7 @@ impl Randomization {
         };
         let (gains, damping) = (factors(of.gains, super::ACTION_SIZE), factors(of.damping, super::JOINTS.len()));
         let frictionloss = factors(of.frictionloss, super::JOINTS.len());
-        let [noise, bias, push] = [(); 3].map(|()| varied());
+        let [has_noise, has_bias, has_pushes] = [(); 3].map(|()| varied());
         let cube_size = self.sizes[variant];
         randomized.then_some(Draw {
             variant,
@@ -159,9 +159,9 @@ impl Randomization {
             damping,
             frictionloss,
             delay,
-            noise,
-            bias,
-            push,
+            has_noise,
+            has_bias,
+            has_pushes,
         })
     }
 
@@ -190,20 +190,20 @@ impl Randomization {
 
     /// Returns the noise on the observations of an episode, if there is any.
     pub(super) fn noise(&self, draw: &Draw) -> Option<&Spread> {
-        Some(&self.noise).filter(|_| draw.noise)
+        Some(&self.noise).filter(|_| draw.has_noise)
     }
 
     /// Draws the offset of the observations in the episode of `rng`.
     pub(super) fn draw_bias(&self, draw: &Draw, rng: &Rng) -> Vec<(usize, f32)> {
         let drawn = self.bias.draw(&mut rng::beside(rng, "bias of randomization")).collect();
-        if draw.bias { drawn } else { Vec::new() }
+        if draw.has_bias { drawn } else { Vec::new() }
     }
 
     /// Returns the force on the cube, N, in a step (from 0) of the episode of `rng`; `None` if it has none.
     pub(super) fn push(&self, draw: &Draw, rng: &Rng, step: u32) -> Option<[f64; 3]> {
         let std = self.config.push;
         let rng = &mut rng::beside_at(rng, "push", step / self.config.push_steps);
-        (draw.push && std > 0.0).then(|| [(); 3].map(|()| normal(rng, std)))
+        (draw.has_pushes && std > 0.0).then(|| [(); 3].map(|()| normal(rng, std)))
     }
 }
 

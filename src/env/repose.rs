@@ -386,6 +386,8 @@ impl Resumable for Repose {
         // A fork may have other delays than its parent.
         let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / ACTION_SIZE;
         self.sim.restore(state.numbers_but(fixed + under_way * ACTION_SIZE)?)?;
+        // A fork may also have no forces on the cube, but its parent's state has one.
+        self.sim.push(self.task.hand.cube.body, [0.0; 3]);
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);

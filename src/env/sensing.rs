@@ -3,6 +3,7 @@
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
+use super::hand::FINGERTIPS;
 use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, OBSERVATION, RELATIVE_QUAT, TIP_QUAT, TIP_SIZE, TIPS};
 use crate::config::ByGroup;
 use crate::quat::{self, Quat};
@@ -44,6 +45,33 @@ impl Spread {
     /// Draws what is added: independent normal numbers.
     pub(super) fn draw<'a>(&'a self, rng: &'a mut Rng) -> impl Iterator<Item = (usize, f32)> + 'a {
         self.0.iter().map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
+    }
+}
+
+/// Adds offsets to others; both are in the order of the values of an observation.
+pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
+    for (i, added) in more {
+        match bias.binary_search_by_key(&i, |&(i, _)| i) {
+            Ok(at) => bias[at].1 += added,
+            Err(at) => bias.insert(at, (i, added)),
+        }
+    }
+}
+
+/// Adds the offset of an episode. On an orientation q it is a small rotation that stays the same however the body turns: q ⊗ (1, v),
+/// where v are the last three of its four numbers.
+pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)]) {
+    let orientations = || {
+        std::iter::once(CUBE_QUAT.start)
+            .chain((TIPS.start..).step_by(TIP_SIZE).take(FINGERTIPS.len()).map(|tip| tip + TIP_QUAT))
+    };
+    let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
+    let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
+    bias.iter().filter(|(i, _)| !in_orientation(*i)).for_each(|&(i, added)| observation[i] += added);
+    for at in orientations() {
+        let q = [0, 1, 2, 3].map(|i| observation[at + i]);
+        let turned = quat::mul(q, [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)]);
+        observation[at..at + 4].copy_from_slice(&turned);
     }
 }
 
@@ -94,6 +122,29 @@ mod tests {
         for (name, why) in [("joint_positions", "is not a group"), ("goal_quat", "is not measured")] {
             let error = spread(&[(name, 0.1)]).unwrap_err().to_string();
             assert!(error.contains(name) && error.contains(why) && error.contains("joint_pos, joint_vel"), "{error}");
+        }
+    }
+
+    #[test]
+    fn the_offset_of_an_orientation_is_the_same_rotation_however_the_cube_lies() {
+        let bias = spread(&[("cube_quat", 0.05), ("joint_pos", 0.1)]).unwrap();
+        let bias: Vec<(usize, f32)> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
+        let mut turns = rng::stream(2, "turns", 0);
+        let mut off = || {
+            let q = quat::canonical(quat::uniform([0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0))));
+            let mut observation = vec![0.1; OBSERVATION_SIZE];
+            observation[CUBE_QUAT.start..][..4].copy_from_slice(&q.map(|x| x as f32));
+            offset(&mut observation, &bias);
+            make_consistent(&mut observation);
+            assert_eq!(observation[5], 0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1);
+            assert_eq!(observation[30], 0.1);
+            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[CUBE_QUAT.start + i]));
+            quat::canonical(quat::mul(quat::conj(q), seen))
+        };
+        let first = off();
+        assert!(first[0] < 0.9999, "{first:?}");
+        for _ in 0..50 {
+            assert!(off().iter().zip(first).all(|(a, b)| (a - b).abs() < 1e-5));
         }
     }
 

@@ -51,13 +51,14 @@ impl Servos {
         self.targets
     }
 
-    /// Returns `count` targets, at least those under way: in front of them are some that would not be read again.
+    /// Returns `count` targets: those under way and, in front of them, the oldest one again.
     pub(super) fn under_way(&self, count: usize) -> impl Iterator<Item = Targets> {
-        repeat_n(self.targets, count - self.under_way.len()).chain(self.under_way.iter().copied())
+        let oldest = *self.under_way.front().unwrap_or(&self.targets);
+        repeat_n(oldest, count - self.under_way.len()).chain(self.under_way.iter().copied())
     }
 
-    /// Resumes with these last targets and the newest `delay` of those that were under way. If there are fewer, because a fork has
-    /// a longer delay than its parent, the oldest one is repeated.
+    /// Resumes with these last targets and the newest `delay` of those that [`Self::under_way`] returned. If there are fewer,
+    /// because a fork has a longer delay than its parent, the oldest one is repeated.
     pub(super) fn restore(&mut self, last: Targets, under_way: &[Targets], delay: usize) {
         let oldest = *under_way.first().unwrap_or(&last);
         self.reset(last, 0);

@@ -28,7 +28,7 @@ impl Task {
     /// Fails with the scene's file if the scene cannot be loaded or lacks a name, or if a setting names an unknown group of the
     /// observation.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::of(Scene::load(config.model_file(), &compilation(config))?, config)
+        Self::of(Scene::load(config.model_file(), &compilation(config))?, config, None)
     }
 
     /// Loads the same task in a scene for display.
@@ -36,12 +36,16 @@ impl Task {
     /// # Errors
     /// Fails like [`Task::new`], or if meshes cannot be read.
     pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::of(Scene::load_to_see(config.model_file(), &compilation(config), look)?, config)
+        Self::of(Scene::load_to_see(config.model_file(), &compilation(config), look)?, config, Some(look))
     }
 
-    fn of(scene: Scene, config: &EnvConfig) -> Result<Arc<Self>> {
+    fn of(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
         let hand = Hand::bind(&scene)?;
-        let scene = scene.varied(&variation(config, &scene, &hand));
+        let nominal = scene;
+        let mut scene = nominal.varied(&variation(config, &nominal, &hand));
+        if let Some(look) = look {
+            scene.set_look(look, &nominal);
+        }
         let noise = Spread::of(&config.noise).context("env.noise")?;
         let bias = Spread::of(&config.bias).context("env.bias")?;
         Ok(Arc::new(Self { scene, hand, config: config.clone(), noise, bias }))

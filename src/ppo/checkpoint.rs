@@ -133,13 +133,13 @@ impl Checkpoint {
         content.to_bytes()
     }
 
-    /// Returns only the parts that playing needs.
+    /// Returns only the parts that playing needs: what is shared does not tell paths of the machine on which it was made.
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
         let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
-        let (config, progress) = (self.config.clone(), self.progress.clone());
+        let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
         Self { config, progress, is_of_0_1: self.is_of_0_1, content: Content { arrays, ..Content::default() } }
     }
 

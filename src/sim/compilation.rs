@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
-use mujoco_rs::wrappers::mj_editing::MjsBody;
+use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
 
 /// The scene built into the program.
 pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -74,7 +74,9 @@ impl Compilation {
         }
         let name = self.object;
         let body = spec.body_mut(name).ok_or_else(|| anyhow!("has no body `{name}`"))?;
-        body.set_simple(!self.shifts);
+        if self.shifts {
+            body.set_simple(false);
+        }
         if self.size != 1.0 {
             resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))
         } else {
@@ -113,8 +115,10 @@ fn resize(body: &mut MjsBody, factor: f64) -> Result<()> {
         scale(geom.pos_mut(), factor);
         scale(geom.size_mut(), factor);
         scale(geom.fromto_mut(), factor);
-        geom.set_density(geom.density() / factor.powi(3));
+        let dimensions = if geom.typeinertia() == MjtGeomInertia::mjINERTIA_SHELL { 2 } else { 3 };
+        geom.set_density(geom.density() / factor.powi(dimensions));
     }
+    body.frame_iter_mut(false).for_each(|frame| scale(frame.pos_mut(), factor));
     body.site_iter_mut(false).for_each(|site| scale(site.pos_mut(), factor));
     body.joint_iter_mut(false).for_each(|joint| scale(joint.pos_mut(), factor));
     for child in body.body_iter_mut() {

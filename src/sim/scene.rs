@@ -72,7 +72,7 @@ impl Scene {
         Self::of(compilation.compile(file)?, origin(file), compilation)
     }
 
-    /// Loads the same scene, with the same physics, for display.
+    /// Loads the same scene, with the same physics, and with what is needed for display.
     ///
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
@@ -87,8 +87,18 @@ impl Scene {
         {
             scene = Self::of(model, scene.origin, compilation)?;
         }
-        look.set_up(Arc::get_mut(&mut scene.model).expect("a new scene is not shared"));
         Ok(scene)
+    }
+
+    /// Sets the camera, and the size and quality of pictures, for a variation of the scene `nominal` that is not shared yet.
+    ///
+    /// # Panics
+    /// Panics if the scene is shared.
+    pub fn set_look(&mut self, look: &Look, nominal: &Self) {
+        let model = Arc::get_mut(&mut self.model).expect("a new scene is not shared");
+        // MuJoCo computes these anew with masses; the picture stays as it is.
+        (model.stat_mut().center, model.stat_mut().extent) = (nominal.model.stat().center, nominal.model.stat().extent);
+        look.set_up(model);
     }
 
     fn of(mut model: MjModel, origin: String, compilation: &Compilation) -> Result<Self> {

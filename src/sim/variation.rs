@@ -7,10 +7,12 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use anyhow::{Result, ensure};
 use mujoco_rs::mujoco_c::mj_copyModel;
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::{Actuator, Body, Hinge, Scene, Simulation};
+use crate::quat;
 
 /// Changes to the physics of a scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,8 +66,8 @@ impl Variation {
                 }
             }
         }
-        if let Some((Body(body), offset)) = self.shift {
-            model.body_ipos_mut()[body].iter_mut().zip(offset).for_each(|(x, by)| *x += by);
+        if let Some((body, offset)) = self.shift {
+            shift(model, body, offset);
         }
         for &(actuator, factor) in &self.gains {
             // SAFETY: this changes the stiffness of a position servo, which is not an index or a size.
@@ -85,6 +87,19 @@ impl Variation {
     /// Returns whether MuJoCo derives other values from what is changed, such as the scale of contact forces from the masses.
     fn is_structural(&self) -> bool {
         self.masses.iter().any(|&(_, factor)| factor != 1.0) || self.shift.is_some_and(|(_, offset)| offset != [0.0; 3])
+    }
+}
+
+/// Moves the centre of mass of a body. MuJoCo keeps the boxes that it tests for contacts in the frame of the inertia, and does not
+/// update them: they must stay where they are in the frame of the body.
+fn shift(model: &mut MjModel, Body(body): Body, offset: [f64; 3]) {
+    model.body_ipos_mut()[body].iter_mut().zip(offset).for_each(|(x, by)| *x += by);
+    let within = quat::rotate(quat::conj(model.body_iquat()[body]), offset);
+    let count = model.body_bvhnum()[body] as usize;
+    if let Ok(first) = usize::try_from(model.body_bvhadr()[body]) {
+        for boxed in &mut model.bvh_aabb_mut()[first..first + count] {
+            boxed.iter_mut().zip(within).for_each(|(x, by)| *x -= by);
+        }
     }
 }
 
@@ -115,8 +130,13 @@ pub struct Variants {
 
 impl Variants {
     /// Creates the variants from scenes that differ only in sizes.
-    pub fn new(scenes: Vec<Scene>) -> Self {
-        Self { scenes, workspaces: Mutex::default() }
+    ///
+    /// # Errors
+    /// Fails if they differ in their structure.
+    pub fn new(scenes: Vec<Scene>) -> Result<Self> {
+        let alike = scenes.windows(2).all(|pair| pair[0].model.is_compatible_with_model(&pair[1].model));
+        ensure!(alike, "{}: with another size it has another structure", scenes[0].origin);
+        Ok(Self { scenes, workspaces: Mutex::default() })
     }
 
     /// Returns a scene (by number) with a variation.
@@ -132,7 +152,8 @@ impl Variants {
         let scene = &self.scenes[scene].model;
         let mut model = simulation.take_own_model().unwrap_or_else(|| (**scene).clone());
         assert!(model.is_compatible_with_model(scene), "scenes that differ only in sizes");
-        // SAFETY: both models have the same layout, so MuJoCo copies one buffer to another of the same size.
+        // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
+        // process if they differ; both come from the same scene, so they do not.
         unsafe { mj_copyModel(model.ffi_mut(), scene.ffi()) };
         variation.apply(&mut model);
         if variation.is_structural() {

@@ -80,7 +80,7 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Checks that the scene is that of the checkpoint. Its friction, masses and timestep may change.
+/// Checks that the scene is that of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &mut Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);

@@ -45,8 +45,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     requests.wait_for_end();
     run::say(&format!("run folder: {place}"));
     if !args.quiet {
-        let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-        hints.iter().for_each(|hint| run::say(&format!("note: {hint}")));
+        say_hints(&session)?;
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if !saver.resumes()
@@ -92,6 +91,13 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
         say_what_next(saver.folder().path());
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Prints notes about settings that are rarely intended.
+fn say_hints(session: &Session) -> Result<()> {
+    let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
+    hints.iter().for_each(|hint| run::say(&format!("note: {hint}")));
+    Ok(())
 }
 
 /// Prints how to look at a run that has finished.

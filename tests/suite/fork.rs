@@ -22,6 +22,19 @@ fn config(folder: &Path, run: &str) -> String {
 }
 
 #[test]
+fn a_policy_of_a_fork_does_not_tell_the_path_of_its_parent() {
+    let folder = tempfile::tempdir().unwrap();
+    succeeded(program(folder.path(), &train(&["--total-steps", "128", "--run-dir", "secret"])));
+    let fork = ["train", "--fork", "secret", "--run-dir", "fork", "--total-steps", "256", "--set", "run.eval_every=1"];
+    succeeded(program(folder.path(), &fork));
+    let tells = |file: &str| {
+        let bytes = fs::read(folder.path().join("fork").join(file)).unwrap();
+        bytes.windows(6).any(|window| window == b"secret")
+    };
+    assert!(tells("checkpoints/latest.safetensors") && !tells("policy.safetensors"));
+}
+
+#[test]
 fn a_fork_that_changes_nothing_continues_bit_for_bit() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();

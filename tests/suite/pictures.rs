@@ -329,3 +329,21 @@ fn pictures_and_films_that_cannot_be_are_refused() {
     refused(&["view", "--plain", "--screenshot", "missing/x.png"], 1, "missing/x.png");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "only the link");
 }
+
+#[test]
+fn the_camera_is_where_it_was_asked_to_be_with_another_mass_too() {
+    if !can_draw() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    // The upper half shows the goal and the sky; the cube, below, moves as its mass makes it.
+    let upper_half = |camera: &str, more: &[&str]| {
+        let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--camera", camera];
+        succeeded(program(folder.path(), &[&args[..], &["--screenshot", "x.png"], more].concat()));
+        let (_, rgb) = picture(&folder.path().join("x.png"));
+        rgb[..rgb.len() / 2].to_vec()
+    };
+    let usual = upper_half("150,-27,0.3", &[]);
+    assert!(usual == upper_half("150,-27,0.3", &["--set", "env.cube_mass_scale=2"]));
+    assert!(usual != upper_half("150,-27,0.4", &[]));
+}
