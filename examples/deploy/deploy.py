@@ -182,10 +182,7 @@ def varied_model(env, scene, drawn=None):
     for bodies, mass in (of_cube, factor["cube_mass"]), (of_hand, factor["hand_mass"]):
         model.body_mass[bodies] *= mass
         model.body_inertia[bodies] *= mass
-    # The boxes that are tested for contacts are kept in the frame of the inertia, and must not move with it.
     cube.ipos[:] += offset["cube_com"]
-    boxes = slice(model.body_bvhadr[cube.id], model.body_bvhadr[cube.id] + model.body_bvhnum[cube.id])
-    model.bvh_aabb[boxes, :3] -= rotated(conjugate(cube.iquat), offset["cube_com"])
     servos = [model.actuator("rh_A_" + name).id for name in ACTUATORS]
     model.actuator_gainprm[servos, 0] *= factor["gains"]
     model.actuator_biasprm[servos, 1] *= factor["gains"]

@@ -12,7 +12,6 @@ use mujoco_rs::mujoco_c::mj_copyModel;
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::{Actuator, Body, Hinge, Scene, Simulation};
-use crate::quat;
 
 /// Changes to the physics of a scene.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,8 +65,8 @@ impl Variation {
                 }
             }
         }
-        if let Some((body, offset)) = self.shift {
-            shift(model, body, offset);
+        if let Some((Body(body), offset)) = self.shift {
+            model.body_ipos_mut()[body].iter_mut().zip(offset).for_each(|(x, by)| *x += by);
         }
         for &(actuator, factor) in &self.gains {
             // SAFETY: this changes the stiffness of a position servo, which is not an index or a size.
@@ -87,19 +86,6 @@ impl Variation {
     /// Returns whether MuJoCo derives other values from what is changed, such as the scale of contact forces from the masses.
     fn is_structural(&self) -> bool {
         self.masses.iter().any(|&(_, factor)| factor != 1.0) || self.shift.is_some_and(|(_, offset)| offset != [0.0; 3])
-    }
-}
-
-/// Moves the centre of mass of a body. MuJoCo keeps the boxes that it tests for contacts in the frame of the inertia, and does not
-/// update them: they must stay where they are in the frame of the body.
-fn shift(model: &mut MjModel, Body(body): Body, offset: [f64; 3]) {
-    model.body_ipos_mut()[body].iter_mut().zip(offset).for_each(|(x, by)| *x += by);
-    let within = quat::rotate(quat::conj(model.body_iquat()[body]), offset);
-    let count = model.body_bvhnum()[body] as usize;
-    if let Ok(first) = usize::try_from(model.body_bvhadr()[body]) {
-        for boxed in &mut model.bvh_aabb_mut()[first..first + count] {
-            boxed.iter_mut().zip(within).for_each(|(x, by)| *x -= by);
-        }
     }
 }
 
@@ -172,5 +158,30 @@ impl Variants {
         own = workspace.swap_model(own);
         free().push(workspace);
         *own
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Compilation;
+    use super::super::compilation::BUILTIN;
+    use super::*;
+
+    #[test]
+    fn the_boxes_of_a_shifted_body_are_those_that_mujoco_compiles() {
+        // The boxes in which contacts are searched are kept in the frame of the inertia; `mj_setConst` updates them.
+        let compilation = Compilation { object: "cube", shifts: true, ..Compilation::plain(0.01) };
+        let scene = Scene::load(None, &compilation).unwrap();
+        let shift = Some((scene.body("cube").unwrap(), [0.01, -0.004, 0.002]));
+        let shifted = scene.varied(&Variation { shift, ..Variation::default() }).model;
+        let joint = "<freejoint name=\"cube\"/>";
+        let inertia = "<inertial pos=\".01 -.004 .002\" mass=\".028\" diaginertia=\"1.16e-5 1.16e-5 1.16e-5\"/>";
+        let compiled = MjModel::from_xml_string(&BUILTIN.replace(joint, &format!("{joint}{inertia}"))).unwrap();
+        let apart = |a: &[[f64; 6]], b: &[[f64; 6]]| {
+            assert_eq!(a.len(), b.len());
+            a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        assert!(apart(shifted.bvh_aabb(), compiled.bvh_aabb()) < 1e-12);
+        assert!(apart(scene.model.bvh_aabb(), compiled.bvh_aabb()) > 1e-3);
     }
 }

@@ -114,31 +114,6 @@ fn a_cube_of_several_parts_is_resized_as_a_whole() {
 }
 
 #[test]
-fn a_cube_with_a_shifted_centre_of_mass_loses_no_contact() {
-    let folder = tempfile::tempdir().unwrap();
-    // Without the search by bounding boxes, all pairs of shapes are tested.
-    let flag = "<flag island=\"disable\"";
-    let path = folder.path().join("scene.xml");
-    fs::write(&path, SCENE.replace(flag, &format!("{flag} midphase=\"disable\""))).unwrap();
-    let model = format!("env.model={}", path.display());
-    let shift = "env.cube_com=[0.01,-0.01,-0.01]";
-    let fallen = |settings: &[&str], episode: u64| {
-        let task = task(settings);
-        let (mut env, mut observation) = (Repose::new(&task), vec![0.0; OBSERVATION_SIZE]);
-        env.reset(rng::stream(0, "test", episode), &mut observation);
-        for _ in 0..25 {
-            let _ = env.step(&[0.0; 20], &mut observation);
-        }
-        env.simulation().qpos().to_vec()
-    };
-    for episode in 0..12 {
-        let (boxes, all) = (fallen(&[shift], episode), fallen(&[shift, &model], episode));
-        let apart = boxes.iter().zip(&all).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        assert!(apart < 1e-6, "episode {episode}: {apart}");
-    }
-}
-
-#[test]
 fn a_fork_without_forces_on_the_cube_drops_the_one_of_its_parent() {
     let (mut env, _) = randomized(&["randomization.push=3", "randomization.delay=[0,0]"]);
     played(&mut env, 0);
