@@ -13,12 +13,12 @@
 //! | module | what it is | imports |
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, run, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, run, schedule, sim |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, quantities, run, schedule, see, sim |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, env, evaluate, load, run |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, env, load, ppo, run, spaces |
-//! | [`mod@plot`] | learning curves of runs | cli, run |
+//! | [`mod@plot`] | learning curves of runs | cli, quantities, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, ppo, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, run |
 //! | [`see`] | rendering of the task: window, film, picture | cli, config, env, evaluate, run, sim |
@@ -35,6 +35,7 @@
 //! | [`sim`] | the only interface to MuJoCo | quat, schedule |
 //! | [`config`] | all settings, their defaults and rules | run |
 //! | [`run`] | the outside world: run folder, files, logs, terminal, signals | - |
+//! | [`quantities`] | what a training logs: names, meanings, units | - |
 //! | [`ranks`] | the division of a training into shards, and the ranks that compute them | - |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
@@ -83,6 +84,7 @@ pub mod pace;
 pub mod play;
 pub mod plot;
 pub mod ppo;
+pub mod quantities;
 pub mod quat;
 pub mod ranks;
 pub mod rng;

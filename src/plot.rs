@@ -1,75 +1,187 @@
-//! Learning curves: metrics of one or more runs, smoothed, over control steps or hours.
+//! Learning curves: metrics of one or more runs over control steps or hours. What training logs in each iteration is smoothed,
+//! evaluations are drawn at their own steps.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{Result, ensure};
+use anyhow::{Result, bail, ensure};
 
 use crate::cli::{Along, PlotArgs};
-use crate::run::{self, Chart, Curve, OutputFile, Picture, Subplot};
+use crate::quantities::quantity;
+use crate::run::{self, Chart, Curve, MetricsTable, OutputFile, Picture, Subplot, similar};
 
 /// The metrics that are drawn by default: the headline, and what explains it.
 const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];
 
+/// What is drawn instead where no run has had an episode of the task itself, because all are randomised.
+const INSTEAD: [(&str, &str); 3] = [
+    ("episode/goals", "randomized/goals"),
+    ("episode/rot_dist", "randomized/rot_dist"),
+    ("episode/drop_rate", "randomized/drop_rate"),
+];
+
+/// The columns that every run must have: control steps at the end of each iteration, and the seconds of its two parts.
+const ALONG: [&str; 3] = ["env_steps", "time/collect_s", "time/update_s"];
+
+/// The group of the metrics of evaluations.
+const EVALUATION: &str = "eval/";
+
 /// The default size in pixels: the width of the picture, and the height of a panel.
 const SIZE: [u32; 2] = [800, 260];
 
-/// The values of a run, column by column.
-type Table = Vec<Vec<f64>>;
+/// The most names that are suggested for one that is not known.
+const SUGGESTIONS: usize = 3;
+
+/// A run: its name, its place on the x axis in each row, the lengths of the windows that are smoothed, and its table.
+struct Run {
+    name: String,
+    along: Vec<f64>,
+    windows: Vec<usize>,
+    table: MetricsTable,
+}
 
 /// Draws the curves. Of several runs, those that cannot be drawn are skipped with a warning, e.g. one that was stopped in its
-/// first iteration, or is too old to have a column.
+/// first iteration.
 ///
 /// # Errors
-/// Fails if no run has readable metrics with these columns and at least one row, or if the picture cannot be written.
+/// Fails if no run has readable metrics with at least one row, if none has a column that is asked for, or if the picture cannot
+/// be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let output = OutputFile::create(&args.out)?;
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
-    let mut panels: Vec<Subplot> =
-        metrics.iter().map(|name| Subplot { name: (*name).to_owned(), curves: Vec::new() }).collect();
-    let tables = tables(&args.runs, &metrics)?;
-    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/metrics, is not smoothed more.
-    let in_row =
-        tables.iter().filter_map(|(_, table)| Some(table[0].get(1)? - table[0][0])).fold(f64::INFINITY, f64::min);
-    let window = args.smooth as f64 * in_row;
-    for (place, table) in &tables {
-        let [steps, collect_s, update_s, values @ ..] = &table[..] else {
-            unreachable!("one column for each requested name")
-        };
-        let along = match args.along {
-            Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
-            Along::Hours => hours(collect_s, update_s),
-        };
-        let lengths = lengths_of_windows(steps, window);
-        for (panel, values) in panels.iter_mut().zip(values) {
-            panel.curves.push(Curve { name: name_of(place), points: smooth(&along, values, &lengths) });
-        }
+    let wanted: Vec<&str> = metrics.iter().copied().chain(INSTEAD.map(|(_, other)| other)).collect();
+    let runs = runs(args, &wanted)?;
+    expect_columns(&runs, &metrics)?;
+    let column = |run: &Run, name: &str| {
+        let place = wanted.iter().position(|wanted| *wanted == name)?;
+        run.table.wanted[place].clone()
+    };
+    let known =
+        |name: &str| runs.iter().any(|run| column(run, name).is_some_and(|all| all.iter().any(|x| !x.is_nan())));
+    let mut panels = Vec::new();
+    for name in metrics {
+        let other = INSTEAD.iter().find(|(usual, _)| *usual == name && args.metric.is_empty());
+        let name = other.map(|(_, other)| *other).filter(|other| !known(name) && known(other)).unwrap_or(name);
+        let curve = |run: &Run| column(run, name).map_or_else(Curve::default, |values| run.curve(name, &values));
+        let curves: Vec<Curve> = runs.iter().map(curve).collect();
+        let curves = if args.seeds { vec![mean_and_band(&curves)] } else { curves };
+        let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
+        let title = quantity(name).map_or_else(|| name.to_owned(), |known| known.title);
+        panels.push(Subplot { title, curves, nothing: nothing.to_owned() });
     }
     let along = match args.along {
         Along::Steps => "million control steps",
         Along::Hours => "hours of collecting and learning",
     };
+    let legend = if args.seeds {
+        vec![format!("mean of {} seeds, from the lowest to the highest", runs.len())]
+    } else {
+        runs.iter().map(|run| run.name.clone()).collect()
+    };
     let size = args.size.unwrap_or([SIZE[0], SIZE[1] * panels.len() as u32]);
-    Chart { along: along.to_owned(), panels, size }.write(output)?;
-    run::say(&format!("{}: {} runs", args.out.display(), tables.len()));
+    Chart { legend, along: along.to_owned(), panels, size }.write(output)?;
+    run::say(&format!("{}: {} runs", args.out.display(), runs.len()));
     Ok(())
 }
 
-/// Reads the columns of each run that can be drawn, and warns of each that cannot.
+/// Reads each run that can be drawn, and warns of each that cannot.
 ///
 /// # Errors
 /// Fails if none of them can be drawn.
-fn tables<'a>(runs: &'a [PathBuf], metrics: &[&str]) -> Result<Vec<(&'a Path, Table)>> {
-    let mut tables = Vec::new();
-    for (i, place) in runs.iter().enumerate() {
-        match rows(place, metrics) {
-            Ok(table) => tables.push((place.as_path(), table)),
-            Err(error) if tables.is_empty() && i + 1 == runs.len() => return Err(error),
+fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
+    let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
+    for (i, place) in args.runs.iter().enumerate() {
+        let rows = run::read_metrics(place, &ALONG, wanted).and_then(|table| {
+            ensure!(!table.required[0].is_empty(), "{}: no rows yet", place.display());
+            Ok(table)
+        });
+        match rows {
+            Ok(table) => tables.push((place, table)),
+            Err(error) if tables.is_empty() && i + 1 == args.runs.len() => return Err(error),
             Err(error) => run::say(&format!("warning: {error:#}; skipped")),
         }
     }
-    Ok(tables)
+    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/metrics, is not smoothed more.
+    let in_row = tables.iter().filter_map(|(_, table)| Some(table.required[0].get(1)? - table.required[0][0]));
+    let window = args.smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
+    let run = |(place, table): (&Path, MetricsTable)| {
+        let [steps, collect_s, update_s] = &table.required[..] else { unreachable!("one for each required column") };
+        let along = match args.along {
+            Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
+            Along::Hours => hours(collect_s, update_s),
+        };
+        let windows = lengths_of_windows(steps, window);
+        Run { name: name_of(place), along, windows, table }
+    };
+    Ok(tables.into_iter().map(run).collect())
+}
+
+/// Checks that each of these columns is in at least one run, and warns of the runs without it.
+///
+/// # Errors
+/// Fails on the first column that no run has, and names the nearest ones.
+fn expect_columns(runs: &[Run], metrics: &[&str]) -> Result<()> {
+    for (i, name) in metrics.iter().enumerate() {
+        let lacking: Vec<&str> =
+            runs.iter().filter(|run| run.table.wanted[i].is_none()).map(|run| &run.name[..]).collect();
+        if lacking.len() == runs.len() {
+            let mut known: Vec<&str> = runs.iter().flat_map(|run| &run.table.names).map(String::as_str).collect();
+            known.sort_unstable();
+            known.dedup();
+            let mut nearest = similar(name, known.into_iter(), '/');
+            nearest.truncate(SUGGESTIONS);
+            let name: String = name.chars().take(64).collect();
+            match &nearest[..] {
+                [] => bail!("no run has a column {name}; the first line of metrics.csv names all columns"),
+                nearest => bail!("no run has a column {name}; did you mean {}?", nearest.join(" or ")),
+            }
+        }
+        if !lacking.is_empty() {
+            run::say(&format!("warning: no column {name} in {}", lacking.join(", ")));
+        }
+    }
+    Ok(())
+}
+
+impl Run {
+    /// Returns the curve of a metric with these values.
+    fn curve(&self, name: &str, values: &[f64]) -> Curve {
+        let dots = name.starts_with(EVALUATION);
+        // Each evaluation counts by itself, at the step at which it was made.
+        let each = vec![1; values.len()];
+        let points = smooth(&self.along, values, if dots { &each } else { &self.windows });
+        Curve { points, band: Vec::new(), dots }
+    }
+}
+
+/// Returns the mean of these curves and the band from the lowest to the highest, where all of them have values: at the points of
+/// the first, with the others on straight lines between theirs.
+fn mean_and_band(curves: &[Curve]) -> Curve {
+    let dots = curves.iter().any(|curve| curve.dots);
+    let mut mean = Curve { dots, ..Curve::default() };
+    for &[x, _] in curves.first().map_or(&[][..], |curve| &curve.points) {
+        let Some(values) = curves.iter().map(|curve| value_at(&curve.points, x)).collect::<Option<Vec<f64>>>() else {
+            continue;
+        };
+        mean.points.push([x, values.iter().sum::<f64>() / values.len() as f64]);
+        mean.band.push([
+            values.iter().copied().fold(f64::INFINITY, f64::min),
+            values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+        ]);
+    }
+    mean
+}
+
+/// Returns the value at `x` on the straight lines between `points`; `None` outside of them.
+fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
+    let after = points.partition_point(|point| point[0] < x);
+    let [right, high] = *points.get(after)?;
+    if right == x {
+        return Some(high);
+    }
+    let [left, low] = *points.get(after.checked_sub(1)?)?;
+    Some(low + (high - low) * (x - left) / (right - left))
 }
 
 /// Returns the numbers of consecutive rows that lie in the same window of so many steps.
@@ -90,15 +202,6 @@ fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
         seconds / 3600.0
     };
     collect_s.iter().zip(update_s).map(until).collect()
-}
-
-/// Reads columns of a run, with one row for each iteration: the control steps at its end, the seconds of its two parts, and these
-/// metrics.
-fn rows(place: &Path, metrics: &[&str]) -> Result<Table> {
-    let columns = [&["env_steps", "time/collect_s", "time/update_s"], metrics].concat();
-    let table = run::read_metrics(place, &columns)?;
-    ensure!(!table[0].is_empty(), "{}: no rows yet", place.display());
-    Ok(table)
 }
 
 /// Returns the name of a run: that of its folder, with control characters replaced.
@@ -146,5 +249,18 @@ mod tests {
         assert_eq!(lengths_of_windows(&rows(100, 5), 250.0), [3, 2]);
         assert_eq!(lengths_of_windows(&rows(400, 3), 250.0), [1, 1, 1]);
         assert_eq!(lengths_of_windows(&[5.0], f64::INFINITY), [1]);
+    }
+
+    #[test]
+    fn the_mean_of_seeds_is_taken_where_all_of_them_have_values() {
+        let curve = |points: &[[f64; 2]]| Curve { points: points.to_vec(), ..Curve::default() };
+        let (a, b) = (curve(&[[1.0, 0.0], [2.0, 1.0], [4.0, 2.0]]), curve(&[[1.5, 4.0], [2.0, 5.0], [3.0, 9.0]]));
+        let found = mean_and_band(&[a, b]);
+        assert_eq!((found.points, found.band), (vec![[2.0, 3.0]], vec![[1.0, 5.0]]));
+        // The second has no point at 2, but one on each side.
+        let (a, b) = (curve(&[[2.0, 1.0]]), curve(&[[1.0, 0.0], [3.0, 6.0]]));
+        let found = mean_and_band(&[a, b]);
+        assert_eq!((found.points, found.band), (vec![[2.0, 2.0]], vec![[1.0, 3.0]]));
+        assert!(mean_and_band(&[curve(&[[1.0, 2.0]]), curve(&[])]).points.is_empty());
     }
 }

@@ -14,7 +14,7 @@ use shadow_repose::config::Config;
 use shadow_repose::env::Task;
 use shadow_repose::ppo::{Array, Checkpoint};
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Report, Status, StatusLine};
+use shadow_repose::run::{Figures, Report, Status, StatusLine};
 
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -149,6 +149,7 @@ fn growth(rows: u64) -> i64 {
         report.iteration(
             row,
             &values,
+            &Figures::default(),
             &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN, evaluation: f64::NAN },
         );
         if row % 500 == 0 {

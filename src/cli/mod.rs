@@ -362,6 +362,9 @@ pub struct PlotArgs {
     /// Number of iterations averaged into each point of a curve, counted in those of the run with the shortest ones
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub smooth: usize,
+    /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest
+    #[arg(long)]
+    pub seeds: bool,
     /// Size of the picture in pixels [default: width 800, height 260 per panel]
     #[arg(long, value_name = "WxH", value_parser = size)]
     pub size: Option<[u32; 2]>,

@@ -4,6 +4,7 @@ use toml::{Table, Value};
 
 use super::ramp::Ramp;
 use super::{BASE, removed};
+use crate::run::similar;
 
 /// Returns the table with this one value. Text that is not a TOML value becomes a string, as does any text for a string key.
 pub(super) fn table_of(key: &str, text: &str, base: &Table) -> Table {
@@ -127,12 +128,12 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     }
 }
 
-/// The maximum length of a name that is compared with the known ones: the comparison takes quadratic time.
-const LONGEST_NAME: usize = 64;
+/// The most characters of an unknown name that a message shows.
+const LONGEST_SHOWN: usize = 64;
 
 fn unknown(name: &str) -> String {
-    if name.len() > LONGEST_NAME {
-        let start: String = name.chars().take(LONGEST_NAME).collect();
+    if name.len() > LONGEST_SHOWN {
+        let start: String = name.chars().take(LONGEST_SHOWN).collect();
         return format!("{start}…: unknown key; configs/repose.toml lists all of them");
     }
     let base: Table = BASE.parse().expect("the built-in configuration is TOML");
@@ -143,19 +144,10 @@ fn unknown(name: &str) -> String {
             known.extend(keys.keys().map(|key| format!("{section}.{key}")));
         }
     }
-    let distance = |candidate: &String| {
-        let whole = strsim::damerau_levenshtein(name, candidate);
-        let last = |s: &str| s.rsplit('.').next().unwrap_or_default().to_owned();
-        // The right key in the wrong section counts as one wrong letter.
-        whole.min(1 + strsim::damerau_levenshtein(&last(name), &last(candidate)))
-    };
     // A section is never suggested for a setting.
-    let alike = |candidate: &&String| candidate.contains('.') || !name.contains('.');
-    let nearest = known.iter().filter(alike).min_by_key(|candidate| distance(candidate));
-    match nearest {
-        Some(nearest) if distance(nearest) <= 2 + name.len() / 4 => {
-            format!("{name}: unknown key; did you mean {nearest}?")
-        }
-        _ => format!("{name}: unknown key; configs/repose.toml lists all of them"),
+    let alike = known.iter().map(String::as_str).filter(|candidate| candidate.contains('.') || !name.contains('.'));
+    match similar(name, alike, '.').first() {
+        Some(nearest) => format!("{name}: unknown key; did you mean {nearest}?"),
+        None => format!("{name}: unknown key; configs/repose.toml lists all of them"),
     }
 }

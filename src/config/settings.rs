@@ -232,6 +232,7 @@ pub struct RunConfig {
     pub checkpoint_every: u64,
     pub eval_every: u64,
     pub eval_episodes: usize,
+    pub film_every: u64,
     pub seed: u64,
     pub shards: usize,
     pub threads: usize,

@@ -11,12 +11,13 @@ use super::overlay::table_of;
 const COMMANDS: [&str; 5] = ["train", "bench", "play", "view", "export"];
 
 /// Settings of `[env]` and `[run]` that are used by fewer commands than the rest of their section.
-const FEWER: [(&str, &[&str]); 5] = [
+const FEWER: [(&str, &[&str]); 6] = [
     ("env.num_envs", &["train", "bench"]),
     ("run.total_steps", &["train", "bench"]),
     ("run.checkpoint_every", &["train"]),
     ("run.eval_every", &["train"]),
     ("run.eval_episodes", &["train"]),
+    ("run.film_every", &["train"]),
 ];
 
 /// Checks that a command uses all of these single settings. A configuration file may hold any setting, because it is shared by

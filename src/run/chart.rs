@@ -1,30 +1,39 @@
-//! A chart with curves in panels, one above the other: SVG, or PNG with the feature `video`.
+//! A chart with curves in panels, one above the other, and a legend above them: SVG, or PNG with the feature `video`.
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail, ensure};
 use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::OutputFile;
 
 /// Curves of one quantity.
 pub struct Subplot {
-    /// The name of the quantity.
-    pub name: String,
-    /// Curves, in legend order.
+    /// What the quantity is.
+    pub title: String,
+    /// Curves, at the places of their names in the legend.
     pub curves: Vec<Curve>,
+    /// The word that is shown if no curve has a point.
+    pub nothing: String,
 }
 
 /// A line through points.
+#[derive(Default)]
 pub struct Curve {
-    /// The name in the legend.
-    pub name: String,
-    /// Points (x, y), in ascending order of x.
+    /// Points (x, y), in ascending order of x. A single one is drawn as a dot.
     pub points: Vec<[f64; 2]>,
+    /// For each point, the lowest and the highest value of a band around it; empty without a band.
+    pub band: Vec<[f64; 2]>,
+    /// Whether each point has a dot.
+    pub dots: bool,
 }
 
 /// Panels with a shared x axis.
 pub struct Chart {
+    /// The names of the curves, in the order that all panels have them.
+    pub legend: Vec<String>,
     /// The label of the x axis.
     pub along: String,
     /// Panels, from top to bottom.
@@ -106,45 +115,141 @@ impl Picture for Chart {
     fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
         let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
         area.fill(&WHITE).map_err(failed)?;
+        let rows = self.legend_rows(&area).map_err(failed)?;
+        let height = ROW * rows.len() as u32 + 2 * MARGIN;
+        ensure!(
+            height + LEAST_PANEL * self.panels.len() as u32 <= self.size[1],
+            "{} panels and the names of {} curves do not fit into {} pixels: use a larger --size",
+            self.panels.len(),
+            self.legend.len(),
+            self.size[1]
+        );
+        let (top, below) = area.split_vertically(height);
+        draw_legend(&top, &rows).map_err(failed)?;
         let last = self.panels.len() - 1;
-        let x = range(self.panels.iter().flat_map(|panel| panel.values(0)));
-        for (i, (panel, part)) in self.panels.iter().zip(area.split_evenly((self.panels.len(), 1))).enumerate() {
-            let y = range(panel.values(1));
-            let mut chart = ChartBuilder::on(&part)
-                .caption(&panel.name, ("sans-serif", 17))
-                .margin(8)
-                .x_label_area_size(if i == last { 46 } else { 24 })
-                .y_label_area_size(56)
-                .build_cartesian_2d(x.clone(), y)
-                .map_err(failed)?;
-            let mut mesh = chart.configure_mesh();
-            mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", 13));
-            if i == last {
-                mesh.x_desc(&self.along);
-            }
-            mesh.draw().map_err(failed)?;
-            for (curve, (colour, dash)) in panel.curves.iter().zip(styles()) {
-                let points = curve.points.iter().map(|&[x, y]| (x, y));
-                let line = DashedLineSeries::new(points, dash, GAP, colour);
-                let drawn = chart.draw_series(line).map_err(failed)?;
-                drawn
-                    .label(&curve.name)
-                    .legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 24, y)], dash, GAP, colour));
-            }
-            if i == 0 {
-                let mut legend = chart.configure_series_labels();
-                legend.position(SeriesLabelPosition::UpperLeft).label_font(("sans-serif", 13));
-                legend.background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.2)).draw().map_err(failed)?;
-            }
+        let x = range(self.panels.iter().flat_map(|panel| panel.curves.iter().flat_map(Curve::along)));
+        for (i, (panel, part)) in self.panels.iter().zip(below.split_evenly((self.panels.len(), 1))).enumerate() {
+            panel.draw(&part, x.clone(), (i == last).then_some(&self.along[..])).map_err(failed)?;
         }
         area.present().map_err(failed)
     }
 }
 
+// Lengths in the legend in pixels: the height of a row, the margins, the length of a line, the space after a name.
+const ROW: u32 = 20;
+const MARGIN: u32 = 6;
+const LINE: i32 = 24;
+const SPACE: i32 = 20;
+
+/// The smallest height of a panel in pixels.
+const LEAST_PANEL: u32 = 100;
+
+/// The radius of a dot in pixels.
+const DOT: i32 = 3;
+
+type Failure<B> = DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>;
+
+/// The names in one row of a legend, each with its style and the place of its line.
+type LegendRow<'a> = Vec<(&'a str, (ShapeStyle, i32), i32)>;
+
+fn label() -> TextStyle<'static> {
+    ("sans-serif", 13).into_font().color(&BLACK).pos(Pos::new(HPos::Left, VPos::Center))
+}
+
+impl Chart {
+    /// Arranges the names in rows as wide as the chart.
+    fn legend_rows<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>) -> Result<Vec<LegendRow<'_>>, Failure<B>> {
+        let (margin, width) = (2 * MARGIN as i32, self.size[0] as i32);
+        let (mut rows, mut left) = (vec![Vec::new()], margin);
+        for (name, style) in self.legend.iter().zip(styles()) {
+            let (text, _) = area.estimate_text_size(name, &label())?;
+            let length = LINE + MARGIN as i32 + text as i32 + SPACE;
+            if left > margin && left + length - SPACE > width {
+                rows.push(Vec::new());
+                left = margin;
+            }
+            rows.last_mut().expect("there is a row").push((&name[..], style, left));
+            left += length;
+        }
+        Ok(rows)
+    }
+}
+
+fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, rows: &[LegendRow]) -> Result<(), Failure<B>> {
+    for (i, row) in rows.iter().enumerate() {
+        let y = (MARGIN + ROW * i as u32 + ROW / 2) as i32;
+        for &(name, (colour, dash), left) in row {
+            area.draw(&DashedPathElement::new([(left, y), (left + LINE, y)], dash, GAP, colour))?;
+            area.draw(&Text::new(name, (left + LINE + MARGIN as i32, y), label()))?;
+        }
+    }
+    Ok(())
+}
+
 impl Subplot {
-    /// Returns the coordinates of the points of all curves along an axis.
-    fn values(&self, axis: usize) -> impl Iterator<Item = f64> {
-        self.curves.iter().flat_map(|curve| &curve.points).map(move |point| point[axis])
+    /// Draws the panel into `part`, with a label of the x axis if it is the last.
+    fn draw<B: DrawingBackend>(
+        &self,
+        part: &DrawingArea<B, Shift>,
+        x: std::ops::Range<f64>,
+        along: Option<&str>,
+    ) -> Result<(), Failure<B>> {
+        let y = range(self.curves.iter().flat_map(Curve::values));
+        let mut chart = ChartBuilder::on(part)
+            .caption(&self.title, ("sans-serif", 17))
+            .margin(8)
+            .x_label_area_size(if along.is_some() { 46 } else { 24 })
+            .y_label_area_size(56)
+            .build_cartesian_2d(x, y)?;
+        let mut mesh = chart.configure_mesh();
+        mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", 13));
+        if let Some(along) = along {
+            mesh.x_desc(along);
+        }
+        mesh.draw()?;
+        for (curve, style) in self.curves.iter().zip(styles()) {
+            curve.draw(&mut chart, style)?;
+        }
+        if self.curves.iter().all(|curve| curve.points.is_empty()) {
+            let (width, height) = part.dim_in_pixel();
+            let style = ("sans-serif", 15).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
+            part.draw(&Text::new(&self.nothing[..], (width as i32 / 2, height as i32 / 2), style))?;
+        }
+        Ok(())
+    }
+}
+
+impl Curve {
+    fn along(&self) -> impl Iterator<Item = f64> {
+        self.points.iter().map(|[x, _]| *x)
+    }
+
+    /// Returns all values, those of the band too.
+    fn values(&self) -> impl Iterator<Item = f64> {
+        self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
+    }
+
+    fn draw<B: DrawingBackend>(
+        &self,
+        chart: &mut ChartContext<B, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
+        (colour, dash): (ShapeStyle, i32),
+    ) -> Result<(), Failure<B>> {
+        let points = || self.points.iter().map(|&[x, y]| (x, y));
+        if !self.band.is_empty() {
+            let edge = |side: usize| self.along().zip(self.band.iter().map(move |band| band[side]));
+            let upper: Vec<_> = edge(1).collect();
+            let outline: Vec<_> = edge(0).chain(upper.into_iter().rev()).collect();
+            // Opaque and below the line, since not every SVG viewer supports opacity.
+            let (red, green, blue) = colour.color.rgb();
+            let pale = |channel: u8| 255 - (255 - channel) / 4;
+            let pale = RGBColor(pale(red), pale(green), pale(blue));
+            chart.draw_series([Polygon::new(outline, pale.filled())])?;
+        }
+        chart.draw_series(DashedLineSeries::new(points(), dash, GAP, colour))?;
+        if self.dots || self.points.len() == 1 {
+            chart.draw_series(points().map(|point| Circle::new(point, DOT, colour.filled())))?;
+        }
+        Ok(())
     }
 }
 
@@ -158,15 +263,28 @@ fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn every_curve_is_drawn_in_a_way_of_its_own() {
-        let curve = |i| Curve { name: format!("run {i}"), points: vec![[0.0, f64::from(i)], [1.0, f64::from(i)]] };
-        let panel = Subplot { name: "a".into(), curves: (1..=8).map(curve).collect() };
-        let chart = Chart { along: "steps".into(), panels: vec![panel], size: [600, 500] };
+    fn panel(title: &str, curves: Vec<Curve>) -> Subplot {
+        Subplot { title: title.into(), curves, nothing: "nothing yet".into() }
+    }
+
+    fn line(points: &[[f64; 2]]) -> Curve {
+        Curve { points: points.to_vec(), ..Curve::default() }
+    }
+
+    fn svg(panels: Vec<Subplot>) -> String {
+        let curves = panels.iter().map(|panel| panel.curves.len()).max().unwrap();
+        let legend = (1..=curves).map(|i| format!("run {i}")).collect();
+        let chart = Chart { legend, along: "steps".into(), panels, size: [600, 500] };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
         chart.write(OutputFile::create(&path).unwrap()).unwrap();
-        let svg = std::fs::read_to_string(path).unwrap();
+        std::fs::read_to_string(path).unwrap()
+    }
+
+    #[test]
+    fn every_curve_is_drawn_in_a_way_of_its_own() {
+        let curve = |i| line(&[[0.0, f64::from(i)], [1.0, f64::from(i)]]);
+        let svg = svg(vec![panel("a", (1..=8).map(curve).collect())]);
         // The first and the eighth share a colour: two solid lines, one of them in the legend, and the eighth's dashes.
         let lines = |colour: RGBColor| {
             let stroke = format!("stroke=\"#{:02X}{:02X}{:02X}\"", colour.0, colour.1, colour.2);
@@ -178,15 +296,31 @@ mod tests {
 
     #[test]
     fn all_panels_have_the_same_axis() {
-        let panel = |name: &str, end| Subplot {
-            name: name.into(),
-            curves: vec![Curve { name: "run".into(), points: vec![[1.0, 0.5], [end, 0.7]] }],
-        };
-        let chart = Chart { along: "steps".into(), panels: vec![panel("a", 5.0), panel("b", 20.0)], size: [600, 500] };
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("chart.svg");
-        chart.write(OutputFile::create(&path).unwrap()).unwrap();
-        let svg = std::fs::read_to_string(path).unwrap();
+        let until = |end| vec![line(&[[1.0, 0.5], [end, 0.7]])];
+        let svg = svg(vec![panel("a", until(5.0)), panel("b", until(20.0))]);
         assert_eq!(svg.lines().filter(|line| line.trim() == "20.0").count(), 2, "{svg}");
+    }
+
+    #[test]
+    fn the_legend_lies_above_all_panels() {
+        let long = |i: usize| line(&[[0.0, 0.0], [1.0, i as f64]]);
+        let svg = svg(vec![panel("the panel", (1..=30).map(long).collect())]);
+        let height = |text: &str| {
+            let lines: Vec<&str> = svg.lines().collect();
+            let place = lines.iter().position(|line| line.trim() == text).expect(text);
+            let tag = lines[..place].iter().rfind(|line| line.starts_with("<text")).unwrap();
+            tag.split(" y=\"").nth(1).unwrap().split('"').next().unwrap().parse::<i32>().unwrap()
+        };
+        assert!(height("run 1") < height("run 30"), "several rows");
+        assert!(height("run 30") < height("the panel"), "{svg}");
+    }
+
+    #[test]
+    fn a_single_point_is_a_dot_a_band_is_a_surface_and_an_empty_panel_says_so() {
+        let band = Curve { points: vec![[1.0, 0.5], [2.0, 0.5]], band: vec![[0.2, 0.9]; 2], dots: false };
+        let svg = svg(vec![panel("dot", vec![line(&[[1.0, 0.5]])]), panel("band", vec![band]), panel("none", vec![])]);
+        for (part, count) in [("<circle", 1), ("<polygon", 1), ("\nnothing yet", 1)] {
+            assert_eq!(svg.matches(part).count(), count, "{part}: {svg}");
+        }
     }
 }

@@ -8,12 +8,13 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use anyhow::{Context, Result};
 use protobuf::Message;
 use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
-use tensorboard_proto::summary::{Summary, Summary_Value};
+use tensorboard_proto::summary::Summary;
 use tensorboard_rs::record_writer::RecordWriter;
 
 use super::file::expect_named;
 use super::output::{make_own, sync_folder};
 use super::records::length_up_to;
+use super::summary::{Figures, Summaries, Tag};
 
 /// The prefix and the suffix of the names of event files.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
@@ -24,15 +25,19 @@ pub(super) struct EventFile {
     /// The file that `writer` writes to.
     file: File,
     writer: RecordWriter<BufWriter<File>>,
+    summaries: Summaries,
 }
+
+/// The tag of the settings.
+pub(super) const SETTINGS: &str = "settings";
 
 impl EventFile {
     /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,
-    /// and discards values from earlier files at `first_step` and later.
+    /// and discards values from earlier files at `first_step` and later. The file begins with the `settings` of the run (TOML).
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn create(folder: &Path, first_step: u64) -> Result<Self> {
+    pub(super) fn create(folder: &Path, first_step: u64, tags: &[Tag], settings: &str) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
         let mut seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
@@ -44,8 +49,8 @@ impl EventFile {
             }
         };
         let writer = RecordWriter::new(BufWriter::new(file.try_clone()?));
-        let mut events = Self { path, file, writer };
-        match events.begin(first_step).and_then(|()| Ok(sync_folder(&events.path)?)) {
+        let mut events = Self { path, file, writer, summaries: Summaries::new(tags) };
+        match events.begin(first_step, settings).and_then(|()| Ok(sync_folder(&events.path)?)) {
             Ok(()) => Ok(events),
             Err(error) => {
                 let _ = fs::remove_file(&events.path);
@@ -54,7 +59,7 @@ impl EventFile {
         }
     }
 
-    fn begin(&mut self, first_step: u64) -> Result<()> {
+    fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
         let mut version = Event::new();
         version.set_file_version("brain.Event:2".into());
         self.write(version, 0)?;
@@ -62,21 +67,24 @@ impl EventFile {
         let mut session = SessionLog::new();
         session.set_status(SessionLog_SessionStatus::START);
         start.set_session_log(session);
-        self.write(start, first_step)
+        self.write(start, first_step)?;
+        if settings.is_empty() {
+            return Ok(());
+        }
+        let settings = self.summaries.of_text(SETTINGS, &format!("```\n{settings}\n```\n"));
+        self.summary(settings, first_step)
     }
 
     /// Adds the values of one step and flushes. `NaN` values are left out.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn scalars(&mut self, step: u64, values: &[(impl AsRef<str>, f64)]) -> Result<()> {
-        let mut summary = Summary::new();
-        for (tag, number) in values.iter().filter(|(_, number)| !number.is_nan()) {
-            let mut value = Summary_Value::new();
-            value.set_tag(tag.as_ref().to_owned());
-            value.set_simple_value(*number as f32);
-            summary.mut_value().push(value);
-        }
+    pub(super) fn iteration(&mut self, step: u64, values: &[(impl AsRef<str>, f64)], figures: &Figures) -> Result<()> {
+        let summary = self.summaries.of_iteration(values, figures);
+        self.summary(summary, step)
+    }
+
+    fn summary(&mut self, summary: Summary, step: u64) -> Result<()> {
         let mut event = Event::new();
         event.set_summary(summary);
         self.write(event, step)
@@ -142,6 +150,9 @@ fn now() -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use tensorboard_proto::summary::Summary_Value;
+
+    use super::super::{Animation, Histogram};
     use super::*;
 
     fn read(path: &Path) -> Vec<Event> {
@@ -155,39 +166,65 @@ mod tests {
         found
     }
 
+    fn create(folder: &Path, first_step: u64) -> EventFile {
+        let tags = ["reward/fall", "histogram/std", "eval/film"]
+            .map(|name| Tag { name: name.into(), description: format!("of {name}") });
+        EventFile::create(folder, first_step, &tags, "[run]\nseed = 3\n").unwrap()
+    }
+
     #[test]
     fn steps_after_the_checkpoint_and_half_written_events_are_cut_off() {
         let place = tempfile::tempdir().unwrap();
-        let mut events = EventFile::create(place.path(), 0).unwrap();
-        (1..=4).for_each(|step| events.scalars(10 * step, &[("a", step as f64)]).unwrap());
+        let mut events = create(place.path(), 0);
+        let figures = Figures {
+            film: Some(("eval/film", Animation { size: [320, 240], gif: vec![7; 3 << 20] })),
+            ..Default::default()
+        };
+        (1..=4).for_each(|step| events.iteration(10 * step, &[("a", step as f64)], &figures).unwrap());
         let path = events.path.clone();
         let half = [fs::read(&path).unwrap(), vec![9; 30]].concat();
         fs::write(&path, half).unwrap();
         for (last, expected) in [(40, 4), (25, 2)] {
             cut_off_after(place.path(), last).unwrap();
-            let steps: Vec<i64> = read(&path)[2..].iter().map(Event::get_step).collect();
+            let steps: Vec<i64> = read(&path)[3..].iter().map(Event::get_step).collect();
             assert_eq!(steps, (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>());
         }
         // A second file of the same second and process.
-        let more = EventFile::create(place.path(), 21).unwrap();
+        let more = create(place.path(), 21);
         assert_ne!(more.path, path);
     }
 
     #[test]
-    fn an_event_file_holds_its_version_the_first_step_and_the_values_that_are_known() {
+    fn an_event_file_holds_its_version_the_settings_and_the_values_that_are_known_each_tag_described_once() {
         let place = tempfile::tempdir().unwrap();
-        let mut events = EventFile::create(place.path(), 7).unwrap();
-        events.scalars(9, &[("reward/fall", 0.25), ("eval/goals", f64::NAN)]).unwrap();
+        let mut events = create(place.path(), 7);
+        let histograms = vec![("histogram/std", Histogram::of([0.5_f32, 1.5].iter()))];
+        let film = Some(("eval/film", Animation { size: [3, 2], gif: vec![1, 2] }));
+        let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
+        events.iteration(9, &values, &Figures { histograms, film }).unwrap();
+        events.iteration(11, &values, &Figures::default()).unwrap();
         let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
         let found = read(&path);
-        assert_eq!(found.len(), 3);
+        assert_eq!(found.len(), 5);
         assert_eq!(found[0].get_file_version(), "brain.Event:2");
         assert_eq!(
             (found[1].get_step(), found[1].get_session_log().get_status()),
             (7, SessionLog_SessionStatus::START)
         );
-        let values = found[2].get_summary().get_value();
-        assert_eq!((found[2].get_step(), values.len()), (9, 1));
+        let settings = &found[2].get_summary().get_value()[0];
+        let plugin = |value: &Summary_Value| value.get_metadata().get_plugin_data().get_plugin_name().to_owned();
+        assert_eq!((found[2].get_step(), settings.get_tag(), &plugin(settings)[..]), (7, "settings", "text"));
+        assert_eq!(settings.get_tensor().get_string_val()[0], b"```\n[run]\nseed = 3\n\n```\n");
+        let values = found[3].get_summary().get_value();
+        assert_eq!((found[3].get_step(), values.len()), (9, 3));
         assert_eq!((values[0].get_tag(), values[0].get_simple_value()), ("reward/fall", 0.25));
+        assert_eq!((values[1].get_histo().get_num(), values[1].get_histo().get_max()), (2.0, 1.5));
+        assert_eq!(values[2].get_image().get_encoded_image_string(), [1, 2]);
+        assert_eq!([0, 1, 2].map(|i| plugin(&values[i])), ["scalars", "histograms", "images"]);
+        let metadata = values[1].get_metadata();
+        assert_eq!(metadata.get_summary_description(), "of histogram/std");
+        assert_eq!(metadata.get_unknown_fields().get(4).unwrap().varint, [2], "the data class");
+        let again = &found[4].get_summary().get_value()[0];
+        assert!(!again.has_metadata() && again.get_simple_value() == 0.25);
     }
 }

@@ -7,26 +7,14 @@ use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 
 use super::file::expect_named;
 use super::folder::METRICS;
 use super::output::{make_own, sync_folder, unused_name};
 
-/// The most bytes that are read of a table; a million rows take half of this.
-const LARGEST_TABLE: u64 = 1 << 30;
-
 /// The most bytes of a row. This program writes none that is longer, and the rest of a longer one is not a row either.
-const LONGEST_ROW: u64 = 1 << 20;
-
-/// The most rows that are read for a chart. Ten times the default training has fewer.
-const MOST_ROWS: usize = 2_000_000;
-
-/// The largest value that is drawn. No metric comes near it, and a chart cannot be laid out far beyond.
-const LARGEST_VALUE: f64 = 1e30;
-
-/// The most characters of a file that a message quotes.
-const LONGEST_QUOTE: usize = 100;
+pub(super) const LONGEST_ROW: u64 = 1 << 20;
 
 /// The table being written.
 pub(super) struct Metrics {
@@ -109,55 +97,6 @@ impl Metrics {
     }
 }
 
-/// Reads these columns of a table and returns their values, column by column. A value is `NaN` if its cell is empty or cannot be
-/// drawn: infinite, or beyond 1e30. `place` is the file or its run folder.
-///
-/// # Errors
-/// Fails if the file cannot be read, lacks a column, has too many rows, or contains anything but numbers.
-pub fn read_metrics(place: &Path, columns: &[&str]) -> Result<Vec<Vec<f64>>> {
-    let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
-    let context = || format!("cannot read {}", path.display());
-    let mut reader = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE));
-    let mut line = Vec::new();
-    let mut next = |line: &mut Vec<u8>| {
-        line.clear();
-        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
-    };
-    next(&mut line).with_context(context)?;
-    let header = String::from_utf8_lossy(&line).trim_end().to_owned();
-    let names: Vec<&str> = header.split(',').collect();
-    let place = |column: &&str| {
-        let found = names.iter().position(|name| name == column);
-        found.with_context(|| format!("{} has no column {column}; it has {}", path.display(), beginning(&header)))
-    };
-    let places: Vec<usize> = columns.iter().map(place).collect::<Result<_>>()?;
-    let mut table = vec![Vec::new(); columns.len()];
-    let mut row = 0;
-    while next(&mut line).with_context(context)? > 0 {
-        row += 1;
-        ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
-        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
-        // Skips incomplete rows: the last row of a run in progress may be one.
-        if cells.len() == names.len() {
-            for (&place, column) in places.iter().zip(&mut table) {
-                let cell = String::from_utf8_lossy(cells[place]);
-                let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
-                let number: f64 = number
-                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), beginning(&cell)))?;
-                column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
-            }
-        }
-    }
-    Ok(table)
-}
-
-/// Returns the beginning of a text, short enough for a message.
-fn beginning(text: &str) -> String {
-    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
-    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
-    if text.chars().count() > LONGEST_QUOTE { format!("{start}…") } else { start }
-}
-
 /// The extent of the rows in a table.
 #[derive(Default)]
 struct Rows {
@@ -207,30 +146,6 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn columns_are_read_by_name_with_gaps_and_without_the_row_under_way() {
-        let (place, path) = table("1,0.5\n2,\n3");
-        let read = read_metrics(&path, &["loss", "iteration"]).unwrap();
-        assert!(read[0][0] == 0.5 && read[0][1].is_nan() && read[1] == [1.0, 2.0], "{read:?}");
-        assert_eq!(read_metrics(place.path(), &["loss"]).unwrap()[0].len(), 2);
-        let refusal = read_metrics(&path, &["goals"]).unwrap_err().to_string();
-        assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
-    }
-
-    #[test]
-    fn numbers_that_cannot_be_drawn_are_gaps_and_what_is_quoted_is_short() {
-        let (_place, path) = table("1,1.7e308\r\n2,-inf\n3,7\n");
-        let read = read_metrics(&path, &["loss"]).unwrap();
-        assert!(read[0][0].is_nan() && read[0][1].is_nan() && read[0][2] == 7.0, "{read:?}");
-        for text in
-            [format!("{{{}\n", "\"a\": 1,".repeat(100_000)), format!("iteration,loss\n1,{}\n", "x".repeat(99_999))]
-        {
-            fs::write(&path, text).unwrap();
-            let refusal = format!("{:#}", read_metrics(&path, &["loss"]).unwrap_err());
-            assert!(refusal.len() < 500 + path.as_os_str().len(), "{refusal}");
-        }
-    }
 
     fn table(rows: &str) -> (tempfile::TempDir, PathBuf) {
         let place = tempfile::tempdir().unwrap();

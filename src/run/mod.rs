@@ -8,6 +8,7 @@ mod file;
 #[cfg(feature = "video")]
 mod film;
 mod folder;
+mod histogram;
 mod interrupt;
 mod lock;
 mod meshes;
@@ -19,21 +20,27 @@ mod processor;
 mod progress;
 mod records;
 mod report;
+mod similar;
+mod summary;
+mod table;
 
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
 pub use chart::{Chart, Curve, Picture, Subplot};
 pub use checkpoints::Checkpoints;
 pub use file::{read_bytes, read_text, same_file};
 #[cfg(feature = "video")]
-pub use film::{FilmFormat, FilmWriter, write_png};
+pub use film::{Clip, FilmFormat, FilmWriter, write_png};
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
+pub use histogram::Histogram;
 pub use interrupt::Requests;
 pub use lock::Locked;
 pub use meshes::hand_meshes;
-pub use metrics::read_metrics;
 pub use output::{OutputFile, expect_folder, write_whole};
 pub use progress::{Bar, Status, StatusLine};
 pub use report::Report;
+pub use similar::similar;
+pub use summary::{Animation, Figures, Tag};
+pub use table::{MetricsTable, read_metrics};
 
 use std::io::{ErrorKind, Write};
 use std::path::Path;

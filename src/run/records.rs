@@ -2,14 +2,14 @@
 //!
 //! A file is a sequence of records: length (8 bytes, little endian), its checksum, an event, its checksum (TFRecord, from
 //! TensorFlow's record_writer.h). An event is a protobuf message, of which only the step, field 2, is read. Files are untrusted:
-//! sizes are bounded before anything is allocated.
+//! sizes are bounded, and no more is allocated than there is.
 
-use std::io::{BufRead, ErrorKind, Result};
+use std::io::{BufRead, ErrorKind, Read, Result};
 
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
 /// The most bytes of an event. This program writes none that is larger; a record that claims to be is damaged.
-const LARGEST: u64 = 1 << 20;
+const LARGEST: u64 = 64 << 20;
 
 /// Returns the number of bytes at the start of a file that are whole events up to `last_step`. Steps do not decrease within a
 /// file.
@@ -38,8 +38,11 @@ fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
 
 /// Reads `count` bytes and their checksum; returns `None` if they are incomplete or do not match.
 fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
-    let (mut bytes, mut checksum) = (vec![0; count], [0; 4]);
-    match reader.read_exact(&mut bytes).and_then(|()| reader.read_exact(&mut checksum)) {
+    let (mut bytes, mut checksum) = (Vec::new(), [0; 4]);
+    if reader.by_ref().take(count as u64).read_to_end(&mut bytes)? < count {
+        return Ok(None);
+    }
+    match reader.read_exact(&mut checksum) {
         Err(error) if error.kind() == ErrorKind::UnexpectedEof => Ok(None),
         result => result.map(|()| (masked_crc32c(&bytes) == u32::from_le_bytes(checksum)).then_some(bytes)),
     }
@@ -143,6 +146,10 @@ mod tests {
             assert_eq!(length(&damaged), if place as u64 >= first { first } else { 0 }, "byte {place}");
         }
         assert_eq!(length(&[&whole[..], &[0; 4096]].concat()), 2 * first);
-        assert_eq!(length(&[&whole[..], &record(&vec![0x40; 2 << 20])].concat()), 2 * first, "larger than any event");
+        assert_eq!(
+            length(&[&whole[..], &record(&vec![0x40; LARGEST as usize + 1])].concat()),
+            2 * first,
+            "larger than any event"
+        );
     }
 }

@@ -13,6 +13,7 @@ use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
 use super::progress::{Status, StatusLine};
+use super::summary::{Figures, Tag};
 
 /// The columns before the tags.
 const FIXED: [&str; 2] = ["iteration", "env_steps"];
@@ -21,6 +22,9 @@ const FIXED: [&str; 2] = ["iteration", "env_steps"];
 pub struct Report {
     folder: PathBuf,
     header: String,
+    tags: Vec<Tag>,
+    /// The settings of the run, TOML.
+    settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
     /// The iteration before the first one of the run.
@@ -81,12 +85,14 @@ impl<W> Log<W> {
 }
 
 impl Report {
-    /// Creates the report of a run in `folder`, for metrics with these names. Writes nothing yet.
-    pub fn new(folder: &Path, tags: &[impl AsRef<str>], progress: StatusLine) -> Self {
-        let columns: Vec<&str> = FIXED.into_iter().chain(tags.iter().map(AsRef::as_ref)).collect();
+    /// Creates the report of a run in `folder`, for numbers with these names. Writes nothing yet.
+    pub fn new(folder: &Path, names: &[impl AsRef<str>], progress: StatusLine) -> Self {
+        let columns: Vec<&str> = FIXED.into_iter().chain(names.iter().map(AsRef::as_ref)).collect();
         Self {
             folder: folder.to_owned(),
             header: columns.join(","),
+            tags: Vec::new(),
+            settings: String::new(),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
             first: 0,
@@ -94,6 +100,12 @@ impl Report {
             env_steps: 0,
             progress,
         }
+    }
+
+    /// Adds descriptions of all that is logged, and the settings of the run (TOML), for TensorBoard.
+    #[must_use]
+    pub fn described(self, tags: Vec<Tag>, settings: String) -> Self {
+        Self { tags, settings, ..self }
     }
 
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
@@ -114,15 +126,16 @@ impl Report {
     }
 
     fn open_events(&self) -> Result<EventFile> {
-        EventFile::create(&self.folder, self.env_steps + u64::from(self.iteration > 0))
+        let first_step = self.env_steps + u64::from(self.iteration > 0);
+        EventFile::create(&self.folder, first_step, &self.tags, &self.settings)
     }
 
     fn open_metrics(&self) -> Result<(Metrics, Vec<String>)> {
         Metrics::open(&self.folder.join(METRICS), &self.header, self.first..self.iteration)
     }
 
-    /// Logs the values of an iteration, whose names and order are those of the tags, and shows the status.
-    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], status: &Status) {
+    /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
+    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], figures: &Figures, status: &Status) {
         (self.iteration, self.env_steps) = (iteration, status.env_steps);
         let names = values.iter().map(|(name, _)| name.as_ref());
         assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
@@ -130,7 +143,7 @@ impl Report {
         let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
         let warnings = [
-            self.events.write(|events| events.scalars(status.env_steps, values)),
+            self.events.write(|events| events.iteration(status.env_steps, values, figures)),
             self.metrics.write(|metrics| metrics.row(&row)),
         ];
         warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
@@ -195,10 +208,10 @@ mod tests {
         let mut report = open(place.path(), &tags, 0, 0);
         for iteration in 1..=3 {
             let values = [("loss/policy", 0.5 * iteration as f64), ("eval/goals", f64::NAN)];
-            report.iteration(iteration, &values, &status(10 * iteration));
+            report.iteration(iteration, &values, &Figures::default(), &status(10 * iteration));
         }
         let mut resumed = open(place.path(), &tags, 2, 20);
-        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &status(30));
+        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &Figures::default(), &status(30));
         let text = std::fs::read_to_string(place.path().join("metrics.csv")).unwrap();
         assert_eq!(text, "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n");
     }
@@ -208,17 +221,17 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("gone");
         let mut report = open(&folder, &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &status(10));
+        report.iteration(1, &[("a", 1.0)], &Figures::default(), &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
         report.sync();
-        report.iteration(2, &[("a", 2.0)], &status(20));
+        report.iteration(2, &[("a", 2.0)], &Figures::default(), &status(20));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
         // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
-        report.iteration(3, &[("a", 3.0)], &status(30));
+        report.iteration(3, &[("a", 3.0)], &Figures::default(), &status(30));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
-        report.iteration(4, &[("a", 4.0)], &status(40));
+        report.iteration(4, &[("a", 4.0)], &Figures::default(), &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
     }
@@ -228,7 +241,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
         let mut report = open(place.path(), &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &status(10));
+        report.iteration(1, &[("a", 1.0)], &Figures::default(), &status(10));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (1, 0));
     }

@@ -2,14 +2,19 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
+use crate::cli::Shot;
+use crate::config::EnvConfig;
 use crate::env::{Env, Repose, Task};
 use crate::evaluate::{Actor, Episodes, Moment, Player};
-use crate::run::{self, Bar, FilmFormat, FilmWriter, OutputFile};
-use crate::sim::Renderer;
+use crate::run::{self, Animation, Bar, Clip, FilmFormat, FilmWriter, OutputFile};
+use crate::sim::{Quality, Renderer};
+
+use super::task_to_see;
 
 /// A film of episodes played one after another.
 pub struct Film {
@@ -88,6 +93,58 @@ impl Film {
         let seconds = self.all_frames as f64 / f64::from(self.fps);
         let pace = self.all_frames as f64 / self.begun.elapsed().as_secs_f64();
         Ok(format!("{width}x{height}, {} frames, {seconds:.2} s, rendered at {pace:.1} frames/s", self.all_frames))
+    }
+}
+
+/// Width, height and frames per second of an animation, and its longest duration, s: it is kept in memory and in a log.
+const ANIMATION: ([u32; 2], u32, f64) = ([320, 240], 10, 20.0);
+
+/// Films single episodes of a task for a log.
+pub struct EpisodeFilms {
+    task: Arc<Task>,
+    renderer: Renderer,
+}
+
+impl EpisodeFilms {
+    /// Prepares films of the task with these settings.
+    ///
+    /// # Errors
+    /// Fails if there is no EGL.
+    pub fn new(config: &EnvConfig) -> Result<Self> {
+        // Primitives, since a training should not need the hand's meshes.
+        let shot = Shot { size: None, camera: None, quality: None, plain: true };
+        let task = task_to_see(config, &shot, ANIMATION.0, Quality::Fast)?;
+        let renderer = Renderer::new(task.scene())?;
+        Ok(Self { task, renderer })
+    }
+
+    /// Plays the first of `episodes` and returns its first 20 s; `None` if `stop` was set meanwhile.
+    ///
+    /// # Errors
+    /// Fails if OpenGL does.
+    pub fn film(&mut self, actor: &Actor, episodes: Episodes, stop: &AtomicBool) -> Result<Option<Animation>> {
+        let (size, fps, seconds) = ANIMATION;
+        let longest = (seconds * f64::from(fps)) as usize;
+        let mut clip = Clip::new(FilmFormat { size, fps, longest });
+        let mut player = Player::new(&self.task, episodes);
+        let ctrl_dt = self.task.config().ctrl_dt;
+        for frame in 0..longest {
+            let due = (frame as f64 / (f64::from(fps) * ctrl_dt)).round() as u32;
+            let mut ended = false;
+            while player.env().episode().length < due && !ended {
+                ended = player.step(actor).is_some();
+            }
+            if ended {
+                break;
+            }
+            if stop.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
+            let env = player.env();
+            let time = f64::from(env.episode().length) * ctrl_dt;
+            clip.push(self.renderer.draw(env.simulation())?, &caption(env, episodes.first, time))?;
+        }
+        Ok(Some(Animation { size, gif: clip.finish()? }))
     }
 }
 

@@ -2,11 +2,14 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use anyhow::{Result, bail};
 
+use crate::config::EnvConfig;
 use crate::env::Task;
 use crate::evaluate::{Actor, Episodes, Moment};
+use crate::run::Animation;
 
 const ABSENT: &str = "this build cannot make films or pictures: it was built without the feature `video`";
 
@@ -41,6 +44,27 @@ impl Film {
     /// Never fails.
     pub fn finish(self) -> Result<String> {
         match self {}
+    }
+}
+
+/// A type without values: this build has no films.
+pub enum EpisodeFilms {}
+
+impl EpisodeFilms {
+    /// Fails, since this build has no films.
+    ///
+    /// # Errors
+    /// Always fails.
+    pub fn new(_: &EnvConfig) -> Result<Self> {
+        bail!(ABSENT)
+    }
+
+    /// Never called, since the type has no value.
+    ///
+    /// # Errors
+    /// Never fails.
+    pub fn film(&mut self, _: &Actor, _: Episodes, _: &AtomicBool) -> Result<Option<Animation>> {
+        match *self {}
     }
 }
 

@@ -9,6 +9,6 @@ mod scenery;
 #[cfg_attr(not(feature = "viewer"), path = "window_absent.rs")]
 mod window;
 
-pub use film::{Film, screenshot};
+pub use film::{EpisodeFilms, Film, screenshot};
 pub use scenery::task_to_see;
 pub use window::{HAS_WINDOWS, Window};

@@ -2,7 +2,9 @@
 
 use crate::agent::Iteration;
 use crate::env::{EpisodeStats, Lesson, Recent, Score};
-use crate::ppo::UpdateStats;
+use crate::ppo::{Policy, Rollout, RolloutBlock, UpdateStats};
+use crate::quantities::quantity;
+use crate::run::{Histogram, Tag};
 
 /// The scores of the episodes that ended in an iteration.
 pub(super) struct Ended {
@@ -58,11 +60,42 @@ pub(super) fn tags(lesson: Lesson, randomizes: bool) -> Vec<String> {
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
+/// What is logged besides numbers.
+const FIGURES: [&str; 5] = ["histogram/std", "histogram/actions", "histogram/advantages", "eval/film", "settings"];
+
+/// Returns the values with these names and all other things that are logged, with their descriptions.
+pub(super) fn described(names: &[String]) -> Vec<Tag> {
+    let all = names.iter().map(String::as_str).chain(FIGURES);
+    let tag = |name: &str| Tag {
+        name: name.to_owned(),
+        description: quantity(name).map(|known| known.description).unwrap_or_default(),
+    };
+    all.map(tag).collect()
+}
+
+/// Returns the histograms of a policy and of the rollout that it has just learnt from.
+pub(super) fn histograms(policy: &Policy, rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
+    let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::of(rollout.blocks.iter().flat_map(of));
+    vec![
+        (FIGURES[0], Histogram::of(policy.std().iter())),
+        (FIGURES[1], all(|block| &block.actions)),
+        (FIGURES[2], all(|block| &block.advantages)),
+    ]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::Config;
     use crate::env::{RewardTerms, Shaping};
+
+    #[test]
+    fn everything_that_is_logged_is_described() {
+        let lesson = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
+        for tag in described(&tags(lesson, true)) {
+            assert!(tag.description.ends_with('.'), "{}: {}", tag.name, tag.description);
+        }
+    }
 
     /// All logged values are different, so that swapped values are detected.
     #[test]

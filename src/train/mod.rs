@@ -1,5 +1,6 @@
 //! The training loop: collect, learn, evaluate, report, save.
 
+mod films;
 mod fork;
 mod hints;
 mod log;
@@ -9,7 +10,7 @@ mod session;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Error, Result, anyhow};
 
@@ -20,10 +21,10 @@ use crate::dump;
 use crate::env::{Lesson, Recent, Score, divergence};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::ppo::Evaluation;
-use crate::run::{self, Report, Requests, RunFolder, Status, StatusLine};
+use crate::run::{self, Figures, Report, Requests, RunFolder, Status, StatusLine};
 use crate::schedule::panic_message;
 use hints::hints;
-use log::{Ended, row, tags};
+use log::{Ended, described, histograms, row, tags};
 use saver::Saver;
 use session::Session;
 
@@ -107,8 +108,14 @@ fn say_what_next(run: &Path) {
     run::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
 }
 
-/// An iteration, and the score of its evaluation, which has no episodes if there was none.
-type Made = (Iteration<Lesson>, Score);
+/// What an iteration has made.
+#[derive(Debug)]
+struct Made {
+    iteration: Iteration<Lesson>,
+    /// The score of its evaluation, which has no episodes if there was none.
+    evaluation: Score,
+    figures: Figures,
+}
 
 impl Session {
     /// Runs one iteration and turns a panic into an error. Returns `None` if `stop` was set meanwhile. If the iteration does not
@@ -129,15 +136,36 @@ impl Session {
             self.best = if found.beats(self.best) { Some(found) } else { self.best };
             evaluation = score;
         }
-        Ok(Some((iteration, evaluation)))
+        let Some(figures) = self.figures(stop) else { return Ok(None) };
+        Ok(Some(Made { iteration, evaluation, figures }))
+    }
+
+    /// Returns what this iteration has in the event file besides numbers; `None` if `stop` was set meanwhile.
+    fn figures(&mut self, stop: &AtomicBool) -> Option<Figures> {
+        let mut figures = Figures::default();
+        if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
+            figures.histograms = histograms(self.agent.ppo.policy(), &self.agent.rollout);
+        }
+        if self.films.due(self.agent.iteration) {
+            let episodes = self.evaluation_episodes();
+            let film = self.films.film(self.agent.ppo.policy(), episodes, stop);
+            if stop.load(Ordering::Relaxed) {
+                return None;
+            }
+            figures.film = film.map(|film| ("eval/film", film));
+        }
+        Some(figures)
+    }
+
+    fn evaluation_episodes(&self) -> Episodes {
+        let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
+        Episodes { seed, purpose: "evaluation", first: 0, count }
     }
 
     /// Plays the evaluation episodes; returns `None` if `stop` was set meanwhile.
     fn evaluate(&self, stop: &AtomicBool, report: &Report) -> Result<Option<Score>> {
-        let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
-        let episodes = Episodes { seed, purpose: "evaluation", first: 0, count };
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
-        let Some(played) = evaluate(&self.task, &actor, episodes, stop, &mut |_| Ok(()))? else {
+        let Some(played) = evaluate(&self.task, &actor, self.evaluation_episodes(), stop, &mut |_| Ok(()))? else {
             return Ok(None);
         };
         let score = Score::of(&played);
@@ -152,7 +180,8 @@ impl Session {
         Ok(Some(score))
     }
 
-    fn report(&mut self, report: &mut Report, (iteration, evaluation): &Made) {
+    fn report(&mut self, report: &mut Report, made: &Made) {
+        let Made { iteration, evaluation, figures } = made;
         let ended = Ended::of(self.agent.pool.take_finished(), randomizes(&self.config));
         let mut recent = Recent::default();
         for env in self.agent.pool.envs_mut() {
@@ -168,7 +197,8 @@ impl Session {
             self.warned = true;
             report.warn(&warning);
         }
-        report.iteration(self.agent.iteration, &row(iteration, &ended, &recent, evaluation), &status);
+        let values = row(iteration, &ended, &recent, evaluation);
+        report.iteration(self.agent.iteration, &values, figures, &status);
     }
 
     /// Prints the total number of diverged steps at the end, if there was a warning.
@@ -194,6 +224,9 @@ impl Session {
 /// The iteration after which there is an early evaluation where the next one would come much later.
 const EARLY: u64 = 50;
 
+/// The iterations between two sets of histograms.
+const HISTOGRAMS_EVERY: u64 = 50;
+
 /// Returns whether there is an evaluation after this iteration. It depends on nothing else, so that a stop leaves no trace.
 fn evaluates(iteration: u64, every: u64) -> bool {
     iteration.is_multiple_of(every) || iteration == EARLY && every > EARLY
@@ -207,7 +240,7 @@ fn randomizes(config: &Config) -> bool {
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(Lesson::task(&session.config.env), randomizes(&session.config));
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
-    Report::new(saver.folder().path(), &tags, progress)
+    Report::new(saver.folder().path(), &tags, progress).described(described(&tags), session.config.to_text())
 }
 
 /// Saves the state at the end of the last complete iteration after a request to stop.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 
+use super::films::Films;
 use super::saver::{Begin, Saver, best_so_far};
 use crate::agent::{Agent, expect_states};
 use crate::cli::TrainArgs;
@@ -27,6 +28,8 @@ pub(super) struct Session {
     pub agent: Agent<Repose>,
     /// The best evaluation so far.
     pub best: Option<Evaluation>,
+    /// The films of evaluation episodes.
+    pub films: Films,
     /// The number of steps of this session on which the physics diverged.
     pub diverged: u64,
     /// Whether the warning about them was printed.
@@ -121,7 +124,8 @@ impl Session {
         config.run.shards = config.shards();
         let task = Task::new(&config.env)?;
         let (agent, scene) = (Agent::of_task(&task, &config)?, task.scene().fingerprint()?);
-        Ok(Self { config, task, agent, best: None, diverged: 0, warned: false, scene })
+        let films = Films::new(&config);
+        Ok(Self { config, task, agent, best: None, films, diverged: 0, warned: false, scene })
     }
 
     /// Returns the complete state at the end of the last iteration.

@@ -380,7 +380,8 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     };
     succeeded(plot(&[]));
     let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
-    for part in ["episode/goals", "episode/rot_dist", "episode/drop_rate", "run", "other", "million control steps"] {
+    let panels = ["goals per episode, evaluation", "goals per episode, training", "rotation error (rad), training"];
+    for part in [&panels[..], &["run", "other", "million control steps"]].concat() {
         assert!(svg.lines().any(|line| line.trim() == part), "{part} is not in\n{svg}");
     }
     // Five points per curve.
@@ -389,7 +390,7 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     succeeded(plot(&["--metric", "loss/value", "--along", "hours", "--out", "loss.svg", "--size", "400x300"]));
     let svg = fs::read_to_string(folder.path().join("loss.svg")).unwrap();
     assert!(
-        svg.contains("loss/value") && svg.contains("hours") && svg.contains("width=\"400\"") && !svg.contains("goals")
+        svg.contains("value loss") && svg.contains("hours") && svg.contains("width=\"400\"") && !svg.contains("goals")
     );
     // Among several runs, those without rows are left out; alone they are an error.
     fs::create_dir(folder.path().join("begun")).unwrap();
@@ -402,14 +403,29 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     let refused = program(folder.path(), &["plot", "nowhere", "begun"]);
     assert!(refused.status.code() == Some(1) && stderr(&refused).contains("error: begun"), "{}", stderr(&refused));
     for (more, part) in [
-        (["--metric", "loss/vaule"], "has no column loss/vaule"),
+        (["--metric", "loss/vaule"], "error: no run has a column loss/vaule; did you mean loss/value?"),
         (["--out", "x.pdf"], "must end in .svg or .png"),
         (["--out", "absent/x.svg"], "cannot write absent/x.svg"),
     ] {
         let refused = plot(&more);
         assert_eq!(refused.status.code(), Some(1));
         assert!(stderr(&refused).contains(part), "{}", stderr(&refused));
+        assert!(!stderr(&refused).contains("warning"), "it is said once: {}", stderr(&refused));
     }
+    // A column that only one of them has.
+    let table = fs::read_to_string(folder.path().join("other/metrics.csv")).unwrap().replace("loss/value", "loss/old");
+    fs::write(folder.path().join("other/metrics.csv"), table).unwrap();
+    let said = stderr(&succeeded(plot(&["--metric", "loss/value"])));
+    assert!(said.contains("warning: no column loss/value in other") && said.contains("2 runs"), "{said}");
+    // Before the first evaluation.
+    let young = "env_steps,time/collect_s,time/update_s,eval/goals\n1,1,1,\n2,1,1,\n";
+    fs::write(folder.path().join("young.csv"), young).unwrap();
+    succeeded(program(folder.path(), &["plot", "young.csv", "--metric", "eval/goals"]));
+    let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
+    assert!(svg.contains("no evaluation yet"), "{svg}");
+    let said = stderr(&succeeded(plot(&["--seeds", "--metric", "episode/length"])));
+    let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
+    assert!(svg.contains("mean of 2 seeds") && svg.contains("<polygon") && said.contains("2 runs"), "{svg}");
 }
 
 #[test]

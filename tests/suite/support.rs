@@ -145,3 +145,21 @@ pub(crate) fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
     found.sort();
     found
 }
+
+/// Returns the events in the event files of a run, in order.
+pub(crate) fn events(run: &Path) -> Vec<tensorboard_proto::event::Event> {
+    let files = fs::read_dir(run).unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<PathBuf> = files.filter(|path| path.to_string_lossy().contains("tfevents")).collect();
+    files.sort();
+    let mut found = Vec::new();
+    for file in files {
+        let bytes = fs::read(file).unwrap();
+        let mut rest = &bytes[..];
+        while !rest.is_empty() {
+            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            found.push(protobuf::Message::parse_from_bytes(&rest[12..12 + length]).unwrap());
+            rest = &rest[16 + length..];
+        }
+    }
+    found
+}

@@ -10,7 +10,7 @@ use rand::RngExt;
 use shadow_repose::rng;
 use shadow_repose::sim::{Compilation, Physics, Scene, Simulation};
 
-use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train, weights};
+use crate::support::{SCENE, command, events, metrics, names, program, stderr, succeeded, train, weights};
 
 /// The result of a run: weights, optimizer and environments of its latest checkpoint, its policy, its metrics, its score.
 pub(crate) type Result = (Vec<(String, Vec<u8>)>, Vec<(String, Vec<u8>)>, Vec<Vec<String>>, String);
@@ -161,28 +161,14 @@ fn killed(kills: usize, iterations: u64) {
     assert!(result(folder.path(), "run") == expected, "after {kills} kills");
     let left = names(&folder.path().join("run/checkpoints"));
     assert!(left.iter().all(|name| name.ends_with(".safetensors")), "{left:?}");
-    assert_eq!(events(&folder.path().join("run")), events(&undisturbed.path().join("run")));
+    assert_eq!(logged(&folder.path().join("run")), logged(&undisturbed.path().join("run")));
 }
 
-/// Returns the steps in the event files of a run, in order, with the number of values of each.
-fn events(run: &Path) -> Vec<(i64, usize)> {
-    let mut files: Vec<String> = names(run).into_iter().filter(|name| name.contains("tfevents")).collect();
-    files.sort();
-    let mut found = Vec::new();
-    for file in files {
-        let bytes = fs::read(run.join(file)).unwrap();
-        let mut rest = &bytes[..];
-        while !rest.is_empty() {
-            let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
-            let event: tensorboard_proto::event::Event =
-                protobuf::Message::parse_from_bytes(&rest[12..12 + length]).unwrap();
-            if event.has_summary() {
-                found.push((event.get_step(), event.get_summary().get_value().len()));
-            }
-            rest = &rest[16 + length..];
-        }
-    }
-    found
+/// Returns the steps in the event files of a run, in order, with the number of values of each. Every session writes the settings.
+fn logged(run: &Path) -> Vec<(i64, usize)> {
+    let events = events(run).into_iter().filter(|event| event.has_summary());
+    let all = events.map(|event| (event.get_step(), event.get_summary().get_value().to_vec()));
+    all.filter(|(_, values)| values[0].get_tag() != "settings").map(|(step, values)| (step, values.len())).collect()
 }
 
 #[test]

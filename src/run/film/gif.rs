@@ -1,7 +1,7 @@
 //! GIF: one palette for the whole film; each frame holds only what differs from the previous one.
 
 use std::borrow::Cow;
-use std::io::BufWriter;
+use std::io::{BufWriter, Write};
 
 use anyhow::{Result, anyhow};
 use color_quant::NeuQuant;
@@ -18,37 +18,37 @@ const BYTES_FOR_PALETTE: usize = 200 << 20;
 /// The most pixels sampled for choosing the palette.
 const PIXELS_FOR_PALETTE: usize = 400_000;
 
-/// A GIF file being written.
-pub(super) struct GifFilm {
+/// A GIF being written.
+pub(super) struct GifFilm<W: Write> {
     format: FilmFormat,
-    stage: Stage,
+    stage: Stage<W>,
 }
 
-enum Stage {
+enum Stage<W: Write> {
     /// Frames `[height, width, 3]` that wait for the palette.
     Gathering {
-        file: Option<OutputFile>,
+        file: Option<W>,
         frames: Vec<Vec<u8>>,
     },
-    Writing(Box<Writing>),
+    Writing(Box<Writing<W>>),
 }
 
-struct Writing {
-    encoder: Encoder<BufWriter<OutputFile>>,
+struct Writing<W: Write> {
+    encoder: Encoder<BufWriter<W>>,
     palette: Palette,
     format: FilmFormat,
     previous: Vec<u8>,
     frames: u64,
 }
 
-impl GifFilm {
+impl<W: Write> GifFilm<W> {
     /// Creates a film; writes nothing until the palette is known.
-    pub(super) fn new(file: OutputFile, format: FilmFormat) -> Self {
+    pub(super) fn new(file: W, format: FilmFormat) -> Self {
         Self { format, stage: Stage::Gathering { file: Some(file), frames: Vec::new() } }
     }
 
     /// Returns the film with a palette. On the first call, chooses the palette and writes the frames that waited for it.
-    fn writing(&mut self) -> Result<&mut Writing> {
+    fn writing(&mut self) -> Result<&mut Writing<W>> {
         if let Stage::Gathering { file, frames } = &mut self.stage {
             let file = file.take().ok_or_else(|| anyhow!("the film could not be started"))?;
             let mut writing = Writing::new(file, self.format, Palette::of(frames))?;
@@ -60,10 +60,9 @@ impl GifFilm {
             Stage::Gathering { .. } => unreachable!("the stage was just changed"),
         }
     }
-}
 
-impl FilmEncoder for GifFilm {
-    fn push(&mut self, rgb: &[u8]) -> Result<()> {
+    /// Adds the next frame `[height, width, 3]`.
+    pub(super) fn push(&mut self, rgb: &[u8]) -> Result<()> {
         match &mut self.stage {
             Stage::Gathering { frames, .. } if (frames.len() + 1) * rgb.len() <= BYTES_FOR_PALETTE => {
                 frames.push(rgb.to_vec());
@@ -73,7 +72,8 @@ impl FilmEncoder for GifFilm {
         }
     }
 
-    fn finish(mut self: Box<Self>) -> Result<OutputFile> {
+    /// Writes what is left and returns the writer.
+    pub(super) fn finish(mut self) -> Result<W> {
         self.writing()?;
         match self.stage {
             Stage::Writing(writing) => {
@@ -85,8 +85,18 @@ impl FilmEncoder for GifFilm {
     }
 }
 
-impl Writing {
-    fn new(file: OutputFile, format: FilmFormat, palette: Palette) -> Result<Self> {
+impl FilmEncoder for GifFilm<OutputFile> {
+    fn push(&mut self, rgb: &[u8]) -> Result<()> {
+        self.push(rgb)
+    }
+
+    fn finish(self: Box<Self>) -> Result<OutputFile> {
+        (*self).finish()
+    }
+}
+
+impl<W: Write> Writing<W> {
+    fn new(file: W, format: FilmFormat, palette: Palette) -> Result<Self> {
         let [width, height] = [u16::try_from(format.size[0])?, u16::try_from(format.size[1])?];
         let mut encoder = Encoder::new(BufWriter::new(file), width, height, &palette.colours())?;
         encoder.set_repeat(Repeat::Infinite)?;

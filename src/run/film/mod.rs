@@ -1,4 +1,4 @@
-//! Films and pictures as files: H.264 in MP4, GIF, PNG.
+//! Films and pictures: H.264 in MP4, GIF, PNG; in files, or a GIF in memory.
 //!
 //! One thread draws a film and another encodes it, which keeps both cores of a small machine busy.
 
@@ -107,6 +107,37 @@ impl FilmWriter {
         drop(self.frames);
         let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
         encoded.and_then(OutputFile::complete).with_context(|| format!("cannot write the film {}", self.path.display()))
+    }
+}
+
+/// A short film in memory, as a GIF.
+pub struct Clip {
+    film: GifFilm<Vec<u8>>,
+    captions: Captions,
+}
+
+impl Clip {
+    /// Starts a clip.
+    pub fn new(format: FilmFormat) -> Self {
+        Self { film: GifFilm::new(Vec::new(), format), captions: Captions::new(format.size) }
+    }
+
+    /// Adds a frame `[height, width, 3]` with these lines of text in its corner.
+    ///
+    /// # Errors
+    /// Fails if the picture is too large for a GIF.
+    pub fn push(&mut self, rgb: &[u8], caption: &[String]) -> Result<()> {
+        let mut frame = rgb.to_vec();
+        self.captions.draw(&mut frame, caption);
+        self.film.push(&frame)
+    }
+
+    /// Returns the file.
+    ///
+    /// # Errors
+    /// Fails if the picture is too large for a GIF.
+    pub fn finish(self) -> Result<Vec<u8>> {
+        self.film.finish()
     }
 }
 

@@ -1,0 +1,128 @@
+//! Reading `metrics.csv`, for charts. Any file may be given: sizes are bounded, and messages quote little of it.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+
+use super::folder::METRICS;
+use super::metrics::LONGEST_ROW;
+
+/// The most bytes that are read of a table; a million rows take half of this.
+const LARGEST_TABLE: u64 = 1 << 30;
+
+/// The most rows that are read for a chart. Ten times the default training has fewer.
+const MOST_ROWS: usize = 2_000_000;
+
+/// The largest value that is drawn. No metric comes near it, and a chart cannot be laid out far beyond.
+const LARGEST_VALUE: f64 = 1e30;
+
+/// The most characters of a file that a message quotes.
+const LONGEST_QUOTE: usize = 100;
+
+/// The most columns whose names are kept, and the most characters of such a name.
+const MOST_NAMES: usize = 1000;
+const LONGEST_NAME: usize = 64;
+
+/// Some columns of a table.
+#[derive(Debug)]
+pub struct MetricsTable {
+    /// The names of all its columns.
+    pub names: Vec<String>,
+    /// The values of each of the required columns.
+    pub required: Vec<Vec<f64>>,
+    /// The values of each of the other columns that were asked for; `None` if the table does not have it.
+    pub wanted: Vec<Option<Vec<f64>>>,
+}
+
+/// Reads these columns of a table. A value is `NaN` if its cell is empty or cannot be drawn: infinite, or beyond 1e30. `place`
+/// is the file or its run folder.
+///
+/// # Errors
+/// Fails if the file cannot be read, lacks a required column, has too many rows, or contains anything but numbers.
+pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<MetricsTable> {
+    let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
+    let context = || format!("cannot read {}", path.display());
+    let mut reader = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE));
+    let mut line = Vec::new();
+    let mut next = |line: &mut Vec<u8>| {
+        line.clear();
+        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
+    };
+    next(&mut line).with_context(context)?;
+    let header = String::from_utf8_lossy(&line).trim_end().to_owned();
+    let names: Vec<&str> = header.split(',').collect();
+    let places: Vec<Option<usize>> =
+        required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column)).collect();
+    for (column, place) in required.iter().zip(&places) {
+        let has = || format!("{} has no column {column}; it has {}", path.display(), beginning(&header));
+        place.with_context(has)?;
+    }
+    let mut columns: Vec<Option<Vec<f64>>> = places.iter().map(|place| place.map(|_| Vec::new())).collect();
+    let mut row = 0;
+    while next(&mut line).with_context(context)? > 0 {
+        row += 1;
+        ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
+        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
+        // Skips incomplete rows: the last row of a run in progress may be one.
+        if cells.len() == names.len() {
+            for (place, column) in places.iter().zip(&mut columns) {
+                let (Some(place), Some(column)) = (*place, column) else { continue };
+                let cell = String::from_utf8_lossy(cells[place]);
+                let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
+                let number: f64 = number
+                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), beginning(&cell)))?;
+                column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
+            }
+        }
+    }
+    let wanted = columns.split_off(required.len());
+    let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
+    let names = known.map(|name| (*name).to_owned()).collect();
+    Ok(MetricsTable { names, required: columns.into_iter().flatten().collect(), wanted })
+}
+
+/// Returns the beginning of a text, short enough for a message.
+fn beginning(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
+    if text.chars().count() > LONGEST_QUOTE { format!("{start}…") } else { start }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn columns_are_read_by_name_with_gaps_and_without_the_row_under_way() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(METRICS);
+        fs::write(&path, "iteration,loss\n1,0.5\n2,\n3").unwrap();
+        let read = read_metrics(&path, &["loss", "iteration"], &["iteration", "goals"]).unwrap();
+        assert!(read.required[0][0] == 0.5 && read.required[0][1].is_nan(), "{read:?}");
+        assert!(read.required[1] == [1.0, 2.0] && read.wanted == [Some(vec![1.0, 2.0]), None], "{read:?}");
+        assert_eq!(read.names, ["iteration", "loss"]);
+        assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().required[0].len(), 2);
+        let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
+        assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_drawn_are_gaps_and_what_is_quoted_is_short() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(METRICS);
+        fs::write(&path, "iteration,loss\n1,1.7e308\r\n2,-inf\n3,7\n").unwrap();
+        let read = &read_metrics(&path, &["loss"], &[]).unwrap().required[0];
+        assert!(read[0].is_nan() && read[1].is_nan() && read[2] == 7.0, "{read:?}");
+        for text in
+            [format!("{{{}\n", "\"a\": 1,".repeat(100_000)), format!("iteration,loss\n1,{}\n", "x".repeat(99_999))]
+        {
+            fs::write(&path, text).unwrap();
+            let refusal = format!("{:#}", read_metrics(&path, &["loss"], &[]).unwrap_err());
+            assert!(refusal.len() < 500 + path.as_os_str().len(), "{refusal}");
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! Films of evaluation episodes for the event file.
+
+use std::sync::atomic::AtomicBool;
+
+use crate::config::Config;
+use crate::evaluate::{Actor, Episodes};
+use crate::ppo::Policy;
+use crate::run::{self, Animation};
+use crate::see::EpisodeFilms;
+
+/// Films every so many iterations, as long as pictures can be drawn.
+pub(super) struct Films {
+    every: u64,
+    episodes: Option<EpisodeFilms>,
+}
+
+impl Films {
+    /// Prepares the films of a training. If pictures cannot be drawn, prints a warning, and there are none.
+    pub(super) fn new(config: &Config) -> Self {
+        let every = config.run.film_every;
+        let mut films = Self { every, episodes: None };
+        if every > 0 {
+            match EpisodeFilms::new(&config.env) {
+                Ok(episodes) => films.episodes = Some(episodes),
+                Err(error) => films.give_up(&error),
+            }
+        }
+        films
+    }
+
+    /// Returns whether there is a film after this iteration.
+    pub(super) fn due(&self, iteration: u64) -> bool {
+        self.episodes.is_some() && iteration.is_multiple_of(self.every)
+    }
+
+    /// Films the first of `episodes` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if
+    /// `stop` was set meanwhile.
+    pub(super) fn film(&mut self, policy: &Policy, episodes: Episodes, stop: &AtomicBool) -> Option<Animation> {
+        let made = self.episodes.as_mut()?.film(&Actor::Mean(policy.freeze()), episodes, stop);
+        made.unwrap_or_else(|error| {
+            self.give_up(&error);
+            None
+        })
+    }
+
+    fn give_up(&mut self, error: &anyhow::Error) {
+        run::say(&format!("warning: run.film_every: no films in this session: {error:#}"));
+        self.episodes = None;
+    }
+}
