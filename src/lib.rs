@@ -19,7 +19,7 @@
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, env, load, ppo, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, quantities, run |
-//! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, ppo, rng, run, schedule, sim, spaces |
+//! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, load, ppo, ranks, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, run |
 //! | [`see`] | rendering of the task: window, film, picture | cli, config, env, evaluate, run, sim |
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate |

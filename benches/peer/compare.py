@@ -4,6 +4,7 @@ Usage: python compare.py [--pairs 5] [--only NAME ...] [--program PATH] [--threa
 Needs: torch, numpy, mujoco==3.17.0 in the Python that runs it, and a prior `cargo build --release`. Keep the machine idle.
 """
 import argparse
+import csv
 import json
 import os
 import pathlib
@@ -16,6 +17,8 @@ import time
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 LARGE, SMALL = [512, 512, 256, 128], [256, 128, 64]
+# The iterations after which and until which a training is timed: compilation and the first rollouts are over.
+ITERATIONS = (10, 40)
 
 
 def run(command):
@@ -42,18 +45,25 @@ class Sides:
                                "--batch", str(batch), "--threads", str(self.threads)]))["samples_per_s"]
 
     def training(self):
-        return self.bench("training", "end_to_end_steps_per_s")
+        """Returns env steps/s of `train` without options over the iterations that the peer is timed in."""
+        steps = ITERATIONS[1] * 16384
+        with tempfile.TemporaryDirectory() as folder:
+            run([self.program, "train", "--quiet", "--run-dir", f"{folder}/run", "--total-steps", str(steps),
+                 "--threads", str(self.threads)])
+            rows = list(csv.DictReader(open(f"{folder}/run/metrics.csv")))[ITERATIONS[0]:ITERATIONS[1]]
+        seconds = sum(float(row["time/collect_s"]) + float(row["time/update_s"]) for row in rows)
+        return 16384 * len(rows) / seconds
 
-    def peer(self, torch_threads):
-        """Returns env steps/s between the first and the last line that the peer prints, one per ten iterations."""
-        command = [sys.executable, HERE / "ppo_peer.py", "--model", ROOT / "assets/shadow_hand/scene.xml",
-                   "--minutes", "0.9", "--threads", str(self.threads), "--torch-threads", str(torch_threads)]
+    def peer(self, *options):
+        """Returns env steps/s of the peer between two of the lines that it prints, one per ten iterations."""
+        command = [sys.executable, "-W", "ignore", HERE / "ppo_peer.py", "--iterations", str(ITERATIONS[1]),
+                   "--threads", str(self.threads), *options]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
-            seen = [(time.perf_counter(), json.loads(line)["env_steps"]) for line in peer.stdout]
-        if len(seen) < 2:
-            sys.exit("ppo_peer.py is too slow on this machine to be timed this way: give it more --minutes")
-        (start, before), (end, after) = seen[0], seen[-1]
-        return (after - before) / (end - start)
+            seen = [(time.perf_counter(), json.loads(line)) for line in peer.stdout]
+        if not seen or seen[-1][1]["iteration"] != ITERATIONS[1]:
+            sys.exit("ppo_peer.py has failed")
+        (start, first), (end, last) = next(line for line in seen if line[1]["iteration"] == ITERATIONS[0]), seen[-1]
+        return (last["env_steps"] - first["env_steps"]) / (end - start)
 
     def memory(self):
         with tempfile.TemporaryDirectory() as folder:
@@ -72,7 +82,7 @@ def main():
     parser.add_argument("--program", type=pathlib.Path, default=ROOT / "target/release/shadow-repose")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
-    sides = Sides(args.program, args.threads)
+    sides, all_threads = Sides(args.program, args.threads), str(args.threads)
     figures = {
         "learner samples/s, nets 512 512 256 128, batch 8192": (lambda: sides.learner(LARGE, 512, 1),
                                                                 lambda: sides.torch(LARGE, 8192)),
@@ -80,9 +90,12 @@ def main():
                                                            lambda: sides.torch(SMALL, 4096)),
         # Measured in turn within one run, so that the speed of the machine is the same for both sides.
         "environments / bare physics": (lambda: sides.bench("physics", "pool_share"), lambda: 1.0),
-        # The peer with its default of one PyTorch thread, and with PyTorch on all threads.
-        "end to end steps/s, nets 256 128 64, 1024 x 16, 4 epochs x 4": (sides.training, lambda: sides.peer(1)),
-        "the same, PyTorch on all threads": (sides.training, lambda: sides.peer(args.threads)),
+        "end to end steps/s, default training; batch API, torch.compile": (
+            sides.training, lambda: sides.peer("--torch-threads", all_threads, "--compile", "all")),
+        "end to end, without torch.compile": (sides.training, lambda: sides.peer("--torch-threads", all_threads)),
+        "end to end, mujoco.rollout in place of the batch API": (
+            sides.training, lambda: sides.peer("--torch-threads", all_threads, "--physics", "rollout")),
+        "end to end, PyTorch on one thread": (sides.training, lambda: sides.peer("--torch-threads", "1")),
     }
     print("| figure | ours | other | ratio: median (range) |\n|---|---|---|---|")
     for name, (ours, other) in figures.items():

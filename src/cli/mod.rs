@@ -388,9 +388,15 @@ pub struct BenchArgs {
     /// Number of worker threads; 0: one per core [default: {threads}]
     #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,
-    /// Measure only this part: physics and environments, gradient steps, or whole iterations
+    /// Measure only this part: physics and environments, gradient steps, whole iterations, or the parts of an iteration
     #[arg(long, value_enum, value_name = "PART")]
     pub only: Option<Part>,
+    /// Policy that acts in `--only iteration`: a checkpoint, a run, builtin or robust [default: builtin]
+    #[arg(long, value_name = "FILE|RUN|NAME")]
+    pub ckpt: Option<PathBuf>,
+    /// Picture of the parts of an iteration to write, as .svg or .png
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
     /// Print only the results, as one JSON object
     #[arg(long)]
     pub json: bool,
@@ -405,6 +411,8 @@ pub enum Part {
     Learner,
     /// Whole iterations of training
     Training,
+    /// The parts of an iteration, while a trained policy acts; only if asked for
+    Iteration,
 }
 
 /// The options of `completions`.

@@ -1,5 +1,6 @@
 //! Running mean and variance of the observations, saved with the policy that was trained on them.
 
+use pulp::Arch;
 use rayon::prelude::*;
 
 use crate::ranks::Division;
@@ -47,12 +48,11 @@ impl Normalizer {
         let size = self.mean.len();
         let in_shard = shards[0].iter().map(|part| part.len() / size).sum::<usize>();
         let rows = (in_shard * division.shards()) as f64;
-        let means = |f: &(dyn Fn(f64, usize) -> f64 + Sync)| -> Vec<f64> {
-            let totals = division.total(column_sums(shards, size, &perceive, f).into_iter());
-            totals.into_iter().map(|total| total / rows).collect()
+        let mean_of = |sums: Vec<Vec<f64>>| -> Vec<f64> {
+            division.total(sums.into_iter()).into_iter().map(|total| total / rows).collect()
         };
-        let mean = means(&|x, _| x);
-        let variance = means(&|x, column| (x - mean[column]).powi(2));
+        let mean = mean_of(column_sums(shards, &vec![0.0; size], &perceive, |x, _| x));
+        let variance = mean_of(column_sums(shards, &mean, &perceive, |x, mean| (x - mean).powi(2)));
         let total = self.count + rows;
         for i in 0..size {
             let delta = mean[i] - self.mean[i];
@@ -64,22 +64,28 @@ impl Normalizer {
     }
 }
 
-/// Returns, for each shard, the sum of `f(value, column)` over its perceived rows in each column.
+/// Returns, for each shard, the sum of `f(value, mean)` over its perceived rows in each column, with the mean of the column.
 fn column_sums(
     shards: &[Vec<&[f32]>],
-    size: usize,
+    means: &[f64],
     perceive: impl Fn(&mut [f32]) + Sync,
-    f: impl Fn(f64, usize) -> f64 + Sync,
+    f: impl Fn(f64, f64) -> f64 + Sync,
 ) -> Vec<Vec<f64>> {
+    let size = means.len();
     let of_task = |rows: &[f32]| {
         let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
-        for row in rows.chunks_exact(size) {
-            seen.copy_from_slice(row);
-            perceive(&mut seen);
-            for (column, (sum, &x)) in sums.iter_mut().zip(&seen).enumerate() {
-                *sum += f(f64::from(x), column);
-            }
-        }
+        Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for row in rows.chunks_exact(size) {
+                    seen.copy_from_slice(row);
+                    perceive(&mut seen);
+                    for ((sum, &x), &mean) in sums.iter_mut().zip(&seen).zip(means) {
+                        *sum += f(f64::from(x), mean);
+                    }
+                }
+            },
+        );
         sums
     };
     let of_shard = |parts: &Vec<&[f32]>| -> Vec<f64> {

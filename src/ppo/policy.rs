@@ -159,7 +159,7 @@ impl Policy {
 
     /// Returns the policy in its current state.
     pub fn freeze(&self) -> FrozenPolicy<'_> {
-        let [actor, critic] = [&self.layout.actor, &self.layout.critic].map(|layers| self.net(layers));
+        let [actor, critic] = [&self.layout.actor, &self.layout.critic].map(|layers| self.net(layers).for_few_rows());
         FrozenPolicy { policy: self, actor, critic, reader: self.reader(), std: self.std() }
     }
 }

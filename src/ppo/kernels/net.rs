@@ -6,6 +6,9 @@ use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
 
+/// The most elements of a product that gemm takes as a small one.
+const LARGEST_SMALL: usize = 16 * 16;
+
 /// One network with the current parameters.
 pub(crate) struct Net<'a> {
     layers: Vec<Dense<'a>>,
@@ -15,6 +18,8 @@ pub(crate) struct Net<'a> {
 /// A dense layer: weight `[outputs, inputs]` and bias `[outputs]`.
 struct Dense<'a> {
     weight: &'a [f32],
+    /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
+    turned: Option<Vec<f32>>,
     bias: &'a [f32],
     inputs: usize,
     outputs: usize,
@@ -64,11 +69,25 @@ impl<'a> Net<'a> {
     pub(crate) fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
         let layer = |layer: &parameters::Layer| Dense {
             weight: &parameters[layer.weight.clone()],
+            turned: None,
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
             outputs: layer.outputs,
         };
         Self { layers: layers.iter().map(layer).collect(), activation }
+    }
+
+    /// Returns the net with copies of the weights for many forward passes of few rows. Without them, each product first
+    /// rearranges the weights, which takes longer than the product if there are few rows. The results are the same, bit for bit.
+    pub(crate) fn for_few_rows(mut self) -> Self {
+        for layer in &mut self.layers {
+            let mut turned = vec![0.0; layer.weight.len()];
+            for (output, row) in layer.weight.chunks_exact(layer.inputs).enumerate() {
+                turned[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
+            }
+            layer.turned = Some(turned);
+        }
+        self
     }
 
     /// Returns the number of inputs.
@@ -92,7 +111,7 @@ impl<'a> Net<'a> {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
-            work.multiplier.product(y, layer.x(x, rows), layer.weight().transposed(), false);
+            work.multiplier.product(y, layer.x(x, rows), layer.turned(rows), false);
             if l + 1 == self.layers.len() {
                 add_bias(y, layer.bias);
             } else {
@@ -135,7 +154,38 @@ impl Dense<'_> {
         Matrix::new(self.weight, self.outputs, self.inputs)
     }
 
+    /// Returns the transposed weight, for a product with `rows` rows.
+    fn turned(&self, rows: usize) -> Matrix<'_> {
+        // gemm adds up single rows and small products in an order that depends on how the weight is stored.
+        let ordered = rows > 1 && rows * self.outputs > LARGEST_SMALL;
+        match self.turned.as_ref().filter(|_| ordered) {
+            Some(turned) => Matrix::new(turned, self.inputs, self.outputs),
+            None => self.weight().transposed(),
+        }
+    }
+
     fn x<'x>(&self, x: &'x [f32], rows: usize) -> Matrix<'x> {
         Matrix::new(&x[..rows * self.inputs], rows, self.inputs)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::parameters::Layout;
+    use super::*;
+
+    #[test]
+    fn copies_of_the_weights_for_few_rows_change_no_bit() {
+        let layout = Layout::new(&[300, 64], 157, 20);
+        let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
+        let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
+        work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
+        for layers in [&layout.actor, &layout.critic] {
+            let net = || Net::new(layers, &parameters, Activation::Elu);
+            for rows in [1, 2, 5, 13, 32, 64] {
+                let expected = net().forward(rows, &mut work).to_vec();
+                assert_eq!(net().for_few_rows().forward(rows, &mut work), expected, "{rows} rows");
+            }
+        }
     }
 }

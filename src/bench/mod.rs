@@ -1,27 +1,30 @@
-//! Measuring the speed of this machine: the physics alone, the environments around it, the learner, and whole iterations.
+//! Measuring the speed of this machine: the physics alone, the environments around it, the learner, whole iterations and their
+//! parts.
 
+mod iteration;
+mod measure;
+mod replay;
+
+use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use rand_distr::{Distribution, StandardNormal};
-use rayon::prelude::*;
 use serde_json::json;
 
 use crate::agent::Agent;
-use crate::cli::{BenchArgs, Part};
+use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
-use crate::env::{
-    ACTION_SIZE, Draw, End, Env, EnvPool, EpisodeStats, Lesson, OBSERVATION_SIZE, Randomization, Repose, StepBuffers,
-    Task, Transition,
-};
+use crate::env::{ACTION_SIZE, End, Env, EnvPool, OBSERVATION_SIZE, Randomization, StepBuffers, Task};
+use crate::load::Origin;
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
-use crate::rng::{self, Rng};
-use crate::run;
+use crate::rng;
+use crate::run::{self, BarChart, HeatMap, NamedBar, OutputFile, Picture};
 use crate::schedule::in_rounds;
-use crate::sim::{BareSimulation, FreeJoint, Scene, SimulationState};
-use crate::spaces::Spaces;
+use iteration::{PARTS, seconds_of_parts};
+use measure::{NEVER, median};
+use replay::{BarePool, RecordingEnv};
 
 /// The number of rounds of measuring physics and pool.
 const ROUNDS: usize = 5;
@@ -42,15 +45,16 @@ const END_TO_END_S: f64 = 8.0;
 /// The maximum number of whole iterations after the first one.
 const END_TO_END_ITERATIONS: usize = 4;
 
-/// The stop flag of what is measured, which is never set.
-static NEVER: AtomicBool = AtomicBool::new(false);
-
 /// Runs the benchmark and prints the results.
 ///
 /// # Errors
 /// Fails if a setting or the scene cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
     expect_used(&args.settings.set, "bench")?;
+    if args.only != Some(Part::Iteration) && (args.ckpt.is_some() || args.out.is_some()) {
+        return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
+    }
+    let output = args.out.as_deref().map(OutputFile::create).transpose()?;
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;
@@ -85,6 +89,18 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         lines +=
             &format!("end to end                {end_to_end:>10.0} steps/s   {total:.0} M steps take {hours:.1} h\n");
     }
+    if args.only == Some(Part::Iteration) {
+        let place = args.ckpt.as_deref().unwrap_or(Path::new("builtin"));
+        let seconds = seconds_of_parts(&task, &config, &Origin::of(place)?)?;
+        let all: f64 = seconds.iter().sum();
+        for (part, seconds) in PARTS.into_iter().zip(seconds) {
+            figures.push((part.key, seconds));
+            lines += &format!("{:<26}{:>10.1} ms        {:.1} %\n", part.name, 1e3 * seconds, 100.0 * seconds / all);
+        }
+        if let Some(output) = output {
+            picture(&config, seconds).write(output)?;
+        }
+    }
     if args.json {
         let figures = figures.into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
         let mut figures = serde_json::Map::from_iter(figures);
@@ -97,115 +113,17 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     }
 }
 
-/// The record of what an environment did in a turn.
-struct Recording {
-    /// Its state at the beginning, and what its episode has drawn.
-    start: (SimulationState, Option<Draw>),
-    /// Its controls, step by step.
-    ctrl: Vec<f64>,
-    /// The random force on the cube in each step, if there are such forces.
-    pushes: Vec<Option<[f64; 3]>>,
-    /// The episodes that began: the number of steps before each, its first state, and what it has drawn.
-    resets: Vec<(usize, SimulationState, Option<Draw>)>,
-    steps: usize,
-}
-
-/// An environment that records the input of its physics. This is the only difference from the environment of a training.
-struct RecordingEnv {
-    env: Repose,
-    recording: Recording,
-}
-
-impl RecordingEnv {
-    fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let env = Repose::randomized(task, randomization);
-        let (ctrl, pushes) = (Vec::with_capacity(TURN * ACTION_SIZE), Vec::with_capacity(TURN));
-        let start = (env.simulation().state(), None);
-        let recording = Recording { start, ctrl, pushes, resets: Vec::new(), steps: 0 };
-        Self { env, recording }
-    }
-
-    fn begin(&mut self) {
-        self.recording.start = (self.env.simulation().state(), self.env.draw().cloned());
-        self.recording.ctrl.clear();
-        self.recording.pushes.clear();
-        self.recording.resets.clear();
-        self.recording.steps = 0;
-    }
-}
-
-impl Env for RecordingEnv {
-    type Episode = EpisodeStats;
-    type Lesson = Lesson;
-    const SPACES: Spaces = Repose::SPACES;
-
-    fn set_lesson(&mut self, lesson: Lesson) {
-        self.env.set_lesson(lesson);
-    }
-
-    fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
-        self.env.reset(rng, observation);
-        let draw = self.env.draw().cloned();
-        self.recording.resets.push((self.recording.steps, self.env.simulation().state(), draw));
-    }
-
-    fn skip_ahead(&mut self, share: f64) {
-        self.env.skip_ahead(share);
-    }
-
-    fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
-        let transition = self.env.step(action, observation);
-        self.recording.pushes.push(self.env.last_step().push);
-        self.recording.ctrl.extend_from_slice(self.env.simulation().ctrl());
-        self.recording.steps += 1;
-        transition
-    }
-
-    fn redirect(&mut self, observation: &mut [f32]) {
-        self.env.redirect(observation);
-    }
-
-    fn episode(&self) -> EpisodeStats {
-        self.env.episode()
-    }
-}
-
-/// The physics alone of an environment.
-struct Replay {
-    sim: BareSimulation,
-    /// What the last episode has drawn, and its scene.
-    drawn: (Option<Draw>, Scene),
-    /// The scenes of the episodes that begin in the next turn.
-    resets: Vec<Scene>,
-}
-
-impl Replay {
-    fn new(nominal: &Scene) -> Self {
-        Self { sim: BareSimulation::new(nominal), drawn: (None, nominal.clone()), resets: Vec::new() }
-    }
-
-    /// Prepares what the replay of a turn needs: its first state and its scenes.
-    fn prepare(&mut self, recording: &Recording, scene_of: impl Fn(Option<&Draw>) -> Scene) {
-        let (state, draw) = &recording.start;
-        if *draw != self.drawn.0 {
-            self.drawn = (draw.clone(), scene_of(draw.as_ref()));
-        }
-        self.sim.start(state, &self.drawn.1);
-        self.resets = recording.resets.iter().map(|(_, _, draw)| scene_of(draw.as_ref())).collect();
-        if let (Some((_, _, draw)), Some(scene)) = (recording.resets.last(), self.resets.last()) {
-            self.drawn = (draw.clone(), scene.clone());
-        }
-    }
-
-    fn step(&mut self, recording: &Recording, step: usize, cube: FreeJoint, substeps: usize) {
-        if let Some(force) = recording.pushes[step] {
-            self.sim.push(cube.body, force);
-        }
-        self.sim.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
-        if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, ..)| after) {
-            self.sim.start(&recording.resets[i].1, &self.resets[i]);
-        }
-    }
+/// Returns a picture of the shares of the parts of an iteration.
+fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
+    let all: f64 = seconds.iter().sum();
+    let bar = |(part, seconds): (iteration::Part, f64)| {
+        let (value, note) = (seconds / all, format!("{:.0} ms", 1e3 * seconds));
+        NamedBar { name: part.name.to_owned(), value, interval: [value; 2], note }
+    };
+    let title =
+        format!("one iteration of {} steps, nets {:?}: {:.2} s", config.steps_per_iteration(), config.ppo.hidden, all);
+    let map = HeatMap { columns: Vec::new(), rows: Vec::new(), cells: Vec::new() };
+    BarChart { title, bars: PARTS.into_iter().zip(seconds).map(bar).collect(), map }
 }
 
 /// The inputs and outputs of a block of environments in a turn.
@@ -239,12 +157,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let randomization = Randomization::new(task, &config.randomization)?;
     let randomization = randomization.as_ref();
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task, randomization)).collect());
-    let scene = randomization.map_or(task.scene(), |randomization| randomization.nominal());
-    let scene_of = |draw: Option<&Draw>| match (randomization, draw) {
-        (Some(randomization), Some(draw)) => randomization.scene_of(draw, task),
-        _ => scene.clone(),
-    };
-    let mut bare: Vec<Replay> = (0..envs).map(|_| Replay::new(scene)).collect();
+    let mut bare = BarePool::new(task, randomization, envs);
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
     pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
     let mut turn = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
@@ -261,15 +174,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
         let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
         for _ in 0..turns {
             pool_seconds += turn(&mut pool, TURN);
-            let sizes = pool.block_sizes();
-            let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
-            bare.par_iter_mut().zip(&recordings).for_each(|(bare, recording)| bare.prepare(recording, scene_of));
-            bare_seconds += replay(&mut bare, &recordings, &sizes, task);
-            drop(recordings);
-            // The replay computed the same physics only if it ended in the same states.
-            let same =
-                bare.iter().zip(pool.envs_mut()).all(|(bare, env)| bare.sim.qpos() == env.env.simulation().qpos());
-            ensure!(same, "the replay of the physics did not end in the states of the environments");
+            bare_seconds += bare.replay(&mut pool)?;
         }
         let done = (turns * TURN * envs) as f64;
         rates[0].push(done / bare_seconds);
@@ -293,21 +198,6 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
             final_observations: &mut rows.final_observations,
         };
         envs.step(&rows.actions[step * size..][..size], buffers).expect("environments do not panic");
-    });
-    start.elapsed().as_secs_f64()
-}
-
-/// Replays the recordings in the same blocks and returns the seconds that the steps took.
-fn replay(bare: &mut [Replay], recordings: &[&Recording], sizes: &[usize], task: &Task) -> f64 {
-    let (cube, substeps) = (task.hand().cube, task.config().substeps());
-    let steps = recordings[0].steps;
-    let mut all = bare.iter_mut().zip(recordings);
-    let blocks: Vec<Vec<_>> = sizes.iter().map(|&size| all.by_ref().take(size).collect()).collect();
-    let start = Instant::now();
-    in_rounds(blocks, steps, |block, step| {
-        for (bare, recording) in block {
-            bare.step(recording, step, cube, substeps);
-        }
     });
     start.elapsed().as_secs_f64()
 }
@@ -338,9 +228,4 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
         }
     }
     Ok(median(if rates.len() > 1 { rates.split_off(1) } else { rates }))
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
 }

@@ -1,0 +1,110 @@
+//! Where the time of an iteration goes, in the hands of a policy that grasps.
+//!
+//! A policy that grasps makes more contacts than a new one, and contacts are what the physics takes its time for. So a trained
+//! policy acts, whatever nets the settings ask for; these are timed on what it has seen.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+
+use super::measure::{NEVER, median};
+use super::replay::{BarePool, RecordingEnv};
+use crate::agent::Agent;
+use crate::config::Config;
+use crate::env::{Env, Lesson, Randomization, Task};
+use crate::load::Origin;
+use crate::ppo::{Ppo, Rollout};
+use crate::ranks::Division;
+use crate::schedule::in_rounds;
+
+/// The control steps before measuring: from the catch of the cube until most hands turn it.
+const BEFORE: usize = 160;
+
+/// The number of iterations that are measured.
+const ROUNDS: usize = 9;
+
+/// A part of an iteration.
+#[derive(Clone, Copy)]
+pub(super) struct Part {
+    /// What a reader is told that it is.
+    pub name: &'static str,
+    /// Its key in JSON.
+    pub key: &'static str,
+}
+
+/// The parts of an iteration.
+pub(super) const PARTS: [Part; 4] = [
+    Part { name: "physics (MuJoCo)", key: "iteration_physics_s" },
+    Part { name: "observe, reward, reset", key: "iteration_environments_s" },
+    Part { name: "policy acts", key: "iteration_policy_s" },
+    Part { name: "learner", key: "iteration_learner_s" },
+];
+
+/// Returns the seconds of each of the [`PARTS`] of an iteration with these settings, as medians, while the policy of `origin`
+/// acts. The environments are without their physics.
+///
+/// # Errors
+/// Fails if there is no such policy, or if it does not fit the task.
+pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origin) -> Result<[f64; 4]> {
+    let mut acting = config.ppo.clone();
+    let (checkpoint, of_it) = origin.load(&[])?;
+    let net = of_it.net;
+    (acting.hidden, acting.activation, acting.symmetry) = (net.hidden, net.activation, net.symmetry);
+    let randomization = Randomization::new(task, &config.randomization)?;
+    let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
+    // The lesson at the end of a training.
+    let (training, end) = (config.training.clone(), config.run.total_steps);
+    let division = || Division::alone(config.shards());
+    let lesson = move |_| Lesson::at(end, &training);
+    let mut agent = Agent::new(envs, &acting, config.run.seed, division(), lesson)?;
+    agent.ppo.begin_with(&checkpoint)?;
+    let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, division())?;
+    let mut bare = BarePool::new(task, randomization.as_ref(), config.env.num_envs);
+    let mut seen = learner.rollout(&agent.pool.block_sizes());
+    let mut found: [Vec<f64>; 4] = Default::default();
+    for round in 0..BEFORE.div_ceil(config.ppo.horizon) + ROUNDS {
+        agent.pool.envs_mut().for_each(RecordingEnv::begin);
+        let collecting = Instant::now();
+        agent.collect(&NEVER)?.context("nothing stops it")?;
+        let collect_s = collecting.elapsed().as_secs_f64();
+        if round >= BEFORE.div_ceil(config.ppo.horizon) {
+            let physics_s = bare.replay(&mut agent.pool)?;
+            for (from, to) in agent.rollout.blocks.iter().zip(&mut seen.blocks) {
+                to.observations.copy_from_slice(&from.observations);
+                to.rewards.copy_from_slice(&from.rewards);
+                to.dones.copy_from_slice(&from.dones);
+            }
+            let policy_s = act_again(&learner, &mut seen);
+            let learning = Instant::now();
+            learner.update(&mut seen, round as u64, &NEVER)?.context("nothing stops it")?;
+            let learner_s = learning.elapsed().as_secs_f64();
+            agent.rollout.carry_over();
+            let acting_s = act_again(&agent.ppo, &mut seen);
+            let parts = [physics_s, collect_s - physics_s - acting_s, policy_s, learner_s];
+            found.iter_mut().zip(parts).for_each(|(found, part)| found.push(part));
+        } else {
+            agent.rollout.carry_over();
+        }
+        agent.iteration += 1;
+    }
+    Ok(found.map(median))
+}
+
+/// Lets the policy of `ppo` act on the observations of a rollout, as it does while collecting, and returns the seconds.
+fn act_again(ppo: &Ppo, rollout: &mut Rollout) -> f64 {
+    let (acting, horizon) = (ppo.acting(), rollout.horizon());
+    let blocks = rollout.blocks.iter_mut().enumerate().map(|(i, block)| {
+        let work = ppo.workspace(block.samples() / horizon);
+        (block, ppo.noise(0, i), work)
+    });
+    let blocks: Vec<_> = blocks.collect();
+    let start = Instant::now();
+    in_rounds(blocks, horizon, |(block, noise, work), t| {
+        acting.act(block, t, noise, work);
+        if t + 1 == horizon {
+            acting.finish(block, t + 1, work);
+        }
+    });
+    start.elapsed().as_secs_f64()
+}
