@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Error, Result, bail, ensure};
 
-use crate::config::{Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
+use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::env::SPACES;
 use crate::ppo::{Checkpoint, Damaged, Policy};
 use crate::run;
@@ -73,6 +73,14 @@ impl Origin {
             Self::BuiltIn(policy) => Path::new(policy.name),
             Self::File(path) => path,
         }
+    }
+
+    /// Reads the policy for use in any scene, whatever the one in which it was trained.
+    ///
+    /// # Errors
+    /// Fails as [`Origin::load`] does.
+    pub fn load_for_any_scene(&self) -> Result<(Checkpoint, PolicyConfig)> {
+        self.load(&[Override { key: MODEL.into(), value: BUILTIN_MODEL.into() }])
     }
 
     /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.

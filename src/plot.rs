@@ -25,9 +25,6 @@ const ALONG: [&str; 3] = ["env_steps", "time/collect_s", "time/update_s"];
 /// The group of the metrics of evaluations.
 const EVALUATION: &str = "eval/";
 
-/// The default size in pixels: the width of the picture, and the height of a panel.
-const SIZE: [u32; 2] = [800, 260];
-
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
@@ -48,11 +45,14 @@ struct Run {
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let output = OutputFile::create(&args.out)?;
+    run::picture_format(&output)?;
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
-    let wanted: Vec<&str> = metrics.iter().copied().chain(INSTEAD.map(|(_, other)| other)).collect();
+    let instead = if args.metric.is_empty() { &INSTEAD[..] } else { &[] };
+    let wanted: Vec<&str> = metrics.iter().copied().chain(instead.iter().map(|(_, other)| *other)).collect();
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &metrics)?;
+    ensure!(!args.seeds || runs.len() > 1, "--seeds: the mean of a single run; give the runs of several seeds");
     let column = |run: &Run, name: &str| {
         let place = wanted.iter().position(|wanted| *wanted == name)?;
         run.table.wanted[place].clone()
@@ -61,13 +61,21 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         |name: &str| runs.iter().any(|run| column(run, name).is_some_and(|all| all.iter().any(|x| !x.is_nan())));
     let mut panels = Vec::new();
     for name in metrics {
-        let other = INSTEAD.iter().find(|(usual, _)| *usual == name && args.metric.is_empty());
+        let other = instead.iter().find(|(usual, _)| *usual == name);
         let name = other.map(|(_, other)| *other).filter(|other| !known(name) && known(other)).unwrap_or(name);
         let curve = |run: &Run| column(run, name).map_or_else(Curve::default, |values| run.curve(name, &values));
         let curves: Vec<Curve> = runs.iter().map(curve).collect();
-        let curves = if args.seeds { vec![mean_and_band(&curves)] } else { curves };
         let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
-        let title = quantity(name).map_or_else(|| name.to_owned(), |known| known.title);
+        let mut title = quantity(name).map_or_else(|| name.to_owned(), |known| known.title);
+        let curves = if args.seeds {
+            let curves: Vec<Curve> = curves.into_iter().filter(|curve| !curve.points.is_empty()).collect();
+            if curves.len() < runs.len() {
+                title += &format!(" ({} of {} seeds)", curves.len(), runs.len());
+            }
+            vec![mean_and_band(&curves)]
+        } else {
+            curves
+        };
         panels.push(Subplot { title, curves, nothing: nothing.to_owned() });
     }
     let along = match args.along {
@@ -79,8 +87,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     } else {
         runs.iter().map(|run| run.name.clone()).collect()
     };
-    let size = args.size.unwrap_or([SIZE[0], SIZE[1] * panels.len() as u32]);
-    Chart { legend, along: along.to_owned(), panels, size }.write(output)?;
+    Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
     run::say(&format!("{}: {} runs", args.out.display(), runs.len()));
     Ok(())
 }

@@ -60,6 +60,7 @@ struct Row {
 /// Fails if a setting does not fit the policy's task, if an episode panics, or if the picture cannot be written.
 pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
+    output.as_ref().map(run::picture_format).transpose()?;
     let config = |condition: &Condition| {
         let sets = [&args.set[..], &condition.sets].concat();
         loaded.config_with(&sets).with_context(|| format!("row `{}`", condition.name))

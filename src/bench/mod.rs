@@ -55,6 +55,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
     }
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
+    output.as_ref().map(run::picture_format).transpose()?;
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     run::start_threads(config.run.threads)?;
@@ -90,16 +91,11 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
             &format!("end to end                {end_to_end:>10.0} steps/s   {total:.0} M steps take {hours:.1} h\n");
     }
     if args.only == Some(Part::Iteration) {
-        let place = args.ckpt.as_deref().unwrap_or(Path::new("builtin"));
-        let seconds = seconds_of_parts(&task, &config, &Origin::of(place)?)?;
-        let all: f64 = seconds.iter().sum();
-        for (part, seconds) in PARTS.into_iter().zip(seconds) {
-            figures.push((part.key, seconds));
-            lines += &format!("{:<26}{:>10.1} ms        {:.1} %\n", part.name, 1e3 * seconds, 100.0 * seconds / all);
-        }
-        if let Some(output) = output {
-            picture(&config, seconds).write(output)?;
-        }
+        let origin = Origin::of(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
+        let seconds = seconds_of_parts(&task, &config, &origin)?;
+        figures.extend(PARTS.iter().zip(seconds).map(|(part, seconds)| (part.key, seconds)));
+        lines += &table(seconds);
+        output.map_or(Ok(()), |output| picture(&config, seconds).write(output))?;
     }
     if args.json {
         let figures = figures.into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
@@ -113,11 +109,20 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     }
 }
 
+/// Returns the seconds and shares of the parts of an iteration as lines.
+fn table(seconds: [f64; 4]) -> String {
+    let all: f64 = seconds.iter().sum();
+    let line = |(part, seconds): (&iteration::Part, f64)| {
+        format!("{:<26}{:>10.1} ms        {:.1} %\n", part.name, 1e3 * seconds, 100.0 * seconds / all)
+    };
+    PARTS.iter().zip(seconds).map(line).collect()
+}
+
 /// Returns a picture of the shares of the parts of an iteration.
 fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
     let all: f64 = seconds.iter().sum();
     let bar = |(part, seconds): (iteration::Part, f64)| {
-        let (value, note) = (seconds / all, format!("{:.0} ms", 1e3 * seconds));
+        let (value, note) = (seconds / all, format!("{:.0} ms, {:.0} %", 1e3 * seconds, 100.0 * seconds / all));
         NamedBar { name: part.name.to_owned(), value, interval: [value; 2], note }
     };
     let title =

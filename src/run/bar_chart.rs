@@ -19,7 +19,7 @@ pub struct NamedBar {
     pub note: String,
 }
 
-/// Values over two quantities.
+/// Values over two quantities; nothing is drawn without rows.
 pub struct HeatMap {
     /// The names of the columns.
     pub columns: Vec<String>,
@@ -58,7 +58,7 @@ const BAR: RGBColor = COLOURS[0];
 
 impl Picture for BarChart {
     fn size(&self) -> [u32; 2] {
-        let map = GAP + CELL * (1 + self.map.rows.len() as i32);
+        let map = if self.map.rows.is_empty() { 0 } else { GAP + CELL * (1 + self.map.rows.len() as i32) };
         [WIDTH as u32, (TITLE + ROW * (1 + self.bars.len() as i32) + map + GAP) as u32]
     }
 

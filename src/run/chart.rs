@@ -38,8 +38,8 @@ pub struct Chart {
     pub along: String,
     /// Panels, from top to bottom.
     pub panels: Vec<Subplot>,
-    /// Width and height in pixels.
-    pub size: [u32; 2],
+    /// Width and height in pixels; without, 800 wide, and as high as the legend and 260 for each panel.
+    pub size: Option<[u32; 2]>,
 }
 
 /// The colour of the grid. Opaque, since not every SVG viewer supports opacity.
@@ -81,48 +81,72 @@ pub trait Picture {
     /// # Errors
     /// Fails for any other format than SVG and PNG, if the file cannot be written, or as [`Picture::draw`] does.
     fn write(&self, output: OutputFile) -> Result<()> {
+        register_font();
         let [width, height] = self.size();
-        #[cfg(feature = "video")]
-        {
-            // With this feature, text is measured for SVG too, which needs the font. Registering it twice has no effect.
-            let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
-        }
-        let extension = output.path().extension().and_then(|extension| extension.to_str()).map(str::to_owned);
-        match extension.as_deref() {
-            Some("svg") => {
+        match picture_format(&output)? {
+            Format::Svg => {
                 let mut text = String::new();
                 self.draw(SVGBackend::with_string(&mut text, (width, height)).into_drawing_area())?;
                 output.finish(text.as_bytes())
             }
             #[cfg(feature = "video")]
-            Some("png") => {
+            Format::Png => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
                 self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
                 super::write_png(output, self.size(), &rgb)
             }
-            #[cfg(not(feature = "video"))]
-            Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display()),
-            _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
         }
     }
 }
 
+/// A format of charts.
+pub enum Format {
+    /// SVG.
+    Svg,
+    /// PNG.
+    #[cfg(feature = "video")]
+    Png,
+}
+
+/// Returns the format of a chart that is to be written, so that a wrong name is noticed before the work.
+///
+/// # Errors
+/// Fails if the name does not end in .svg or .png, and for PNG without the feature `video`.
+pub fn picture_format(output: &OutputFile) -> Result<Format> {
+    match output.path().extension().and_then(|extension| extension.to_str()) {
+        Some("svg") => Ok(Format::Svg),
+        #[cfg(feature = "video")]
+        Some("png") => Ok(Format::Png),
+        #[cfg(not(feature = "video"))]
+        Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display()),
+        _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
+    }
+}
+
+/// Makes the font known. With the feature `video`, text is measured for SVG too, which needs it. A second call has no effect.
+fn register_font() {
+    #[cfg(feature = "video")]
+    let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
+}
+
 impl Picture for Chart {
     fn size(&self) -> [u32; 2] {
-        self.size
+        let [width, panel] = SIZE;
+        let legend = || legend_height(&self.legend_rows(width));
+        self.size.unwrap_or_else(|| [width, legend() + panel * self.panels.len() as u32])
     }
 
     fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
         let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
         area.fill(&WHITE).map_err(failed)?;
-        let rows = self.legend_rows(&area).map_err(failed)?;
-        let height = ROW * rows.len() as u32 + 2 * MARGIN;
+        let [width, whole] = self.size();
+        let rows = self.legend_rows(width);
+        let height = legend_height(&rows);
         ensure!(
-            height + LEAST_PANEL * self.panels.len() as u32 <= self.size[1],
-            "{} panels and the names of {} curves do not fit into {} pixels: use a larger --size",
+            height + LEAST_PANEL * self.panels.len() as u32 <= whole,
+            "{} panels and the names of {} curves do not fit into {whole} pixels: use a larger --size",
             self.panels.len(),
             self.legend.len(),
-            self.size[1]
         );
         let (top, below) = area.split_vertically(height);
         draw_legend(&top, &rows).map_err(failed)?;
@@ -134,6 +158,9 @@ impl Picture for Chart {
         area.present().map_err(failed)
     }
 }
+
+/// The default width of a chart and height of a panel in pixels.
+const SIZE: [u32; 2] = [800, 260];
 
 // Lengths in the legend in pixels: the height of a row, the margins, the length of a line, the space after a name.
 const ROW: u32 = 20;
@@ -157,22 +184,27 @@ fn label() -> TextStyle<'static> {
 }
 
 impl Chart {
-    /// Arranges the names in rows as wide as the chart.
-    fn legend_rows<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>) -> Result<Vec<LegendRow<'_>>, Failure<B>> {
-        let (margin, width) = (2 * MARGIN as i32, self.size[0] as i32);
+    /// Arranges the names in rows of a chart of this width.
+    fn legend_rows(&self, width: u32) -> Vec<LegendRow<'_>> {
+        let margin = 2 * MARGIN as i32;
         let (mut rows, mut left) = (vec![Vec::new()], margin);
         for (name, style) in self.legend.iter().zip(styles()) {
-            let (text, _) = area.estimate_text_size(name, &label())?;
+            // Without a font, the width of a letter is a guess.
+            let text = label().font.box_size(name).map_or(7 * name.len() as u32, |(width, _)| width);
             let length = LINE + MARGIN as i32 + text as i32 + SPACE;
-            if left > margin && left + length - SPACE > width {
+            if left > margin && left + length - SPACE > width as i32 {
                 rows.push(Vec::new());
                 left = margin;
             }
             rows.last_mut().expect("there is a row").push((&name[..], style, left));
             left += length;
         }
-        Ok(rows)
+        rows
     }
+}
+
+fn legend_height(rows: &[LegendRow]) -> u32 {
+    ROW * rows.len() as u32 + 2 * MARGIN
 }
 
 fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, rows: &[LegendRow]) -> Result<(), Failure<B>> {
@@ -274,7 +306,7 @@ mod tests {
     fn svg(panels: Vec<Subplot>) -> String {
         let curves = panels.iter().map(|panel| panel.curves.len()).max().unwrap();
         let legend = (1..=curves).map(|i| format!("run {i}")).collect();
-        let chart = Chart { legend, along: "steps".into(), panels, size: [600, 500] };
+        let chart = Chart { legend, along: "steps".into(), panels, size: None };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
         chart.write(OutputFile::create(&path).unwrap()).unwrap();

@@ -29,7 +29,7 @@ pub(super) struct EventFile {
 }
 
 /// The tag of the settings.
-pub(super) const SETTINGS: &str = "settings";
+pub const SETTINGS: &str = "settings";
 
 impl EventFile {
     /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,

@@ -25,8 +25,9 @@ mod summary;
 mod table;
 
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
-pub use chart::{Chart, Curve, Picture, Subplot};
+pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
 pub use checkpoints::Checkpoints;
+pub use events::SETTINGS;
 pub use file::{read_bytes, read_text, same_file};
 #[cfg(feature = "video")]
 pub use film::{Clip, FilmFormat, FilmWriter, write_png};

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
@@ -10,7 +10,7 @@ use anyhow::{Result, ensure};
 use crate::cli::Shot;
 use crate::config::EnvConfig;
 use crate::env::{Env, Repose, Task};
-use crate::evaluate::{Actor, Episodes, Moment, Player};
+use crate::evaluate::{Actor, Episodes, Moment, Player, evaluate};
 use crate::run::{self, Animation, Bar, Clip, FilmFormat, FilmWriter, OutputFile};
 use crate::sim::{Quality, Renderer};
 
@@ -118,7 +118,7 @@ impl EpisodeFilms {
         Ok(Self { task, renderer })
     }
 
-    /// Plays the first of `episodes` and returns its first 20 s; `None` if `stop` was set meanwhile.
+    /// Plays the first of `episodes` as an evaluation does and returns its first 20 s; `None` if `stop` was set meanwhile.
     ///
     /// # Errors
     /// Fails if OpenGL does.
@@ -126,25 +126,20 @@ impl EpisodeFilms {
         let (size, fps, seconds) = ANIMATION;
         let longest = (seconds * f64::from(fps)) as usize;
         let mut clip = Clip::new(FilmFormat { size, fps, longest });
-        let mut player = Player::new(&self.task, episodes);
-        let ctrl_dt = self.task.config().ctrl_dt;
-        for frame in 0..longest {
-            let due = (frame as f64 / (f64::from(fps) * ctrl_dt)).round() as u32;
-            let mut ended = false;
-            while player.env().episode().length < due && !ended {
-                ended = player.step(actor).is_some();
+        let (task, renderer, ctrl_dt) = (&self.task, &mut self.renderer, self.task.config().ctrl_dt);
+        let mut frames = 0;
+        let mut observe = |moment: Moment| {
+            let time = f64::from(moment.env.episode().length) * ctrl_dt;
+            let over = moment.step.is_some_and(|(_, end)| end.is_some());
+            while !over && frames < longest && frames as f64 / f64::from(fps) <= time + 1e-9 {
+                let picture = renderer.draw(moment.env.simulation())?;
+                clip.push(picture, &caption(moment.env, moment.episode, time))?;
+                frames += 1;
             }
-            if ended {
-                break;
-            }
-            if stop.load(Ordering::Relaxed) {
-                return Ok(None);
-            }
-            let env = player.env();
-            let time = f64::from(env.episode().length) * ctrl_dt;
-            clip.push(self.renderer.draw(env.simulation())?, &caption(env, episodes.first, time))?;
-        }
-        Ok(Some(Animation { size, gif: clip.finish()? }))
+            Ok(())
+        };
+        let played = evaluate(task, actor, Episodes { count: 1, ..episodes }, stop, &mut observe)?;
+        played.map(|_| Ok(Animation { size, gif: clip.finish()? })).transpose()
     }
 }
 

@@ -1,11 +1,15 @@
 //! Films of evaluation episodes for the event file.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::AtomicBool;
+
+use anyhow::{Error, anyhow};
 
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes};
 use crate::ppo::Policy;
-use crate::run::{self, Animation};
+use crate::run::{self, Animation, Report};
+use crate::schedule::panic_message;
 use crate::see::EpisodeFilms;
 
 /// Films every so many iterations, as long as pictures can be drawn.
@@ -22,7 +26,7 @@ impl Films {
         if every > 0 {
             match EpisodeFilms::new(&config.env) {
                 Ok(episodes) => films.episodes = Some(episodes),
-                Err(error) => films.give_up(&error),
+                Err(error) => run::say(&format!("warning: {}", absent(&error))),
             }
         }
         films
@@ -35,16 +39,26 @@ impl Films {
 
     /// Films the first of `episodes` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if
     /// `stop` was set meanwhile.
-    pub(super) fn film(&mut self, policy: &Policy, episodes: Episodes, stop: &AtomicBool) -> Option<Animation> {
-        let made = self.episodes.as_mut()?.film(&Actor::Mean(policy.freeze()), episodes, stop);
+    pub(super) fn film(
+        &mut self,
+        policy: &Policy,
+        episodes: Episodes,
+        stop: &AtomicBool,
+        report: &Report,
+    ) -> Option<Animation> {
+        let films = self.episodes.as_mut()?;
+        let film = || films.film(&Actor::Mean(policy.freeze()), episodes, stop);
+        // A film that fails must not end the training, even by a panic.
+        let made = catch_unwind(AssertUnwindSafe(film));
+        let made = made.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
         made.unwrap_or_else(|error| {
-            self.give_up(&error);
+            report.warn(&absent(&error));
+            self.episodes = None;
             None
         })
     }
+}
 
-    fn give_up(&mut self, error: &anyhow::Error) {
-        run::say(&format!("warning: run.film_every: no films in this session: {error:#}"));
-        self.episodes = None;
-    }
+fn absent(error: &Error) -> String {
+    format!("run.film_every: no films in this session: {error:#}")
 }

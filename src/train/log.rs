@@ -4,7 +4,7 @@ use crate::agent::Iteration;
 use crate::env::{EpisodeStats, Lesson, Recent, Score};
 use crate::ppo::{Policy, Rollout, RolloutBlock, UpdateStats};
 use crate::quantities::quantity;
-use crate::run::{Histogram, Tag};
+use crate::run::{self, Histogram, Tag};
 
 /// The scores of the episodes that ended in an iteration.
 pub(super) struct Ended {
@@ -60,12 +60,15 @@ pub(super) fn tags(lesson: Lesson, randomizes: bool) -> Vec<String> {
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
-/// What is logged besides numbers.
-const FIGURES: [&str; 5] = ["histogram/std", "histogram/actions", "histogram/advantages", "eval/film", "settings"];
+// What is logged besides numbers and settings.
+const STD: &str = "histogram/std";
+const ACTIONS: &str = "histogram/actions";
+const ADVANTAGES: &str = "histogram/advantages";
+pub(super) const FILM: &str = "eval/film";
 
 /// Returns the values with these names and all other things that are logged, with their descriptions.
 pub(super) fn described(names: &[String]) -> Vec<Tag> {
-    let all = names.iter().map(String::as_str).chain(FIGURES);
+    let all = names.iter().map(String::as_str).chain([STD, ACTIONS, ADVANTAGES, FILM, run::SETTINGS]);
     let tag = |name: &str| Tag {
         name: name.to_owned(),
         description: quantity(name).map(|known| known.description).unwrap_or_default(),
@@ -77,17 +80,20 @@ pub(super) fn described(names: &[String]) -> Vec<Tag> {
 pub(super) fn histograms(policy: &Policy, rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
     let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::of(rollout.blocks.iter().flat_map(of));
     vec![
-        (FIGURES[0], Histogram::of(policy.std().iter())),
-        (FIGURES[1], all(|block| &block.actions)),
-        (FIGURES[2], all(|block| &block.advantages)),
+        (STD, Histogram::of(policy.std().iter())),
+        (ACTIONS, all(|block| &block.actions)),
+        (ADVANTAGES, all(|block| &block.advantages)),
     ]
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicBool;
+
     use super::*;
+    use crate::agent::Agent;
     use crate::config::Config;
-    use crate::env::{RewardTerms, Shaping};
+    use crate::env::{RewardTerms, Shaping, Task};
 
     #[test]
     fn everything_that_is_logged_is_described() {
@@ -95,6 +101,20 @@ mod tests {
         for tag in described(&tags(lesson, true)) {
             assert!(tag.description.ends_with('.'), "{}: {}", tag.name, tag.description);
         }
+    }
+
+    #[test]
+    fn histograms_are_those_of_the_quantities_whose_names_they_have() {
+        let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
+        let config = Config::resolve(None, &sets.map(|set| set.parse().unwrap())).unwrap();
+        let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
+        agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+        let found = histograms(agent.ppo.policy(), &agent.rollout);
+        let [(STD, std), (ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
+        let count = |histogram: &Histogram| histogram.counts.iter().sum::<f64>();
+        assert_eq!([count(std), count(actions), count(advantages)], [20.0, 32.0 * 20.0, 32.0]);
+        assert!(std.min > 0.5 && std.max < 0.7 && actions.min < -0.5, "{found:?}");
+        assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");
     }
 
     /// All logged values are different, so that swapped values are detected.

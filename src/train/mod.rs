@@ -24,7 +24,7 @@ use crate::ppo::Evaluation;
 use crate::run::{self, Figures, Report, Requests, RunFolder, Status, StatusLine};
 use crate::schedule::panic_message;
 use hints::hints;
-use log::{Ended, described, histograms, row, tags};
+use log::{Ended, FILM, described, histograms, row, tags};
 use saver::Saver;
 use session::Session;
 
@@ -136,23 +136,23 @@ impl Session {
             self.best = if found.beats(self.best) { Some(found) } else { self.best };
             evaluation = score;
         }
-        let Some(figures) = self.figures(stop) else { return Ok(None) };
+        let Some(figures) = self.figures(stop, report) else { return Ok(None) };
         Ok(Some(Made { iteration, evaluation, figures }))
     }
 
     /// Returns what this iteration has in the event file besides numbers; `None` if `stop` was set meanwhile.
-    fn figures(&mut self, stop: &AtomicBool) -> Option<Figures> {
+    fn figures(&mut self, stop: &AtomicBool, report: &Report) -> Option<Figures> {
         let mut figures = Figures::default();
         if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
             figures.histograms = histograms(self.agent.ppo.policy(), &self.agent.rollout);
         }
         if self.films.due(self.agent.iteration) {
             let episodes = self.evaluation_episodes();
-            let film = self.films.film(self.agent.ppo.policy(), episodes, stop);
+            let film = self.films.film(self.agent.ppo.policy(), episodes, stop, report);
             if stop.load(Ordering::Relaxed) {
                 return None;
             }
-            figures.film = film.map(|film| ("eval/film", film));
+            figures.film = film.map(|film| (FILM, film));
         }
         Some(figures)
     }

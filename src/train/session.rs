@@ -9,7 +9,7 @@ use super::films::Films;
 use super::saver::{Begin, Saver, best_so_far};
 use crate::agent::{Agent, expect_states};
 use crate::cli::TrainArgs;
-use crate::config::{BUILTIN_MODEL, Config, Override, user_file};
+use crate::config::{Config, Override, user_file};
 use crate::env::{Repose, SPACES, Task};
 use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Array, Checkpoint, Evaluation};
@@ -195,9 +195,7 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
 /// Loads the policy of a checkpoint or run for a training with this configuration to begin with.
 fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Checkpoint> {
     let origin = Origin::of(place)?;
-    // The scene in which it was trained does not matter.
-    let any_scene = Override { key: MODEL.into(), value: BUILTIN_MODEL.into() };
-    let (checkpoint, of_it) = origin.load(&[any_scene])?;
+    let (checkpoint, of_it) = origin.load_for_any_scene()?;
     let fitting = || {
         let net = config.ppo.net();
         checkpoint.expect_policy(&net, &SPACES)?;

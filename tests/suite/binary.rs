@@ -426,6 +426,20 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     let said = stderr(&succeeded(plot(&["--seeds", "--metric", "episode/length"])));
     let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
     assert!(svg.contains("mean of 2 seeds") && svg.contains("<polygon") && said.contains("2 runs"), "{svg}");
+    succeeded(plot(&["--seeds", "--metric", "loss/value"]));
+    let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
+    assert!(svg.contains("value loss (1 of 2 seeds)") && !svg.contains("nothing yet"), "{svg}");
+    let refused = program(folder.path(), &["plot", "run", "--seeds"]);
+    assert!(stderr(&refused).contains("error: --seeds"), "{}", stderr(&refused));
+    // The names of many runs make the picture higher.
+    for i in 10..50 {
+        let run = folder.path().join(format!("20261123-0700{i}-a-long-name-of-a-run"));
+        fs::create_dir(&run).unwrap();
+        fs::write(run.join("metrics.csv"), young).unwrap();
+    }
+    let many: Vec<String> = (10..50).map(|i| format!("20261123-0700{i}-a-long-name-of-a-run")).collect();
+    let many: Vec<&str> = many.iter().map(String::as_str).collect();
+    succeeded(program(folder.path(), &[&["plot", "--metric", "eval/goals"], &many[..]].concat()));
 }
 
 #[test]
@@ -447,6 +461,30 @@ fn bench_prints_every_figure() {
     }
     assert_eq!((figures["threads"].as_u64(), figures["num_envs"].as_u64()), (Some(2), Some(64)));
     assert_eq!(figures["hidden"], serde_json::json!([16]));
+}
+
+#[test]
+fn bench_tells_where_the_time_of_an_iteration_goes() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = ["bench", "--only", "iteration", "--set", "env.num_envs=16", "--set", "ppo.hidden=[16]"];
+    let bench = |more: &[&str]| program(folder.path(), &[&small[..], more].concat());
+    let figures = json(&succeeded(bench(&["--json", "--out", "parts.svg"])));
+    for key in ["iteration_physics_s", "iteration_policy_s", "iteration_learner_s"] {
+        assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
+    }
+    assert!(figures["iteration_environments_s"].is_f64());
+    let svg = fs::read_to_string(folder.path().join("parts.svg")).unwrap();
+    for part in ["physics (MuJoCo)", "observe, reward, reset", "policy acts", "learner", "nets [16]"] {
+        assert!(svg.contains(part), "{part}: {svg}");
+    }
+    let refused = bench(&["--out", "parts.pdf"]);
+    assert!(stderr(&refused).contains("must end in .svg or .png"), "{}", stderr(&refused));
+    let refused = bench(&["--ckpt", "nowhere"]);
+    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("nowhere"), "{}", stderr(&refused));
+    for option in [["--ckpt", "builtin"], ["--out", "x.svg"]] {
+        let refused = program(folder.path(), &[&["bench", "--only", "learner"], &option[..]].concat());
+        assert_eq!(refused.status.code(), Some(2), "{}", stderr(&refused));
+    }
 }
 
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
