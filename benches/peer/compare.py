@@ -18,7 +18,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 LARGE, SMALL = [512, 512, 256, 128], [256, 128, 64]
 # The iterations after which and until which a training is timed: compilation and the first rollouts are over.
-ITERATIONS = (10, 40)
+ITERATIONS = (10, 30)
 
 
 def run(command):
