@@ -54,8 +54,8 @@ pub enum Origin {
 }
 
 impl Origin {
-    /// Returns the origin that `place` names: `builtin`, `robust` unless there is such a file or folder, a file, or a run folder, which stands for its best checkpoint or, if
-    /// there is none yet, its latest.
+    /// Returns the origin that `place` names: `builtin`, `robust` unless there is such a file or folder, a file, or a run folder,
+    /// which stands for its best checkpoint or, if there is none yet, its latest.
     ///
     /// # Errors
     /// Fails if there is no such file, run folder or checkpoint.

@@ -1,6 +1,6 @@
 //! Where the time of an iteration goes, in the hands of a policy that grasps.
 //!
-//! A policy that grasps makes more contacts than a new one, and contacts are what the physics takes its time for. So a trained
+//! A policy that grasps makes other contacts than a new one, and contacts are what the physics takes its time for. So a trained
 //! policy acts, whatever nets the settings ask for; these are timed on what it has seen. What remains of collecting without physics and policy is a
 //! difference of three times, so it is less exact than they are.
 
