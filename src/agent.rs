@@ -38,6 +38,8 @@ pub struct Agent<E: Env> {
     pub env_steps: u64,
     /// The point at which it was forked from another training, if it was.
     pub fork: Option<Fork>,
+    /// The shards, of which this agent computes those of its rank.
+    pub division: Division,
 }
 
 /// The record of an iteration.
@@ -73,10 +75,18 @@ impl Agent<Repose> {
     /// # Errors
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
     pub fn of_task(task: &Arc<Task>, config: &Config) -> Result<Self> {
+        Self::divided(task, config, Division::alone(config.shards()))
+    }
+
+    /// The same for the shards that `division` assigns to this rank.
+    ///
+    /// # Errors
+    /// Fails as [`Agent::of_task`] does.
+    pub fn divided(task: &Arc<Task>, config: &Config, division: Division) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let envs = (0..config.env.num_envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
+        let envs = config.env.num_envs / division.shards() * division.own().len();
+        let envs = (0..envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
         let training = config.training.clone();
-        let division = Division::alone(config.shards());
         Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &training))
     }
 }
@@ -96,7 +106,7 @@ impl<E: Env> Agent<E> {
     ) -> Result<Self> {
         let mut pool = EnvPool::of_shards(seed, envs, &division);
         let steps = (config.horizon * pool.count() / division.own().len() * division.shards()) as u64;
-        let ppo = Ppo::new(config, E::SPACES, seed, division)?;
+        let ppo = Ppo::new(config, E::SPACES, seed, division.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
         pool.set_lesson(lessons(0));
@@ -111,6 +121,7 @@ impl<E: Env> Agent<E> {
             iteration: 0,
             env_steps: 0,
             fork: None,
+            division,
         })
     }
 
@@ -146,13 +157,14 @@ impl<E: Env> Agent<E> {
 }
 
 impl<E: Resumable> Agent<E> {
-    /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation.
+    /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation. All
+    /// ranks call it together; on others than the first, it lacks the environments and is of no use.
     pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
         let progress = Progress { iteration, env_steps, best, fork };
         let mut checkpoint = self.ppo.checkpoint(config, progress);
-        let EnvState { numbers, counters } = self.pool.save();
-        let rows = self.pool.count();
+        let EnvState { numbers, counters } = self.pool.save().gathered(&self.division);
+        let rows = self.pool.count() * self.division.shards() / self.division.own().len();
         checkpoint.insert(NUMBERS, Array::F64(vec![rows, numbers.len() / rows], numbers));
         checkpoint.insert(COUNTERS, Array::U64(vec![rows, counters.len() / rows], counters));
         checkpoint

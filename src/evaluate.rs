@@ -4,6 +4,7 @@
 //! that the nets always see batches of the same shape and results do not depend on threads or the number of episodes.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,6 +15,7 @@ use rayon::prelude::*;
 
 use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
 use crate::ppo::{FrozenPolicy, Workspace};
+use crate::ranks::Division;
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
 
@@ -92,30 +94,67 @@ pub fn evaluate(
     interrupted: &AtomicBool,
     observer: &mut dyn FnMut(Moment) -> Result<()>,
 ) -> Result<Option<Vec<EpisodeStats>>> {
-    let mut lanes: Vec<Lane> = (0..LANES.min(episodes.count)).map(|_| Lane::new(task)).collect();
+    play(task, actor, episodes, 0..LANES, interrupted, observer)
+}
+
+/// Plays the episodes, shared out among the ranks, and returns all of them to the first rank, in order. Returns `None` if
+/// `interrupted` was set meanwhile.
+///
+/// # Errors
+/// Fails with the episode's number if an episode panics.
+pub fn evaluate_together(
+    task: &Arc<Task>,
+    actor: &Actor,
+    episodes: Episodes,
+    division: &Division,
+    interrupted: &AtomicBool,
+) -> Result<Option<Vec<EpisodeStats>>> {
+    let own = play(task, actor, episodes, division.part_of(LANES), interrupted, &mut |_| Ok(()))?;
+    let Some(own) = own else { return Ok(None) };
+    let all = EpisodeStats::gathered(own, division);
+    let numbers = division.parts_of(LANES).into_iter().flat_map(|lanes| episodes.on(lanes));
+    let mut numbered: Vec<(usize, EpisodeStats)> = numbers.zip(all).collect();
+    numbered.sort_unstable_by_key(|(number, _)| *number);
+    Ok(Some(numbered.into_iter().map(|(_, episode)| episode).collect()))
+}
+
+/// Plays those of the episodes that run on some of the lanes. The other lanes are idle, so that each episode sees batches of the
+/// same shape, and the same row of them, whoever plays it.
+fn play(
+    task: &Arc<Task>,
+    actor: &Actor,
+    episodes: Episodes,
+    own: Range<usize>,
+    interrupted: &AtomicBool,
+    observer: &mut dyn FnMut(Moment) -> Result<()>,
+) -> Result<Option<Vec<EpisodeStats>>> {
+    let own = own.start.min(episodes.count)..own.end.min(episodes.count);
+    let mut lanes: Vec<Lane> = own.clone().map(|_| Lane::new(task)).collect();
     let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
     let mut actions = vec![0.0; LANES * ACTION_SIZE];
     let mut work = actor.policy().map(|policy| policy.workspace(LANES));
     let mut results = Vec::with_capacity(episodes.count);
-    let end = episodes.first + episodes.count;
-    for first in (episodes.first..end).step_by(LANES) {
-        let started = LANES.min(end - first);
-        let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE);
+    for first in episodes.groups() {
+        let started = own.len().min((episodes.end() - first).saturating_sub(own.start));
+        // The number of the first episode of this rank.
+        let first = first + own.start;
+        let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start);
         let starting = lanes[..started].par_iter_mut().zip(rows).enumerate();
         starting.for_each(|(i, (lane, row))| lane.start(episodes, first + i, row));
         let mut ends: Vec<Option<End>> = vec![None; lanes.len()];
-        for (i, observation) in observations.chunks_exact(OBSERVATION_SIZE).take(started).enumerate() {
+        let rows = observations.chunks_exact(OBSERVATION_SIZE).skip(own.start);
+        for (i, observation) in rows.take(started).enumerate() {
             observer(Moment { episode: first + i, env: &lanes[i].env, observation, step: None })?;
         }
         while lanes.iter().any(|lane| lane.running) {
             if interrupted.load(Ordering::Relaxed) {
                 return Ok(None);
             }
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+            actor.choose(&observations, &mut lanes, own.start, &mut actions, work.as_mut());
             lanes
                 .par_iter_mut()
-                .zip(actions.par_chunks_exact(ACTION_SIZE))
-                .zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE))
+                .zip(actions.par_chunks_exact(ACTION_SIZE).skip(own.start))
+                .zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start))
                 .zip(&mut ends)
                 .enumerate()
                 .filter(|(_, (((lane, _), _), _))| lane.running)
@@ -125,8 +164,8 @@ pub fn evaluate(
                     stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
                 })?;
             for (i, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.running) {
-                let observation = &observations[i * OBSERVATION_SIZE..][..OBSERVATION_SIZE];
-                let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
+                let observation = &observations[(own.start + i) * OBSERVATION_SIZE..][..OBSERVATION_SIZE];
+                let action = &actions[(own.start + i) * ACTION_SIZE..][..ACTION_SIZE];
                 let step = Some((action, ends[i]));
                 observer(Moment { episode: first + i, env: &lane.env, observation, step })?;
                 lane.running = ends[i].is_none();
@@ -135,6 +174,23 @@ pub fn evaluate(
         results.extend(lanes[..started].iter().map(|lane| lane.env.episode()));
     }
     Ok(Some(results))
+}
+
+impl Episodes {
+    fn end(&self) -> usize {
+        self.first + self.count
+    }
+
+    /// Returns the first episode of each group that runs together.
+    fn groups(&self) -> impl Iterator<Item = usize> + use<> {
+        (self.first..self.end()).step_by(LANES)
+    }
+
+    /// Returns the numbers of the episodes that run on these lanes, in the order in which they are played.
+    fn on(&self, lanes: Range<usize>) -> impl Iterator<Item = usize> + use<> {
+        let end = self.end();
+        self.groups().flat_map(move |first| (first + lanes.start..first + lanes.end).take_while(move |&it| it < end))
+    }
 }
 
 impl Actor<'_> {
@@ -156,12 +212,20 @@ impl Actor<'_> {
         }
     }
 
-    /// Writes the actions of all lanes; those of lanes that have ended are not used.
-    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
+    /// Writes the actions `[LANES, A]` of these lanes, the first of which has the row `first_lane`; those of lanes that have ended
+    /// are not used.
+    fn choose(
+        &self,
+        observations: &[f32],
+        lanes: &mut [Lane],
+        first_lane: usize,
+        actions: &mut [f32],
+        work: Option<&mut Workspace>,
+    ) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
         }
-        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
+        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE).skip(first_lane)) {
             match self {
                 Actor::Mean(_) => {}
                 Actor::Stochastic(policy) => {
@@ -212,7 +276,7 @@ impl Player {
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
         self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
-        actor.choose(&self.observation, lane, &mut self.action, self.work.as_mut());
+        actor.choose(&self.observation, lane, 0, &mut self.action, self.work.as_mut());
         self.lane.env.step(&self.action, &mut self.observation).end
     }
 
@@ -258,7 +322,7 @@ mod tests {
                 }
             }
             let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * ACTION_SIZE]);
-            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+            actor.choose(&observations, &mut lanes, 0, &mut actions, work.as_mut());
             let (one, other) = actions.split_at(ACTION_SIZE);
             assert_eq!(one == other, alike, "{symmetry:?}");
         }

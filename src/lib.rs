@@ -12,8 +12,8 @@
 //!
 //! | module | what it is | imports |
 //! |---|---|---|
-//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, run, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, quantities, run, schedule, see, sim |
+//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, ranks, run, train, view |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, quantities, ranks, run, schedule, see, sim |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, env, evaluate, load, run |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
@@ -25,7 +25,7 @@
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate |
 //! | [`pace`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks |
-//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, rng, schedule |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, rng, schedule |
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
 //! | [`load`] | checkpoints and policies from untrusted files | config, env, ppo, run |
 //! | [`dump`] | the steps that led to a diverged state, as JSON | config, env |
@@ -36,7 +36,7 @@
 //! | [`config`] | all settings, their defaults and rules | run |
 //! | [`run`] | the outside world: run folder, files, logs, terminal, signals | - |
 //! | [`quantities`] | what a training logs: names, meanings, units | - |
-//! | [`ranks`] | the division of a training into shards, and the ranks that compute them | - |
+//! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | - |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
 //! | [`quat`] | rotations | - |
@@ -62,6 +62,9 @@
 //! ```
 //! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
 //! `ppo::kernels` describes how a minibatch is computed; `ppo::candle` does the same with candle's tensors.
+//!
+//! With several ranks each step of this is computed by all of them, on their own shards; [`ranks`] describes what they tell one
+//! another.
 //!
 //! # Recovery
 //! At the end of each iteration [`train`] copies everything that the next one depends on into a [`ppo::Checkpoint`] with

@@ -4,16 +4,26 @@ use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use shadow_repose::cli::{self, Command};
+use shadow_repose::ranks::Launched;
 use shadow_repose::run::Requests;
 use shadow_repose::train::train;
-use shadow_repose::{bench, export, manual, play, plot, run, view};
+use shadow_repose::{bench, export, manual, play, plot, ranks, run, view};
 
 fn main() -> ExitCode {
     let command = match cli::parse() {
         Ok(cli) => cli.command,
         Err(answer) => return tell(&answer),
     };
-    let result = Requests::listen(matches!(command, Command::Train(_))).and_then(|requests| match command {
+    let trains = matches!(command, Command::Train(_));
+    if let Some(launched) = ranks::launched() {
+        if !trains {
+            return refuse(launched);
+        }
+        if launched.rank > 0 {
+            run::speak_as(&format!("rank {}", launched.rank));
+        }
+    }
+    let result = Requests::listen(trains).and_then(|requests| match command {
         Command::Train(args) => train(&args, &requests),
         Command::Play(args) => play::play(&args, &requests),
         Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
@@ -35,8 +45,19 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints the help, the version or a usage error, and returns the exit code.
+/// Refuses to run one command in each of several processes. One of them says so.
+fn refuse(launched: Launched) -> ExitCode {
+    if launched.rank == 0 {
+        run::say(&format!("error: only `train` runs on several ranks; {} processes were started", launched.size));
+    }
+    ExitCode::FAILURE
+}
+
+/// Prints the help, the version or a usage error, and returns the exit code. One of several processes says it.
 fn tell(answer: &clap::Error) -> ExitCode {
+    if ranks::launched().is_some_and(|launched| launched.rank > 0) {
+        return ExitCode::from(answer.exit_code() as u8);
+    }
     match answer.print() {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
             run::say(&format!("error: cannot write to stdout: {error}"));

@@ -29,7 +29,7 @@ const SCORES: [(&str, &str, &str); 7] = [
 ];
 
 /// All other quantities: name, title, description.
-const OTHERS: [(&str, &str, &str); 32] = [
+const OTHERS: [(&str, &str, &str); 34] = [
     ("reward/rotation", "reward: rotation", "The task's reward for a small rotation error, mean per step."),
     (
         "reward/distance",
@@ -68,6 +68,16 @@ const OTHERS: [(&str, &str, &str); 32] = [
     ("time/collect_s", "collecting (s)", "Seconds of collecting in the iteration."),
     ("time/update_s", "learning (s)", "Seconds of learning in the iteration."),
     ("time/steps_per_s", "speed (steps/s)", "Control steps per second of collecting and learning, over all hands."),
+    (
+        "time/exchange_s",
+        "exchange (s)",
+        "Seconds that the first of several ranks talked to the others, waiting included.",
+    ),
+    (
+        "time/exchange_bytes",
+        "exchange (bytes)",
+        "Bytes that the first of several ranks sent to the others in the iteration.",
+    ),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
     ("histogram/std", "standard deviations", "Standard deviations of the 20 actions; 1 is half an actuator's range."),
     ("histogram/actions", "actions", "Actions of the iteration as drawn, before they are clipped to [-1, 1]."),

@@ -3,6 +3,7 @@
 use anyhow::{Result, ensure};
 
 use super::{EnvState, RewardTerms, SavedEnv, Shaping};
+use crate::ranks::Division;
 
 /// The sums over one episode.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -35,6 +36,26 @@ impl EpisodeStats {
         state.numbers.extend([rotation, distance, action, bonus, fall]);
         state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
         state.counters.extend([self.dropped, self.diverged].map(u64::from));
+    }
+
+    /// Returns the episodes of all ranks to the first rank, in the order of the ranks.
+    pub fn gathered(own: Vec<Self>, division: &Division) -> Vec<Self> {
+        if division.is_alone() {
+            return own;
+        }
+        let mut state = EnvState::default();
+        for episode in own {
+            episode.save(&mut state);
+            state.counters.push(u64::from(episode.randomized));
+        }
+        let all = state.gathered(division);
+        let count = all.numbers.len() / Self::NUMBERS;
+        let read = |mut row: SavedEnv| -> Result<Self> {
+            let episode = Self::saved(&mut row)?;
+            Ok(Self { randomized: row.counters::<1>()? == [1], ..episode })
+        };
+        let rows = if count == 0 { Ok(Vec::new()) } else { all.rows(count).and_then(|rows| rows.map(read).collect()) };
+        rows.expect("the ranks run the same program")
     }
 
     /// # Errors
@@ -83,6 +104,28 @@ impl std::ops::AddAssign for Recent {
         self.reward += other.reward;
         self.shaping += other.shaping;
         self.diverged += other.diverged;
+    }
+}
+
+impl Recent {
+    /// Returns the sums over all shards, given those of each shard of this rank.
+    pub fn total(own: impl Iterator<Item = Self>, division: &Division) -> Self {
+        let row = |recent: Self| {
+            let RewardTerms { rotation, distance, action, bonus, fall } = recent.reward;
+            let Shaping { progress, within, drop } = recent.shaping;
+            let [steps, diverged] = [recent.steps, recent.diverged].map(|count| count as f64);
+            vec![steps, diverged, rotation, distance, action, bonus, fall, progress, within, drop]
+        };
+        let total = division.total(own.map(row));
+        let [steps, diverged, rotation, distance, action, bonus, fall, progress, within, drop] = total[..] else {
+            unreachable!("one sum for each number of a row")
+        };
+        Self {
+            steps: steps as u64,
+            diverged: diverged as u64,
+            reward: RewardTerms { rotation, distance, action, bonus, fall },
+            shaping: Shaping { progress, within, drop },
+        }
     }
 }
 

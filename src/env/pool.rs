@@ -18,6 +18,8 @@ use crate::spaces::Spaces;
 /// N environments that start their next episode automatically.
 pub struct EnvPool<E: Env> {
     blocks: Vec<EnvBlock<E>>,
+    /// The number of this rank's shards.
+    shards: usize,
 }
 
 /// A part of a pool that is stepped by one thread at a time.
@@ -73,7 +75,7 @@ impl<E: Env> EnvPool<E> {
             EnvBlock { slots, seed, number, first: first - size, stride, finished: Vec::new() }
         };
         let of_all_shards = own.clone().flat_map(|_| &sizes);
-        Self { blocks: of_all_shards.enumerate().map(block).collect() }
+        Self { blocks: of_all_shards.enumerate().map(block).collect(), shards: own.len() }
     }
 
     /// Returns the number of environments.
@@ -117,6 +119,19 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
+    /// Returns the environments of each shard, in order.
+    pub fn shards_mut(&mut self) -> impl Iterator<Item = impl Iterator<Item = &mut E>> {
+        let in_shard = self.blocks.len() / self.shards;
+        self.blocks
+            .chunks_mut(in_shard)
+            .map(|blocks| blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env))
+    }
+
+    /// Returns the number of the first environment among those of all ranks.
+    pub fn first(&self) -> usize {
+        self.blocks[0].first
+    }
+
     /// Returns the environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
         self.blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env)
@@ -134,14 +149,15 @@ impl<E: Resumable> EnvPool<E> {
         state
     }
 
-    /// Resumes, bit for bit, from the state of a pool with the same number of environments, and writes the `observations`
-    /// `[n, O]` of each block to act on next.
+    /// Resumes, bit for bit, from the states of the environments of all ranks, and writes the `observations` `[n, O]` of each
+    /// block to act on next.
     ///
     /// # Errors
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let size = E::SPACES.observation_size;
-        let mut rows = state.rows(self.count())?;
+        let (size, of_all_ranks) = (E::SPACES.observation_size, self.blocks[0].stride as usize);
+        let mut rows = state.rows(of_all_ranks)?.skip(self.first());
+        let first = self.first();
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         for (i, (slot, row)) in
             slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
@@ -154,7 +170,7 @@ impl<E: Resumable> EnvPool<E> {
                 slot.env.restore(&mut state, row)?;
                 state.finish()
             };
-            restore().with_context(|| format!("environment {i}"))?;
+            restore().with_context(|| format!("environment {}", first + i))?;
         }
         self.blocks.iter_mut().for_each(|block| block.finished.clear());
         Ok(())

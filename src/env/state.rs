@@ -5,6 +5,8 @@
 
 use anyhow::{Context, Result, ensure};
 
+use crate::ranks::Division;
+
 /// The states of N environments, in order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EnvState {
@@ -21,6 +23,20 @@ pub struct SavedEnv<'a> {
 }
 
 impl EnvState {
+    /// Returns the states of the environments of all ranks to the first rank, in their order.
+    pub fn gathered(self, division: &Division) -> Self {
+        if division.is_alone() {
+            return self;
+        }
+        let numbers = self.numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let counters = self.counters.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let [numbers, counters] = [numbers, counters].map(|own| division.gather_at_first(own).concat());
+        Self {
+            numbers: numbers.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
+            counters: counters.as_chunks().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect(),
+        }
+    }
+
     /// Returns the rows of each of `count` environments.
     ///
     /// # Errors

@@ -37,15 +37,23 @@ impl Adam {
         Self { mean: vec![0.0; count], square: vec![0.0; count], steps: 0 }
     }
 
-    /// Moves the parameters one step against the gradient, which is first multiplied by `scale`.
-    pub(super) fn step(&mut self, parameters: &mut [f32], gradient: &[f32], learning_rate: f64, scale: f64) {
+    /// Moves the parameters in the range `own` one step against the gradient, which is first multiplied by `scale`.
+    pub(super) fn step(
+        &mut self,
+        parameters: &mut [f32],
+        gradient: &[f32],
+        own: Range<usize>,
+        learning_rate: f64,
+        scale: f64,
+    ) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
         let scale = scale as f32;
         let rate = (learning_rate / correction(BETA1)) as f32;
         let unbiased = (1.0 / correction(BETA2)) as f32;
-        let parameters = parameters.par_chunks_mut(CHUNK).zip(gradient.par_chunks(CHUNK));
-        let moments = self.mean.par_chunks_mut(CHUNK).zip(self.square.par_chunks_mut(CHUNK));
+        let [mean, square] = [&mut self.mean, &mut self.square].map(|moment| &mut moment[own.clone()]);
+        let parameters = parameters[own.clone()].par_chunks_mut(CHUNK).zip(gradient[own].par_chunks(CHUNK));
+        let moments = mean.par_chunks_mut(CHUNK).zip(square.par_chunks_mut(CHUNK));
         parameters.zip(moments).for_each(|((x, grad), (mean, square))| {
             Arch::new().dispatch(
                 #[inline(always)]
@@ -62,13 +70,25 @@ impl Adam {
     }
 }
 
-/// Returns the Euclidean norm of a gradient. The squares are added group by group.
-pub(super) fn norm(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
-    let squares = |group: &Range<usize>| {
-        let chunks: Vec<f64> = gradient[group.clone()].par_chunks(NORM_CHUNK).map(sum_of_squares).collect();
-        chunks.iter().sum::<f64>()
+/// Returns the chunks of each group of parameters, whose squares are added up apart.
+pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Vec<Range<usize>>> {
+    let chunks = |group: &Range<usize>| {
+        let firsts = group.clone().step_by(NORM_CHUNK);
+        firsts.map(|first| first..group.end.min(first + NORM_CHUNK)).collect()
     };
-    groups.iter().map(squares).sum::<f64>().sqrt()
+    groups.iter().map(chunks).collect()
+}
+
+/// Returns the sum of the squares of a gradient in each of these chunks.
+pub(super) fn squares(gradient: &[f32], chunks: &[Range<usize>]) -> Vec<f64> {
+    chunks.par_iter().map(|chunk| sum_of_squares(&gradient[chunk.clone()])).collect()
+}
+
+/// Returns the Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
+/// group.
+pub(super) fn norm(squares: &[f64], chunks: &[Vec<Range<usize>>]) -> f64 {
+    let mut squares = squares.iter();
+    chunks.iter().map(|group| squares.by_ref().take(group.len()).sum::<f64>()).sum::<f64>().sqrt()
 }
 
 /// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
@@ -90,6 +110,11 @@ fn sum_of_squares(x: &[f32]) -> f64 {
 mod tests {
     use super::*;
 
+    fn norm_of(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
+        let chunks = norm_chunks(groups);
+        norm(&squares(gradient, &chunks.concat()), &chunks)
+    }
+
     /// The expected values are those of this program (PyTorch):
     /// ```python
     /// import torch
@@ -107,9 +132,9 @@ mod tests {
         let (mut x, mut adam) = ([1.0f32, -2.0, 3.0], Adam::new(3));
         for (expected_norm, expected) in GOLDEN {
             let gradient = [2.0 * x[0], x[1], 0.2 * x[2]];
-            let norm = norm(&gradient, &[0..2, 2..3]);
+            let norm = norm_of(&gradient, &[0..2, 2..3]);
             assert!((norm - expected_norm).abs() < 1e-5, "norm {norm}");
-            adam.step(&mut x, &gradient, 0.1, (1.0 / (norm + 1e-6)).min(1.0));
+            adam.step(&mut x, &gradient, 0..3, 0.1, (1.0 / (norm + 1e-6)).min(1.0));
             for (found, expected) in x.iter().zip(expected) {
                 assert!((found - expected).abs() < 1e-6, "{found} instead of {expected}");
             }
@@ -129,7 +154,7 @@ mod tests {
         let exact = gradient.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
         let on = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| norm(&gradient, &[0..12_345, 12_345..20_000]))
+            pool.install(|| norm_of(&gradient, &[0..12_345, 12_345..20_000]))
         };
         assert!((on(1) / exact - 1.0).abs() < 1e-5);
         assert!([2, 8].map(on) == [on(1); 2]);

@@ -54,7 +54,7 @@ mod tests {
 
     /// Takes one gradient step with a learning rate of 1e-3, without clipping.
     fn step(ppo: &mut Ppo) {
-        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 1e-3, 1.0);
+        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), 1e-3, 1.0);
     }
 
     /// Computes the gradient of these samples and leaves it in the learner.

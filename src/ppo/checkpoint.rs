@@ -259,13 +259,14 @@ impl Policy {
 
 impl Ppo {
     /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
-    /// progress of the run.
+    /// progress of the run. All ranks call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
         let mut checkpoint = Checkpoint { config, progress, is_of_0_1: false, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
-        let kinds = [("", &self.policy.parameters), ("adam.mean.", &adam.mean), ("adam.square.", &adam.square)];
+        let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.division.shared(moment, &self.slices));
+        let kinds = [("", &self.policy.parameters[..]), ("adam.mean.", &mean), ("adam.square.", &square)];
         for View { name, shape, range } in self.policy.layout.views() {
             for (prefix, numbers) in kinds {
                 let array = Array::F32(shape.clone(), numbers[range.clone()].to_vec());

@@ -41,10 +41,10 @@ pub use policy::{ActorParts, FrozenPolicy, LayerParts, Policy};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{Backend, PpoConfig};
-use crate::ranks::Division;
+use crate::ranks::{Division, Slices, totals};
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
-use adam::{Adam, norm};
+use adam::{Adam, norm, norm_chunks, squares};
 use backend::{GradientBackend, Minibatch, ShardSums};
 use candle::Reference;
 use kernels::{Arithmetic, Kernels};
@@ -61,6 +61,8 @@ pub struct Ppo {
     adam: Adam,
     learning_rate: f64,
     division: Division,
+    /// The parameters that each rank moves.
+    slices: Slices,
 }
 
 /// Statistics of an update: means over its minibatches unless stated otherwise.
@@ -128,12 +130,20 @@ impl Ppo {
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (config, learning_rate) = (config.clone(), config.learning_rate);
-        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division })
+        let slices = division.slices(&norm_chunks(&policy.layout.groups()).concat());
+        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division, slices })
     }
 
     /// Returns the current policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
+    }
+
+    /// Returns a checksum (CRC-32) of all parameters.
+    pub fn checksum(&self) -> u32 {
+        let mut hasher = crc32fast::Hasher::new();
+        self.policy.parameters.iter().for_each(|x| hasher.update(&x.to_le_bytes()));
+        hasher.finalize()
     }
 
     /// Creates a rollout of the configured horizon for blocks with these numbers of environments.
@@ -268,9 +278,11 @@ impl Ppo {
         let (own_shards, shards) = (self.division.own().len(), self.division.shards());
         let minibatch = Minibatch { samples, own_shards, shards };
         let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
-        self.division.add_up(&mut self.gradient);
+        self.division.reduce(&mut self.gradient, &self.slices);
         let losses = self.losses(&sums, minibatch.count() as f64);
-        let grad_norm = norm(&self.gradient, &self.policy.layout.groups());
+        let squares = squares(&self.gradient, self.slices.own_chunks());
+        let squares = self.division.gather_chunks(squares, &self.slices);
+        let grad_norm = norm(&squares, &norm_chunks(&self.policy.layout.groups()));
         for (what, value) in [("the loss", losses.total), ("the norm of the gradient", grad_norm)] {
             if !value.is_finite() {
                 bail!("{what} is {value}: the training has failed and stops here");
@@ -283,18 +295,22 @@ impl Ppo {
         let entropy = self.policy.log_std().iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum();
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
-        self.adam.step(&mut self.policy.parameters, &self.gradient, self.learning_rate, scale);
+        let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
+        self.adam.step(parameters, &self.gradient, own, self.learning_rate, scale);
+        self.division.share(parameters, &self.slices);
         Ok(Step { losses, grad_norm, entropy })
     }
 
     /// Returns the losses of a minibatch of `samples` samples, given the sums of this rank's shards.
     fn losses(&self, sums: &[ShardSums], samples: f64) -> Losses {
-        let row = |sums: &ShardSums| vec![sums.surrogate, sums.value_error, sums.excess, sums.kl, sums.clipped];
-        let totals = self.division.total(sums.iter().map(row));
+        let row =
+            |sums: &ShardSums| [sums.surrogate, sums.value_error, sums.excess, sums.kl, sums.clipped, sums.ratio_error];
+        let rows = self.division.gather(sums.iter().flat_map(row).collect());
+        let totals = totals(&rows, self.division.shards());
         let mean = |i: usize| totals[i] / samples;
         let (policy, value, excess, kl, clip_fraction) = (-mean(0), mean(1), mean(2), mean(3), mean(4));
         let total = policy + self.config.value_coef * value + self.config.bounds_coef * excess;
-        let ratio_error = self.division.largest(sums.iter().map(|sums| sums.ratio_error).fold(0.0, f64::max));
+        let ratio_error = rows.iter().skip(5).step_by(6).copied().fold(0.0, f64::max);
         Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
     }
 

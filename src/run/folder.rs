@@ -20,6 +20,8 @@ const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
 const DIVERGED: &str = "diverged";
+/// A file with this name asks the training to stop.
+const STOP: &str = "stop";
 /// The prefixes of the names of a run's files.
 const OURS: [&[u8]; 9] = [
     b"config.toml",
@@ -192,6 +194,11 @@ impl RunFolder {
         };
         found.retain(ours);
         Ok(found)
+    }
+
+    /// Returns whether the user has asked the training to stop by a file with the name `stop`, and removes it.
+    pub fn take_stop(&self) -> bool {
+        fs::remove_file(self.path.join(STOP)).is_ok()
     }
 
     /// Returns the path of the folder.

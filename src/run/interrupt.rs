@@ -98,12 +98,14 @@ impl Requests {
         &self.stop
     }
 
-    /// Returns the exit code for the cause of the stop: 128 plus the signal's number, or 0 for the time limit.
+    /// Returns the signal that requested the stop, or 0 if none did.
+    pub fn signal(&self) -> i32 {
+        self.signal.load(Ordering::Relaxed)
+    }
+
+    /// Returns the exit code for the cause of the stop.
     pub fn exit_code(&self) -> ExitCode {
-        match self.signal.load(Ordering::Relaxed) {
-            0 => ExitCode::SUCCESS,
-            signal => ExitCode::from(128 + signal as u8),
-        }
+        exit_code(self.signal())
     }
 
     /// Requests a stop when the program has listened for this time.
@@ -123,6 +125,11 @@ impl Requests {
     pub fn take_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
     }
+}
+
+/// Returns the exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.
+pub fn exit_code(signal: i32) -> ExitCode {
+    if signal == 0 { ExitCode::SUCCESS } else { ExitCode::from(128 + signal as u8) }
 }
 
 /// Returns the signals that were ignored when the program started, as bits. They stay ignored, as the caller intended.

@@ -22,11 +22,14 @@ pub(super) struct Metrics {
     file: File,
     /// Bytes of the header and of whole rows.
     length: u64,
+    /// The indices of the columns that the table has, in a table that was begun when there were fewer.
+    columns: Option<Vec<usize>>,
 }
 
 impl Metrics {
     /// Opens or creates the table with this header, to continue after the rows of these iterations. Also returns notes about rows
-    /// that are cut off or missing. A table with a different header is kept under another name.
+    /// that are cut off or missing. A table that lacks some of the columns continues without them; one with a different header is
+    /// kept under another name.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
@@ -59,7 +62,7 @@ impl Metrics {
         }
         make_own(path).with_context(context)?;
         let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).with_context(context)?;
-        let mut metrics = Self { path: path.to_owned(), file, length: found.length };
+        let mut metrics = Self { path: path.to_owned(), file, length: found.length, columns: found.columns };
         metrics.repair().with_context(context)?;
         if found.length == 0 {
             metrics.row(&format!("{header}\n"))?;
@@ -68,11 +71,16 @@ impl Metrics {
         Ok((metrics, notes))
     }
 
-    /// Adds a row, which ends with a line feed.
+    /// Adds a row of all columns, which ends with a line feed.
     ///
     /// # Errors
     /// Fails if the file cannot be written; [`Metrics::repair`] must succeed before the next row.
     pub(super) fn row(&mut self, row: &str) -> Result<()> {
+        let mut row = std::borrow::Cow::from(row);
+        if let Some(columns) = &self.columns {
+            let cells: Vec<&str> = row.trim_end().split(',').collect();
+            row = (columns.iter().map(|&i| cells[i]).collect::<Vec<_>>().join(",") + "\n").into();
+        }
         self.file.write_all(row.as_bytes()).with_context(|| format!("cannot write {}", self.path.display()))?;
         self.length += row.len() as u64;
         Ok(())
@@ -106,6 +114,8 @@ struct Rows {
     kept: u64,
     /// The number of rows after them.
     dropped: u64,
+    /// The indices of its columns among the expected ones, if it has fewer.
+    columns: Option<Vec<usize>>,
 }
 
 /// Counts the rows of a table up to an iteration and after it; returns `None` if the header is different.
@@ -122,18 +132,20 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     if next(&mut line)? == 0 {
         return Ok(Some(Rows::default()));
     }
+    let mut columns = None;
     match line.strip_suffix(b"\n") {
         Some(found) if found == header.as_bytes() => {}
+        Some(found) if among(found, header).is_some() => columns = among(found, header),
         // A header that was written only in part, e.g. on a full disk.
         None if header.as_bytes().starts_with(&line) => return Ok(Some(Rows::default())),
         _ => return Ok(None),
     }
-    let mut found = Rows { length: line.len() as u64, ..Rows::default() };
+    let commas = line.iter().filter(|&&byte| byte == b',').count();
+    let mut found = Rows { length: line.len() as u64, columns, ..Rows::default() };
     while next(&mut line)? > 0 {
         let number =
             line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse::<u64>().ok());
-        let whole =
-            line.ends_with(b"\n") && line.iter().filter(|&&byte| byte == b',').count() == header.matches(',').count();
+        let whole = line.ends_with(b"\n") && line.iter().filter(|&&byte| byte == b',').count() == commas;
         if found.dropped == 0 && whole && number.is_some_and(|number| number <= iterations) {
             (found.length, found.kept) = (found.length + line.len() as u64, found.kept + 1);
         } else {
@@ -141,6 +153,13 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
         }
     }
     Ok(Some(found))
+}
+
+/// Returns the indices of these columns among the expected ones; `None` if one is not among them, or if the order differs.
+fn among(columns: &[u8], expected: &str) -> Option<Vec<usize>> {
+    let mut places = expected.split(',').enumerate();
+    let place = |column: &[u8]| places.find(|(_, name)| name.as_bytes() == column).map(|(place, _)| place);
+    columns.split(|&byte| byte == b',').map(place).collect()
 }
 
 #[cfg(test)]
@@ -185,6 +204,17 @@ mod tests {
         let old = ["metrics.before-1.csv", "metrics.before-1-2.csv"];
         let old = old.map(|name| fs::read_to_string(place.path().join(name)).unwrap());
         assert_eq!(old, ["iteration,loss\n1,0.5\n", "iteration,return\n"]);
+    }
+
+    #[test]
+    fn a_table_that_was_begun_with_fewer_columns_continues_without_the_new_ones() {
+        let (place, path) = table("1,0.5\n2,0.25\n");
+        let (mut metrics, notes) = Metrics::open(&path, "iteration,speed,loss,drops", 0..1).unwrap();
+        assert!(notes.len() == 1 && notes[0].contains("1 rows"), "{notes:?}");
+        metrics.row("2,9,0.125,\n").unwrap();
+        metrics.sync().unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n1,0.5\n2,0.125\n");
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -33,7 +33,7 @@ pub use file::{read_bytes, read_text, same_file};
 pub use film::{Clip, FilmFormat, FilmWriter, write_png};
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use histogram::Histogram;
-pub use interrupt::Requests;
+pub use interrupt::{Requests, exit_code};
 pub use lock::Locked;
 pub use meshes::hand_meshes;
 pub use output::{OutputFile, expect_folder, write_whole};
@@ -45,6 +45,7 @@ pub use table::{MetricsTable, read_metrics};
 
 use std::io::{ErrorKind, Write};
 use std::path::Path;
+use std::sync::OnceLock;
 
 use anyhow::{Context, Result, anyhow, ensure};
 
@@ -60,9 +61,17 @@ pub fn print(text: &str) -> Result<()> {
     }
 }
 
+/// What each line of [`say`] begins with.
+static SPEAKER: OnceLock<String> = OnceLock::new();
+
+/// From now on, lines to stderr begin with this name: there are several processes, and they print to the same place.
+pub fn speak_as(name: &str) {
+    let _ = SPEAKER.set(format!("{name}: "));
+}
+
 /// Prints a line to stderr. Control characters are escaped, since the line may quote an untrusted file.
 pub fn say(line: &str) {
-    let mut harmless = String::with_capacity(line.len() + 1);
+    let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
     for c in line.chars() {
         match c {
             '\n' | '\t' => harmless.push(c),

@@ -22,7 +22,7 @@ impl Films {
     /// Prepares the films of a training. If pictures cannot be drawn, prints a warning, and there are none.
     pub(super) fn new(config: &Config) -> Self {
         let every = config.run.film_every;
-        let mut films = Self { every, episodes: None };
+        let mut films = Self { every, ..Self::none() };
         if every > 0 {
             match EpisodeFilms::new(&config.env) {
                 Ok(episodes) => films.episodes = Some(episodes),
@@ -30,6 +30,11 @@ impl Films {
             }
         }
         films
+    }
+
+    /// Returns the films of a training that has none.
+    pub(super) fn none() -> Self {
+        Self { every: 0, episodes: None }
     }
 
     /// Returns whether there is a film after this iteration.

@@ -4,23 +4,23 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::saver::{Begin, Saver};
-use super::session::{SCENE, Session, overrides, settle_model};
+use super::plan::{Plan, Start, overrides, settle_model};
+use super::session::SCENE;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, user_file};
 use crate::env::{SPACES, Task};
 use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Checkpoint, Fork};
-use crate::run::{self, RunFolder};
+use crate::run::RunFolder;
 
-impl Session {
-    /// Sets up a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
+impl Plan {
+    /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
     /// change unless they determine the size of the state or the kind of policy; nets may become wider.
     ///
     /// # Errors
-    /// Fails if the checkpoint cannot be resumed from, if the settings do not fit it, or if the folder cannot be created.
-    pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<(Self, Saver)> {
+    /// Fails if the checkpoint cannot be resumed from, or if the settings do not fit it.
+    pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
         if matches!(Origin::of(place), Ok(Origin::BuiltIn(_))) {
             let name = place.display();
             bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
@@ -32,11 +32,7 @@ impl Session {
         };
         let context = || format!("cannot fork {}", place.display());
         let (path, checkpoint) = load::newest_sound(&places).with_context(context)?;
-        let session =
-            Self::forked(&path, checkpoint, args).with_context(|| format!("cannot fork {}", path.display()))?;
-        let (folder, lock) = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
-        let saver = session.saver(folder, lock, args, Begin::New);
-        Ok((session, saver))
+        Self::forked(&path, checkpoint, args).with_context(|| format!("cannot fork {}", path.display()))
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
@@ -46,23 +42,20 @@ impl Session {
         expect_kept(&parent, &config)?;
         settle_model(&mut config)?;
         expect_scene(&parent, &config, &mut checkpoint)?;
-        run::start_threads(config.run.threads)?;
         checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), SPACES, config.run.seed)?;
         let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
-        let mut session = Self::new(config)?;
-        let agent = &mut session.agent;
-        agent.restore(&mut checkpoint)?;
-        checkpoint.finish()?;
-        agent.ppo.settle_learning_rate(&parent.ppo);
-        // Scores under different settings are not comparable, so the best one is not kept.
-        agent.fork = Some(Fork { from, iteration: agent.iteration, env_steps: agent.env_steps });
+        let progress = &mut checkpoint.progress;
         ensure!(
-            !session.finished(),
+            progress.env_steps < config.run.total_steps,
             "run.total_steps = {}: the checkpoint has made {} already; set the new total with --total-steps",
-            session.config.run.total_steps,
-            session.agent.env_steps
+            config.run.total_steps,
+            progress.env_steps
         );
-        Ok(session)
+        progress.fork = Some(Fork { from, iteration: progress.iteration, env_steps: progress.env_steps });
+        // Scores under different settings are not comparable, so the best one is not kept.
+        progress.best = None;
+        let start = Start::Fork(checkpoint, Box::new(parent));
+        Ok(Self { start, context: format!("cannot fork {}", path.display()), ..Self::new(config, args) })
     }
 }
 

@@ -4,6 +4,7 @@ use crate::agent::Iteration;
 use crate::env::{EpisodeStats, Lesson, Recent, Score};
 use crate::ppo::{Policy, Rollout, RolloutBlock, UpdateStats};
 use crate::quantities::quantity;
+use crate::ranks::Traffic;
 use crate::run::{self, Histogram, Tag};
 
 /// The scores of the episodes that ended in an iteration.
@@ -15,9 +16,9 @@ pub(super) struct Ended {
 }
 
 impl Ended {
-    /// Computes the scores of `episodes`, in a training with or `without` randomised ones.
-    pub(super) fn of(episodes: Vec<EpisodeStats>, randomizes: bool) -> Self {
-        let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.into_iter().partition(|episode| episode.randomized);
+    /// Computes the scores of `episodes`, in a training with or without randomised ones.
+    pub(super) fn of(episodes: &[EpisodeStats], randomizes: bool) -> Self {
+        let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
         Self { nominal: Score::of(&nominal), randomized: randomizes.then(|| Score::of(&drawn)) }
     }
 
@@ -28,12 +29,14 @@ impl Ended {
 }
 
 /// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
-/// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings.
+/// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings, with the traffic
+/// between the ranks if there are several.
 pub(super) fn row(
     iteration: &Iteration<Lesson>,
     ended: &Ended,
     recent: &Recent,
     evaluation: &Score,
+    traffic: Option<&Traffic>,
 ) -> Vec<(String, f64)> {
     let mut row = Vec::new();
     let mut put = |group: &str, values: &[(&str, f64)]| {
@@ -49,6 +52,7 @@ pub(super) fn row(
     put("eval/", &evaluation.headline());
     put("", &iteration.update.named());
     put("time/", &iteration.time_named());
+    put("time/", &Traffic::named(traffic));
     put("sim/", &[("diverged", recent.diverged as f64)]);
     row
 }
@@ -56,7 +60,7 @@ pub(super) fn row(
 /// Returns the names of the values of any iteration, in a training with or without randomised episodes.
 pub(super) fn tags(lesson: Lesson, randomizes: bool) -> Vec<String> {
     let iteration = Iteration { lesson, update: UpdateStats::default(), steps: 0, collect_s: 0.0, update_s: 0.0 };
-    let empty = row(&iteration, &Ended::of(Vec::new(), randomizes), &Recent::default(), &Score::of(&[]));
+    let empty = row(&iteration, &Ended::of(&[], randomizes), &Recent::default(), &Score::of(&[]), None);
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -149,7 +153,7 @@ mod tests {
             ..Default::default()
         };
         let other = EpisodeStats { randomized: true, ..episode(RewardTerms::default(), 200, 8) };
-        let ended = |randomizes| Ended::of(vec![episode(reward, 80, 2), other], randomizes);
+        let ended = |randomizes| Ended::of(&[episode(reward, 80, 2), other], randomizes);
         let evaluation = Score::of(&[episode(RewardTerms::default(), 1000, 5), episode(reward, 50, 0)]);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
             episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
@@ -158,9 +162,10 @@ mod tests {
             eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, loss/policy 1, loss/value 2, policy/entropy 4, \
             policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \
             value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, \
-            time/steps_per_s 2, sim/diverged 28";
+            time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
         let row = |randomizes| {
-            let row = row(&iteration, &ended(randomizes), &recent, &evaluation);
+            let traffic = Traffic { seconds: 29.0, bytes: 30 };
+            let row = row(&iteration, &ended(randomizes), &recent, &evaluation, Some(&traffic));
             row.iter().map(|(name, value)| format!("{name} {value}")).collect::<Vec<_>>().join(", ")
         };
         let names =
@@ -174,7 +179,7 @@ mod tests {
         let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
         assert_eq!(row(true), expected);
         assert_eq!(tags(lesson, true), names(&expected));
-        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::of(all, true).shown().goals);
+        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::of(&all, true).shown().goals);
         assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }
 }

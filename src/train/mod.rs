@@ -4,37 +4,57 @@ mod films;
 mod fork;
 mod hints;
 mod log;
+mod plan;
 mod saver;
 mod session;
+mod together;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, Error, Result, anyhow};
+use anyhow::{Context, Error, Result};
 
 use crate::agent::Iteration;
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::dump;
-use crate::env::{Lesson, Recent, Score, divergence};
-use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::env::{EpisodeStats, Lesson, Recent, Repose, Score, divergence};
+use crate::evaluate::{Actor, Episodes, evaluate_together};
 use crate::ppo::Evaluation;
-use crate::run::{self, Figures, Report, Requests, RunFolder, Status, StatusLine};
-use crate::schedule::panic_message;
+use crate::ranks::{self, Ranks, Traffic};
+use crate::run::{self, Figures, Report, Requests, Status, StatusLine};
 use hints::hints;
 use log::{Ended, FILM, described, histograms, row, tags};
 use saver::Saver;
 use session::Session;
+use together::{Next, follow, panicked};
 
-/// Trains until all steps are made or a stop is requested, and returns the exit code of the program.
+/// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
+/// several processes, they train together.
 ///
 /// # Errors
 /// Fails if settings, files or the scene cannot be used, if the run folder cannot be written to at the start or at the end, if a
-/// loss is not finite, or after a panic.
+/// loss is not finite, or after a panic. One of several ranks ends all others then, and does not return.
 pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
-    let (mut session, mut saver) = Session::of(args)?;
+    let membership = ranks::join()?;
+    let ranks = &membership.ranks;
+    if ranks.size() == 1 {
+        return lead(args, requests, ranks);
+    }
+    let work = || if ranks.rank() == 0 { lead(args, requests, ranks) } else { follow(requests, ranks) };
+    // To leave the ranks means to wait for the others, who may be waiting for this one.
+    let result = catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| Err(panicked(&*panic)));
+    result.or_else(|error| {
+        run::say(&format!("error: {error:#}"));
+        ranks.abort()
+    })
+}
+
+/// Trains as the rank that reports and saves.
+fn lead(args: &TrainArgs, requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result<ExitCode> {
+    let (mut session, mut saver) = Session::lead(args, ranks)?;
     let place = saver.folder().path().display().to_string();
     if session.finished() {
         run::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.steps_made()));
@@ -55,42 +75,52 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
         saver.give_back();
         return Err(error);
     }
+    let code = run_to_end(&mut session, saver, &mut report, requests)?;
+    if session.finished() && !args.quiet {
+        say_what_next(Path::new(&place));
+    }
+    Ok(code)
+}
+
+/// Iterates until all steps are made or a stop is requested, and returns the exit code.
+fn run_to_end(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
     while !session.finished() {
-        match session.iterate(requests.stop(), &report) {
-            Ok(Some(made)) => {
-                saver.take(session.checkpoint());
-                if let Err(error) = saver.begin(&mut report) {
-                    report.finish();
-                    return Err(saver.elsewhere(error));
-                }
-                if args.dump_diverged {
-                    session.dump_diverged(saver.folder(), &report);
-                }
-                session.report(&mut report, &made);
-            }
+        let (made, next) = match session.iterate_and_agree(requests, &saver, report) {
+            Ok(Some(result)) => result,
             Ok(None) => {
                 session.count_divergence();
-                return stop(saver, &mut report, requests);
+                return stop(saver, report, requests.exit_code());
             }
             Err(error) => {
                 session.count_divergence();
-                return Err(give_up(error, saver, &mut report));
+                return Err(give_up(error, saver, report));
             }
+        };
+        if session.hands_over(&next) {
+            saver.take(session.checkpoint());
         }
-        let due = session.agent.iteration.is_multiple_of(session.config.run.checkpoint_every);
-        if (requests.take_save() || due)
-            && !session.finished()
-            && let Err(error) = saver.save(&mut report)
+        if let Err(error) = saver.begin(report) {
+            report.finish();
+            return Err(saver.elsewhere(error));
+        }
+        session.write_dumps(saver.folder(), report);
+        session.report(report, &made);
+        if session.finished() {
+            break;
+        }
+        if let Some(code) = next.stop {
+            session.count_divergence();
+            return stop(saver, report, code);
+        }
+        if session.saves(&next)
+            && let Err(error) = saver.save(report)
         {
             report.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
         }
     }
-    saver.save_at_last(&mut report)?;
+    saver.save_at_last(report)?;
     session.count_divergence();
-    run::say(&format!("finished: {}; {place}", saver.steps_made()));
-    if !args.quiet {
-        say_what_next(saver.folder().path());
-    }
+    run::say(&format!("finished: {}; {}", saver.steps_made(), saver.folder().path().display()));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -108,41 +138,71 @@ fn say_what_next(run: &Path) {
     run::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
 }
 
-/// What an iteration has made.
+/// What an iteration has made, on all ranks together where it says nothing else. It is whole on the first rank only.
 #[derive(Debug)]
 struct Made {
+    /// The record of the iteration on this rank.
     iteration: Iteration<Lesson>,
+    /// The episodes that ended.
+    ended: Vec<EpisodeStats>,
+    /// The sums over the steps.
+    recent: Recent,
     /// The score of its evaluation, which has no episodes if there was none.
     evaluation: Score,
+    /// What talking to the other ranks has cost this one.
+    traffic: Traffic,
     figures: Figures,
 }
 
 impl Session {
-    /// Runs one iteration and turns a panic into an error. Returns `None` if `stop` was set meanwhile. If the iteration does not
-    /// complete, only the state at the end of the previous one can be used.
-    fn iterate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
+    /// Runs one iteration and agrees with the other ranks on what follows. Returns `None` if a stop was requested meanwhile.
+    fn iterate_and_agree(
+        &mut self,
+        requests: &Requests,
+        saver: &Saver,
+        report: &Report,
+    ) -> Result<Option<(Made, Next)>> {
+        let Some(made) = self.iterate(requests, Some(report))? else { return Ok(None) };
+        let next = self.agree(requests, saver.folder().take_stop())?;
+        Ok(Some((made, next)))
+    }
+
+    /// Runs one iteration and turns a panic into an error. Returns `None` if a stop was requested meanwhile. If the iteration does
+    /// not complete, only the state at the end of the previous one can be used.
+    fn iterate(&mut self, requests: &Requests, report: Option<&Report>) -> Result<Option<Made>> {
         let number = self.agent.iteration + 1;
+        // One of several ranks cannot stop alone in the middle of an iteration: the others wait for what it computes.
+        let never = AtomicBool::new(false);
+        let stop = if self.agent.division.is_alone() { requests.stop() } else { &never };
         let caught = catch_unwind(AssertUnwindSafe(|| self.collect_learn_evaluate(stop, report)));
-        let result = caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
+        let result = caught.unwrap_or_else(|panic| Err(panicked(&*panic)));
         result.with_context(|| format!("iteration {number}"))
     }
 
-    fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: &Report) -> Result<Option<Made>> {
+    fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: Option<&Report>) -> Result<Option<Made>> {
         let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
+        let traffic = self.agent.division.take_traffic();
         let mut evaluation = Score::of(&[]);
         if evaluates(self.agent.iteration, self.config.run.eval_every) {
-            let Some(score) = self.evaluate(stop, report)? else { return Ok(None) };
-            let found = Evaluation { goals: score.goals, rot_dist: score.rot_dist };
-            self.best = if found.beats(self.best) { Some(found) } else { self.best };
+            let Some(score) = self.evaluate(stop)? else { return Ok(None) };
             evaluation = score;
         }
         let Some(figures) = self.figures(stop, report) else { return Ok(None) };
-        Ok(Some(Made { iteration, evaluation, figures }))
+        let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
+        self.improved = found.beats(self.best);
+        self.best = if self.improved { Some(found) } else { self.best };
+        let (pool, division) = (&mut self.agent.pool, &self.agent.division);
+        let ended = EpisodeStats::gathered(pool.take_finished(), division);
+        let shards: Vec<Recent> = pool.shards_mut().map(recent).collect();
+        let recent = Recent::total(shards.into_iter(), division);
+        Ok(Some(Made { iteration, ended, recent, evaluation, traffic, figures }))
     }
 
-    /// Returns what this iteration has in the event file besides numbers; `None` if `stop` was set meanwhile.
-    fn figures(&mut self, stop: &AtomicBool, report: &Report) -> Option<Figures> {
+    /// Returns what this iteration has in the event file besides numbers; `None` if `stop` was set meanwhile. Without a report
+    /// there is none.
+    fn figures(&mut self, stop: &AtomicBool, report: Option<&Report>) -> Option<Figures> {
         let mut figures = Figures::default();
+        let Some(report) = report else { return Some(figures) };
         if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
             figures.histograms = histograms(self.agent.ppo.policy(), &self.agent.rollout);
         }
@@ -163,30 +223,25 @@ impl Session {
     }
 
     /// Plays the evaluation episodes; returns `None` if `stop` was set meanwhile.
-    fn evaluate(&self, stop: &AtomicBool, report: &Report) -> Result<Option<Score>> {
+    fn evaluate(&self, stop: &AtomicBool) -> Result<Option<Score>> {
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
-        let Some(played) = evaluate(&self.task, &actor, self.evaluation_episodes(), stop, &mut |_| Ok(()))? else {
-            return Ok(None);
-        };
-        let score = Score::of(&played);
-        report.say(&format!(
-            "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
-            self.agent.env_steps,
-            score.episodes,
-            score.goals,
-            score.rot_dist,
-            100.0 * score.drop_rate
-        ));
-        Ok(Some(score))
+        let played = evaluate_together(&self.task, &actor, self.evaluation_episodes(), &self.agent.division, stop)?;
+        Ok(played.map(|played| Score::of(&played)))
     }
 
     fn report(&mut self, report: &mut Report, made: &Made) {
-        let Made { iteration, evaluation, figures } = made;
-        let ended = Ended::of(self.agent.pool.take_finished(), randomizes(&self.config));
-        let mut recent = Recent::default();
-        for env in self.agent.pool.envs_mut() {
-            recent += env.take_recent();
+        let Made { iteration, ended, recent, evaluation, traffic, figures } = made;
+        if evaluation.episodes > 0 {
+            report.say(&format!(
+                "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
+                self.agent.env_steps,
+                evaluation.episodes,
+                evaluation.goals,
+                evaluation.rot_dist,
+                100.0 * evaluation.drop_rate
+            ));
         }
+        let ended = Ended::of(ended, randomizes(&self.config));
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
         let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
@@ -197,7 +252,8 @@ impl Session {
             self.warned = true;
             report.warn(&warning);
         }
-        let values = row(iteration, &ended, &recent, evaluation);
+        let traffic = (!self.agent.division.is_alone()).then_some(traffic);
+        let values = row(iteration, &ended, recent, evaluation, traffic);
         report.iteration(self.agent.iteration, &values, figures, &status);
     }
 
@@ -207,18 +263,13 @@ impl Session {
             run::say(&format!("warning: {} steps of this session diverged", self.diverged));
         }
     }
+}
 
-    /// Writes the steps that led to each divergence.
-    fn dump_diverged(&mut self, folder: &RunFolder, report: &Report) {
-        let iteration = self.agent.iteration;
-        for (env, repose) in self.agent.pool.envs_mut().enumerate() {
-            let Some(diverged) = repose.take_diverged() else { continue };
-            let text = dump::of(&diverged, &self.config.env, iteration, env);
-            if let Err(error) = folder.dump(&format!("iteration-{iteration:08}-env-{env}.json"), &text) {
-                report.warn(&format!("{error:#}"));
-            }
-        }
-    }
+fn recent<'a>(envs: impl Iterator<Item = &'a mut Repose>) -> Recent {
+    envs.fold(Recent::default(), |mut sum, env| {
+        sum += env.take_recent();
+        sum
+    })
 }
 
 /// The iteration after which there is an early evaluation where the next one would come much later.
@@ -244,7 +295,7 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
 }
 
 /// Saves the state at the end of the last complete iteration after a request to stop.
-fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
+fn stop(mut saver: Saver, report: &mut Report, code: ExitCode) -> Result<ExitCode> {
     saver.save_at_last(report)?;
     if saver.has_begun() {
         run::say(&format!("stopped after {}; resume with", saver.steps_made()));
@@ -252,7 +303,7 @@ fn stop(mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<Ex
     } else {
         run::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
     }
-    Ok(requests.exit_code())
+    Ok(code)
 }
 
 /// Saves the state at the end of the last complete iteration after a failure, and returns the error.
@@ -270,6 +321,7 @@ mod tests {
     use super::*;
     use crate::config::Override;
     use crate::ppo::Checkpoint;
+    use crate::run::RunFolder;
     use crate::train::saver::Begin;
 
     #[test]
@@ -289,13 +341,13 @@ mod tests {
         let mut session = Session::new(Config::resolve(None, &sets).unwrap()).unwrap();
         let (folder, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let mut saver = session.saver(folder, lock, &TrainArgs::default(), Begin::New);
-        let (mut report, never) = (new_report(&session, &saver, true), AtomicBool::new(false));
+        let (mut report, never) = (new_report(&session, &saver, true), Requests::none());
         saver.begin(&mut report).unwrap();
-        assert!(session.iterate(&never, &report).unwrap().is_some(), "nothing stops it");
+        assert!(session.iterate(&never, Some(&report)).unwrap().is_some(), "nothing stops it");
         saver.take(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, &report).unwrap_err();
+        let error = session.iterate(&never, Some(&report)).unwrap_err();
         let latest = saver.folder().checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");

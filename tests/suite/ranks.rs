@@ -1,11 +1,15 @@
 //! A divided training computes the same bits, however it is divided.
 
+use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Barrier, Mutex};
 
 use shadow_repose::agent::Agent;
-use shadow_repose::env::{Env, EpisodeStats, Lesson, Repose, Task};
-use shadow_repose::ranks::{Division, Ranks, tree_sum};
+use shadow_repose::config::Config;
+use shadow_repose::env::{Env, EpisodeStats, Lesson, Repose, SPACES, Task};
+use shadow_repose::evaluate::{Actor, Episodes, evaluate, evaluate_together};
+use shadow_repose::ppo::{Checkpoint, Ppo};
+use shadow_repose::ranks::{Division, Ranks};
 
 use crate::point_mass::{divided, settings};
 use crate::support::config;
@@ -18,46 +22,80 @@ struct Seat {
 
 struct Table {
     barrier: Barrier,
-    floats: Mutex<Vec<Vec<f32>>>,
-    doubles: Mutex<Vec<Vec<f64>>>,
+    /// What each rank has put down.
+    put: Mutex<Vec<Vec<u8>>>,
+}
+
+impl Seat {
+    /// Returns what all ranks pass, in their order.
+    fn see<T: Copy>(&self, own: Vec<T>, to_bytes: fn(&T) -> Vec<u8>, of_bytes: fn(&[u8]) -> T) -> Vec<Vec<T>> {
+        self.table.put.lock().unwrap()[self.rank] = own.iter().flat_map(to_bytes).collect();
+        self.table.barrier.wait();
+        let all = self.table.put.lock().unwrap().clone();
+        self.table.barrier.wait();
+        all.iter().map(|bytes| bytes.chunks(size_of::<T>()).map(of_bytes).collect()).collect()
+    }
+
+    fn see_bytes(&self, own: Vec<u8>) -> Vec<Vec<u8>> {
+        self.see(own, |x| vec![*x], |bytes| bytes[0])
+    }
+
+    fn see_floats(&self, own: &[f32]) -> Vec<Vec<f32>> {
+        let of_bytes = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().unwrap());
+        self.see(own.to_vec(), |x| x.to_le_bytes().to_vec(), of_bytes)
+    }
 }
 
 impl Ranks for Seat {
     fn size(&self) -> usize {
-        self.table.floats.lock().unwrap().len()
+        self.table.put.lock().unwrap().len()
     }
 
     fn rank(&self) -> usize {
         self.rank
     }
 
-    fn add_up(&self, numbers: &mut [f32]) {
-        self.table.floats.lock().unwrap()[self.rank] = numbers.to_vec();
-        self.table.barrier.wait();
-        let all = self.table.floats.lock().unwrap().clone();
-        tree_sum(numbers, &all.iter().map(|part| &part[..]).collect::<Vec<_>>());
-        self.table.barrier.wait();
+    fn exchange(&self, numbers: &[f32], parts: &[Range<usize>]) -> Vec<f32> {
+        let own = parts[self.rank].clone();
+        self.see_floats(numbers).iter().flat_map(|of_rank| of_rank[own.clone()].to_vec()).collect()
+    }
+
+    fn share(&self, numbers: &mut [f32], parts: &[Range<usize>]) {
+        for (of_rank, part) in self.see_floats(numbers).iter().zip(parts) {
+            numbers[part.clone()].copy_from_slice(&of_rank[part.clone()]);
+        }
     }
 
     fn gather(&self, numbers: Vec<f64>) -> Vec<f64> {
-        self.table.doubles.lock().unwrap()[self.rank] = numbers;
-        self.table.barrier.wait();
-        let all = self.table.doubles.lock().unwrap().concat();
-        self.table.barrier.wait();
-        all
+        let of_bytes = |bytes: &[u8]| f64::from_le_bytes(bytes.try_into().unwrap());
+        let all = self.see(numbers, |x| x.to_le_bytes().to_vec(), of_bytes);
+        assert!(all.iter().all(|of_rank| of_rank.len() == all[0].len()), "all ranks pass the same number of values");
+        all.concat()
+    }
+
+    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+        let all = self.see_bytes(bytes);
+        if self.rank == 0 { all } else { Vec::new() }
+    }
+
+    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
+        self.see_bytes(bytes).swap_remove(0)
+    }
+
+    fn abort(&self) -> ! {
+        panic!("rank {} ends all", self.rank)
     }
 }
 
 /// Returns the results of this number of ranks, each with its part of the `shards` and with its own threads.
 fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Division) -> T + Sync) -> Vec<T> {
-    let (floats, doubles) = (Mutex::new(vec![Vec::new(); ranks]), Mutex::new(vec![Vec::new(); ranks]));
-    let table = Arc::new(Table { barrier: Barrier::new(ranks), floats, doubles });
+    let table = Arc::new(Table { barrier: Barrier::new(ranks), put: Mutex::new(vec![Vec::new(); ranks]) });
     std::thread::scope(|scope| {
         let start = |rank| {
             let (table, work) = (table.clone(), &work);
             scope.spawn(move || {
                 let threads = rayon::ThreadPoolBuilder::new().num_threads(1 + rank % 2).build().unwrap();
-                threads.install(|| work(rank, Division::new(shards, Box::new(Seat { rank, table }))))
+                threads.install(|| work(rank, Division::new(shards, Arc::new(Seat { rank, table }))))
             })
         };
         let all: Vec<_> = (0..ranks).map(start).collect();
@@ -122,6 +160,77 @@ fn hands_that_are_dealt_to_ranks_learn_the_same_bits() {
     for ranks in [2, 8] {
         assert_same(work(1).remove(0), work(ranks), &format!("{ranks} ranks"), order);
     }
+}
+
+/// Makes this many more iterations on some ranks, from a checkpoint or from the start, and returns the checkpoint of the end.
+fn continued(from: Option<&[u8]>, iterations: usize, ranks: usize, config: &Config, task: &Arc<Task>) -> Vec<u8> {
+    let work = |_, division| {
+        let mut agent = Agent::divided(task, config, division).unwrap();
+        if let Some(bytes) = from {
+            agent.restore(&mut Checkpoint::parse(bytes).unwrap()).unwrap();
+        }
+        for _ in 0..iterations {
+            agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+        }
+        agent.checkpoint("", None)
+    };
+    on_ranks(ranks, 8, work).swap_remove(0).to_bytes().unwrap()
+}
+
+#[test]
+fn a_checkpoint_does_not_know_how_many_ranks_have_saved_it() {
+    // The parameters of the nets are not a whole number of chunks for any number of ranks.
+    let sets = ["env.num_envs=16", "ppo.hidden=[40]", "ppo.horizon=8", "env.max_episode_seconds=0.1", "run.shards=8"];
+    let config = config(&sets);
+    let task = Task::new(&config.env).unwrap();
+    let expected = continued(None, 4, 1, &config, &task);
+    for path in [[4, 1], [1, 4], [2, 8], [8, 2]] {
+        let middle = continued(None, 2, path[0], &config, &task);
+        let end = continued(Some(&middle), 2, path[1], &config, &task);
+        assert!(end == expected, "on {path:?} ranks");
+    }
+}
+
+#[test]
+fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
+    let config = config(&["env.max_episode_seconds=0.2", "ppo.hidden=[16]"]);
+    let task = Task::new(&config.env).unwrap();
+    let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
+    let never = AtomicBool::new(false);
+    for count in [5, 100] {
+        let episodes = Episodes { seed: 3, purpose: "evaluation", first: 10, count };
+        let alone = Actor::Mean(ppo.policy().freeze());
+        let alone = evaluate(&task, &alone, episodes, &never, &mut |_| Ok(())).unwrap().unwrap();
+        assert_eq!(alone.len(), count);
+        for ranks in [1, 4] {
+            let work = |_, division: Division| {
+                let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
+                let actor = Actor::Mean(ppo.policy().freeze());
+                evaluate_together(&task, &actor, episodes, &division, &never).unwrap().unwrap()
+            };
+            let mut together = on_ranks(ranks, 4, work);
+            assert!(together.swap_remove(0) == alone, "{count} episodes on {ranks} ranks");
+        }
+    }
+}
+
+#[test]
+fn a_gradient_step_sends_no_more_than_a_ring_would() {
+    let work = |_, division: Division| {
+        let mut agent = divided(8, &settings(), 5, division);
+        agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
+        let steps = settings().epochs * settings().minibatches;
+        (agent.division.take_traffic().bytes, agent.ppo.policy().parameters.len(), steps)
+    };
+    for ranks in [2, 4] {
+        let all = on_ranks(ranks, 8, work);
+        let sent: u64 = all.iter().map(|(bytes, _, _)| bytes).sum();
+        let (_, parameters, steps) = all[0];
+        // A ring sends each value 2 (n - 1) times; the rest are losses, norms and statistics.
+        let ring = (8 * (ranks - 1) * parameters * steps) as u64;
+        assert!((ring..ring + 2000 * (ranks * ranks * steps) as u64).contains(&sent), "{sent} against {ring}");
+    }
+    assert_eq!(on_ranks(1, 8, work)[0].0, 0);
 }
 
 #[test]

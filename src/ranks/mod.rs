@@ -1,12 +1,21 @@
 //! The division of a training run among ranks, which does not affect what it computes.
 //!
+//! A rank is a process; how ranks talk to each other is behind one trait.
 //! The environments are dealt to shards; their number is a setting and a power of two. Everything that is computed from
 //! many samples is computed shard by shard and combined in the order of the shards, gradients as a binary tree. A rank
 //! computes consecutive shards, which form a subtree. So one, two or four ranks give the same bits.
 
+mod division;
+mod launch;
+#[cfg(feature = "mpi")]
+mod mpi;
+
 use std::ops::Range;
 
 use pulp::Arch;
+
+pub use division::{Division, Slices, Traffic, totals};
+pub use launch::{Launched, Membership, join, launched};
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {
@@ -16,11 +25,23 @@ pub trait Ranks: Send + Sync {
     /// Returns the index of this rank.
     fn rank(&self) -> usize;
 
-    /// Replaces the values by their sum over all ranks, added as a binary tree in the order of the ranks.
-    fn add_up(&self, numbers: &mut [f32]);
+    /// Sends `numbers[parts[i]]` to rank i, for every i. Returns what the ranks have sent to this one, in their order.
+    fn exchange(&self, numbers: &[f32], parts: &[Range<usize>]) -> Vec<f32>;
+
+    /// Replaces `numbers[parts[i]]` by the values that rank i has there, for every i.
+    fn share(&self, numbers: &mut [f32], parts: &[Range<usize>]);
 
     /// Returns the values of all ranks, in their order; all ranks pass the same number of values.
     fn gather(&self, numbers: Vec<f64>) -> Vec<f64>;
+
+    /// Returns the bytes of each rank, in their order, to rank 0, and nothing to the others.
+    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>>;
+
+    /// Returns the bytes of rank 0.
+    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8>;
+
+    /// Ends all ranks at once.
+    fn abort(&self) -> !;
 }
 
 /// One rank that computes all shards.
@@ -35,62 +56,26 @@ impl Ranks for Alone {
         0
     }
 
-    fn add_up(&self, _: &mut [f32]) {}
+    fn exchange(&self, numbers: &[f32], _: &[Range<usize>]) -> Vec<f32> {
+        numbers.to_vec()
+    }
+
+    fn share(&self, _: &mut [f32], _: &[Range<usize>]) {}
 
     fn gather(&self, numbers: Vec<f64>) -> Vec<f64> {
         numbers
     }
-}
 
-/// The shards of a training run, and which of them this rank computes.
-pub struct Division {
-    shards: usize,
-    ranks: Box<dyn Ranks>,
-}
-
-impl Division {
-    /// Divides this number of shards among these ranks.
-    ///
-    /// # Panics
-    /// Panics if either number is not a power of two, or if there are fewer shards than ranks.
-    pub fn new(shards: usize, ranks: Box<dyn Ranks>) -> Self {
-        let fits = shards.is_power_of_two() && ranks.size().is_power_of_two() && ranks.size() <= shards;
-        assert!(fits, "{shards} shards on {} ranks", ranks.size());
-        Self { shards, ranks }
+    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+        vec![bytes]
     }
 
-    /// Assigns this number of shards to one rank.
-    pub fn alone(shards: usize) -> Self {
-        Self::new(shards, Box::new(Alone))
+    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
+        bytes
     }
 
-    /// Returns the number of all shards.
-    pub fn shards(&self) -> usize {
-        self.shards
-    }
-
-    /// Returns the shards of this rank.
-    pub fn own(&self) -> Range<usize> {
-        let each = self.shards / self.ranks.size();
-        each * self.ranks.rank()..each * (self.ranks.rank() + 1)
-    }
-
-    /// Replaces the sum over the shards of this rank by the sum over all ranks.
-    pub fn add_up(&self, numbers: &mut [f32]) {
-        self.ranks.add_up(numbers);
-    }
-
-    /// Returns the sums over all shards, added in their order. `of_own` yields one row for each shard of this rank, all
-    /// of equal length.
-    pub fn total(&self, of_own: impl Iterator<Item = Vec<f64>>) -> Vec<f64> {
-        let all = self.ranks.gather(of_own.flatten().collect());
-        let width = all.len() / self.shards;
-        (0..width).map(|i| all.iter().skip(i).step_by(width).sum()).collect()
-    }
-
-    /// Returns the largest of the values of all ranks.
-    pub fn largest(&self, own: f64) -> f64 {
-        self.ranks.gather(vec![own]).into_iter().fold(f64::NEG_INFINITY, f64::max)
+    fn abort(&self) -> ! {
+        std::process::exit(1)
     }
 }
 
@@ -139,14 +124,5 @@ mod tests {
         tree_sum(&mut second, &parts[4..]);
         tree_sum(&mut out, &[&first, &second]);
         assert_eq!(out, [expected, 8.0]);
-    }
-
-    #[test]
-    fn totals_are_added_in_the_order_of_the_shards() {
-        let division = Division::alone(4);
-        assert_eq!((division.shards(), division.own()), (4, 0..4));
-        // 1 is lost when added to 1e16: once in this order, never or twice in others.
-        let rows = [1e16, 1.0, -1e16, 1.0].map(|x| vec![x, 1.0]).into_iter();
-        assert_eq!(division.total(rows), [1.0, 4.0]);
     }
 }
