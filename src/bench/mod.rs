@@ -67,7 +67,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         rayon::current_num_threads(),
         config.env.num_envs,
         config.ppo.hidden,
-        config.steps_per_iteration() / config.ppo.minibatches as u64,
+        config.samples_per_minibatch(),
     );
     if asked(Part::Physics) {
         let (physics, pool, share) = physics_and_pool(&task, &config)?;
@@ -212,7 +212,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let mut agent = Agent::of_task(task, config)?;
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
-    let size = rollout.samples() / config.ppo.minibatches;
+    let size = config.samples_per_minibatch();
     let flops = flops_per_sample(ppo.policy());
     time_gradient_steps(ppo, rollout, 2)?;
     let samples = size as f64 / median(time_gradient_steps(ppo, rollout, REPEATS)?);

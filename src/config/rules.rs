@@ -162,11 +162,15 @@ fn learning(config: &Config, rules: &mut Rules) {
     let samples = config.env.num_envs.saturating_mul(ppo.horizon);
     let rule = "make at most 2^22 samples (num_envs * horizon)";
     rules.check(samples <= 1 << 22, "ppo.horizon", ppo.horizon, rule);
-    let divides = ppo.minibatches == 0 || samples.is_multiple_of(ppo.minibatches);
+    // One of the two holds; a number of minibatches of 0 is reported elsewhere.
+    let by_size = ppo.minibatch_size > 0;
+    let (key, parts) =
+        if by_size { ("ppo.minibatch_size", ppo.minibatch_size) } else { ("ppo.minibatches", ppo.minibatches) };
+    let divides = parts == 0 || samples.is_multiple_of(parts);
     let rule = format!("divide num_envs * horizon = {samples}");
-    rules.check(divides, "ppo.minibatches", ppo.minibatches, &rule);
+    rules.check(divides, key, parts, &rule);
     let shards = config.run.shards;
-    let dealt = !divides || ppo.minibatches == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
+    let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
     rules.check(dealt, "run.shards", shards, rule);
     let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;

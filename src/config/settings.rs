@@ -159,6 +159,7 @@ pub struct PpoConfig {
     pub horizon: usize,
     pub epochs: usize,
     pub minibatches: usize,
+    pub minibatch_size: usize,
     pub hidden: Vec<usize>,
     pub activation: Activation,
     pub symmetry: Symmetry,
@@ -257,7 +258,7 @@ impl Config {
 
     /// Returns the number of samples in a minibatch.
     pub fn samples_per_minibatch(&self) -> usize {
-        self.env.num_envs * self.ppo.horizon / self.ppo.minibatches
+        self.ppo.minibatch_of(self.env.num_envs * self.ppo.horizon)
     }
 
     /// Returns the number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
@@ -276,6 +277,11 @@ impl PpoConfig {
     /// Returns the structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
         NetConfig { hidden: self.hidden.clone(), activation: self.activation, symmetry: self.symmetry }
+    }
+
+    /// Returns the number of samples in a minibatch of a rollout with this many.
+    pub fn minibatch_of(&self, samples: usize) -> usize {
+        if self.minibatch_size == 0 { samples / self.minibatches } else { self.minibatch_size }
     }
 
     /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.

@@ -198,14 +198,15 @@ impl Ppo {
         let own = self.division.own();
         let in_shard = rollout.samples() / own.len();
         // Each part takes this number of samples from each shard.
-        let size = in_shard / self.config.minibatches;
+        let shards = self.division.shards();
+        let size = self.config.minibatch_of(in_shard * shards) / shards;
         let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
         let mut shuffles: Vec<Rng> = own.clone().map(stream).collect();
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
         let (mut samples, mut steps) = (Vec::new(), Vec::new());
         for epoch in 0..self.config.epochs {
             order.chunks_mut(in_shard).zip(&mut shuffles).for_each(|(shard, shuffle)| shard.shuffle(shuffle));
-            for part in 0..self.config.minibatches {
+            for part in 0..in_shard / size {
                 if stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }

@@ -58,6 +58,9 @@ impl Session {
         plan.expect_ranks(ranks.size())?;
         plan.send(&**ranks)?;
         let mut session = Self::set_up(plan, ranks.clone())?;
+        if let Some(warning) = session.expect_alike()? {
+            run::say(&format!("warning: {warning}"));
+        }
         // A new folder is created last, so that a training that cannot be set up leaves none behind.
         let (folder, lock, begin) = match existing {
             Some(existing) => {
@@ -76,9 +79,10 @@ impl Session {
     /// Sets up the training that the first rank has planned, on another rank.
     ///
     /// # Errors
-    /// Fails as [`Session::set_up`] does.
+    /// Fails as [`Session::set_up`] and [`Session::expect_alike`] do.
     pub(super) fn follow(ranks: &Arc<dyn Ranks>) -> Result<Self> {
-        Self::set_up(Plan::receive(&**ranks)?, ranks.clone())
+        let session = Self::set_up(Plan::receive(&**ranks)?, ranks.clone())?;
+        session.expect_alike().map(|_| session)
     }
 
     fn set_up(plan: Plan, ranks: Arc<dyn Ranks>) -> Result<Self> {

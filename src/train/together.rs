@@ -6,12 +6,12 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use anyhow::{Error, Result, anyhow, bail};
+use anyhow::{Error, Result, anyhow, bail, ensure};
 
 use super::session::Session;
 use crate::dump;
 use crate::ranks::Ranks;
-use crate::run::{self, Report, Requests, RunFolder};
+use crate::run::{self, Machine, Report, Requests, RunFolder};
 use crate::schedule::panic_message;
 use crate::sim;
 
@@ -46,7 +46,42 @@ pub(super) fn follow(requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result<Exit
     Ok(ExitCode::SUCCESS)
 }
 
+/// The most processors that a rank which is bound to one core may use: two, where a core runs two threads.
+const ONE_CORE: f64 = 2.0;
+
 impl Session {
+    /// Checks that this rank runs the same program on the same scene as the first one. Returns a warning, on all ranks, if one may
+    /// use only one core of a machine with more.
+    ///
+    /// # Errors
+    /// Fails if the program or the scene differs.
+    pub(super) fn expect_alike(&self) -> Result<Option<String>> {
+        if self.agent.division.is_alone() {
+            return Ok(None);
+        }
+        let machine = Machine::this();
+        let [low, high] = [self.scene & u64::from(u32::MAX), self.scene >> 32].map(|half| half as f64);
+        let name = f64::from(crc32fast::hash(machine.name.as_bytes()));
+        let [allowed, processors] = [machine.allowed, machine.processors].map(|count| count as f64);
+        let own = [f64::from(run::program_checksum()), low, high, name, allowed, processors];
+        let all = self.agent.division.gather(own.to_vec());
+        let rows: Vec<&[f64]> = all.chunks(own.len()).collect();
+        ensure!(own[0] == rows[0][0], "the program on {} is not the one of rank 0", machine.name);
+        ensure!(own[1..3] == rows[0][1..3], "the scene on {} is not the one of rank 0", machine.name);
+        let bound = |row: &[f64]| {
+            let ranks_there = rows.iter().filter(|other| other[3] == row[3]).count() as f64;
+            row[4] <= ONE_CORE && row[4] * ranks_there < row[5]
+        };
+        let bound = rows.iter().position(|row| bound(row)).filter(|_| self.config.run.threads != 1);
+        Ok(bound.map(|rank| {
+            let [_, _, _, _, allowed, processors] = rows[rank] else { unreachable!("one row for each rank") };
+            format!(
+                "rank {rank} may use only {allowed} of the {processors} processors of its machine: start with mpirun --bind-to none, \
+                 or --map-by ppr:1:node:PE={processors}, or srun --cpus-per-task"
+            )
+        }))
+    }
+
     /// Agrees with the other ranks on what follows this iteration, and checks that all have the same weights. `asked_to_stop` tells
     /// that the user did so by a file.
     ///

@@ -12,6 +12,7 @@ mod docs;
 mod experiment;
 mod export;
 mod fork;
+mod mpi;
 mod outputs;
 mod pace;
 #[cfg(feature = "video")]

@@ -1,0 +1,58 @@
+//! The machine that this process runs on, as far as several processes must know it of one another.
+
+use std::fs;
+
+use super::file::read_bytes;
+
+/// A machine, and what this process may use of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Machine {
+    /// Its name in the network.
+    pub name: String,
+    /// The number of processors that the system runs on.
+    pub processors: usize,
+    /// The number of them that this process may run on.
+    pub allowed: usize,
+}
+
+impl Machine {
+    /// Returns this machine. What the system does not tell is empty or 0.
+    pub fn this() -> Self {
+        let text = |path| fs::read_to_string(path).unwrap_or_default();
+        let status = text("/proc/self/status");
+        let allowed = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:")).unwrap_or_default();
+        Self {
+            name: text("/proc/sys/kernel/hostname").trim().to_owned(),
+            processors: count(&text("/sys/devices/system/cpu/online")),
+            allowed: count(allowed),
+        }
+    }
+}
+
+/// Returns the number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
+fn count(list: &str) -> usize {
+    let number = |text: &str| text.trim().parse::<usize>().ok();
+    let of = |part: &str| match part.split_once('-') {
+        Some((first, last)) => Some((number(last)? + 1).saturating_sub(number(first)?)),
+        None => number(part).map(|_| 1),
+    };
+    list.split(',').filter_map(of).sum()
+}
+
+/// Returns a checksum (CRC-32) of the file of this program; 0 if it cannot be read.
+pub fn program_checksum() -> u32 {
+    let program = std::env::current_exe().ok().and_then(|path| read_bytes(&path).ok());
+    program.map_or(0, |bytes| crc32fast::hash(&bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn processors_are_counted_in_the_lists_of_the_kernel() {
+        assert_eq!(["0", "0-3", "0-3,8", "1,3,5-6\n", ""].map(count), [1, 4, 5, 4, 0]);
+        let this = Machine::this();
+        assert!(this.processors >= this.allowed && this.allowed >= 1, "{this:?}");
+    }
+}
