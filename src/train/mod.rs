@@ -14,6 +14,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, Error, Result};
 
@@ -31,6 +32,9 @@ use saver::Saver;
 use session::Session;
 use together::{Next, follow, panicked};
 
+/// The time that the first rank has to tell of an error before another one does, and ends it.
+const PATIENCE: Duration = Duration::from_secs(2);
+
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
 /// several processes, they train together.
 ///
@@ -47,6 +51,10 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     // To leave the ranks means to wait for the others, who may be waiting for this one.
     let result = catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| Err(panicked(&*panic)));
     result.or_else(|error| {
+        if ranks.rank() > 0 {
+            // What all ranks meet at once, such as a loss that is not finite, is told by the first.
+            std::thread::sleep(PATIENCE);
+        }
         run::say(&format!("error: {error:#}"));
         ranks.abort()
     })
