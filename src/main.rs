@@ -15,7 +15,7 @@ fn main() -> ExitCode {
         Err(answer) => return tell(&answer),
     };
     let trains = matches!(command, Command::Train(_));
-    if let Some(launched) = ranks::launched() {
+    if let Some(launched) = ranks::one_of_several() {
         if !trains {
             return refuse(launched);
         }
@@ -55,7 +55,7 @@ fn refuse(launched: Launched) -> ExitCode {
 
 /// Prints the help, the version or a usage error, and returns the exit code. One of several processes says it.
 fn tell(answer: &clap::Error) -> ExitCode {
-    if ranks::launched().is_some_and(|launched| launched.rank > 0) {
+    if ranks::one_of_several().is_some_and(|launched| launched.rank > 0) {
         return ExitCode::from(answer.exit_code() as u8);
     }
     match answer.print() {

@@ -15,7 +15,7 @@ use std::ops::Range;
 use pulp::Arch;
 
 pub use division::{Division, Slices, Traffic, totals};
-pub use launch::{Launched, Membership, join, launched};
+pub use launch::{Launched, Membership, join, launched, one_of_several};
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {

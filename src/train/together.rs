@@ -10,7 +10,7 @@ use anyhow::{Error, Result, anyhow, bail, ensure};
 
 use super::session::Session;
 use crate::dump;
-use crate::ranks::Ranks;
+use crate::ranks::{self, Ranks};
 use crate::run::{self, Machine, Report, Requests, RunFolder};
 use crate::schedule::panic_message;
 use crate::sim;
@@ -50,13 +50,13 @@ pub(super) fn follow(requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result<Exit
 const ONE_CORE: f64 = 2.0;
 
 impl Session {
-    /// Checks that this rank runs the same program on the same scene as the first one. Returns a warning, on all ranks, if one may
-    /// use only one core of a machine with more.
+    /// Checks that this rank runs the same program on the same scene as the first one. Returns a warning, on all ranks, if a
+    /// launcher has bound one to a single core of a machine with more.
     ///
     /// # Errors
     /// Fails if the program or the scene differs.
     pub(super) fn expect_alike(&self) -> Result<Option<String>> {
-        if self.agent.division.is_alone() {
+        if ranks::launched().is_none() {
             return Ok(None);
         }
         let machine = Machine::this();
@@ -72,7 +72,7 @@ impl Session {
             let ranks_there = rows.iter().filter(|other| other[3] == row[3]).count() as f64;
             row[4] <= ONE_CORE && row[4] * ranks_there < row[5]
         };
-        let bound = rows.iter().position(|row| bound(row)).filter(|_| self.config.run.threads != 1);
+        let bound = rows.iter().position(|row| bound(row)).filter(|_| self.config.run.threads == 0);
         Ok(bound.map(|rank| {
             let [_, _, _, _, allowed, processors] = rows[rank] else { unreachable!("one row for each rank") };
             format!(
