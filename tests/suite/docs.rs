@@ -120,7 +120,14 @@ fn every_setting_and_option_that_the_documents_name_exists() {
                 assert!(is_known || stands_for_some, "{}: {word}", path.display());
             }
             if word.starts_with("--") && word.len() > 3 && text.contains("shadow-repose") {
-                const OF_OTHERS: [&str; 13] = [
+                const OF_OTHERS: [&str; 20] = [
+                    "--features",
+                    "--map-by",
+                    "--bind-to",
+                    "--mpi",
+                    "--nodes",
+                    "--ntasks-per-node",
+                    "--signal",
                     "--check",
                     "--release",
                     "--logdir",
