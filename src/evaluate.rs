@@ -109,10 +109,11 @@ pub fn evaluate_together(
     division: &Division,
     interrupted: &AtomicBool,
 ) -> Result<Option<Vec<EpisodeStats>>> {
-    let own = play(task, actor, episodes, division.part_of(LANES), interrupted, &mut |_| Ok(()))?;
+    let lanes = LANES.min(episodes.count);
+    let own = play(task, actor, episodes, division.part_of(lanes), interrupted, &mut |_| Ok(()))?;
     let Some(own) = own else { return Ok(None) };
     let all = EpisodeStats::gathered(own, division);
-    let numbers = division.parts_of(LANES).into_iter().flat_map(|lanes| episodes.on(lanes));
+    let numbers = division.parts_of(lanes).into_iter().flat_map(|lanes| episodes.on(lanes));
     let mut numbered: Vec<(usize, EpisodeStats)> = numbers.zip(all).collect();
     numbered.sort_unstable_by_key(|(number, _)| *number);
     Ok(Some(numbered.into_iter().map(|(_, episode)| episode).collect()))

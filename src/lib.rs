@@ -70,7 +70,8 @@
 //! At the end of each iteration [`train`] copies everything that the next one depends on into a [`ppo::Checkpoint`] with
 //! [`agent::Agent::checkpoint`]: the state of the learner and of the environments. If the following iteration fails or is
 //! stopped (a signal, a panic, a loss that is not finite), that checkpoint is the one to write. [`run`] writes it whole or
-//! not at all, under its number. [`load`] is the only way to read such files; it also finds the newest undamaged one.
+//! not at all, under its number. Several ranks hand over their states only when that is due: if one fails, all end, and the last
+//! checkpoint is what remains. [`load`] is the only way to read such files; it also finds the newest undamaged one.
 
 pub mod agent;
 pub mod bench;

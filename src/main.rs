@@ -15,13 +15,8 @@ fn main() -> ExitCode {
         Err(answer) => return tell(&answer),
     };
     let trains = matches!(command, Command::Train(_));
-    if let Some(launched) = ranks::one_of_several() {
-        if !trains {
-            return refuse(launched);
-        }
-        if launched.rank > 0 {
-            run::speak_as(&format!("rank {}", launched.rank));
-        }
+    if let Some(launched) = ranks::launched().filter(|_| !trains) {
+        return refuse(launched);
     }
     let result = Requests::listen(trains).and_then(|requests| match command {
         Command::Train(args) => train(&args, &requests),
@@ -55,7 +50,7 @@ fn refuse(launched: Launched) -> ExitCode {
 
 /// Prints the help, the version or a usage error, and returns the exit code. One of several processes says it.
 fn tell(answer: &clap::Error) -> ExitCode {
-    if ranks::one_of_several().is_some_and(|launched| launched.rank > 0) {
+    if ranks::launched().is_some_and(|launched| launched.rank > 0) {
         return ExitCode::from(answer.exit_code() as u8);
     }
     match answer.print() {

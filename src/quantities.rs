@@ -71,17 +71,25 @@ const OTHERS: [(&str, &str, &str); 34] = [
     (
         "time/exchange_s",
         "exchange (s)",
-        "Seconds that the first of several ranks talked to the others, waiting included.",
+        "Seconds of collecting and learning in which the first of several ranks talked to the others or waited for them.",
     ),
     (
         "time/exchange_bytes",
         "exchange (bytes)",
-        "Bytes that the first of several ranks sent to the others in the iteration.",
+        "Bytes that the first of several ranks sent to the others while collecting and learning.",
     ),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
     ("histogram/std", "standard deviations", "Standard deviations of the 20 actions; 1 is half an actuator's range."),
-    ("histogram/actions", "actions", "Actions of the iteration as drawn, before they are clipped to [-1, 1]."),
-    ("histogram/advantages", "advantages", "Advantages of the iteration, with mean 0 and standard deviation 1."),
+    (
+        "histogram/actions",
+        "actions",
+        "Actions of the iteration as drawn, before they are clipped to [-1, 1]; of several ranks: those of the first.",
+    ),
+    (
+        "histogram/advantages",
+        "advantages",
+        "Advantages of the iteration, with mean 0 and standard deviation 1; of several ranks: those of the first.",
+    ),
     ("eval/film", "film", "The first evaluation episode with mean actions, at the speed of the simulation."),
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];

@@ -22,6 +22,7 @@ mod policy;
 mod rollout;
 
 use std::f64::consts::{E, TAU};
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -61,6 +62,8 @@ pub struct Ppo {
     adam: Adam,
     learning_rate: f64,
     division: Division,
+    /// The chunks of each group of parameters, by which the norm of the gradient is computed.
+    chunks: Vec<Vec<Range<usize>>>,
     /// The parameters that each rank moves.
     slices: Slices,
 }
@@ -130,8 +133,9 @@ impl Ppo {
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (config, learning_rate) = (config.clone(), config.learning_rate);
-        let slices = division.slices(&norm_chunks(&policy.layout.groups()).concat());
-        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division, slices })
+        let chunks = norm_chunks(&policy.layout.groups());
+        let slices = division.slices(&chunks.concat());
+        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division, chunks, slices })
     }
 
     /// Returns the current policy.
@@ -283,7 +287,7 @@ impl Ppo {
         let losses = self.losses(&sums, minibatch.count() as f64);
         let squares = squares(&self.gradient, self.slices.own_chunks());
         let squares = self.division.gather_chunks(squares, &self.slices);
-        let grad_norm = norm(&squares, &norm_chunks(&self.policy.layout.groups()));
+        let grad_norm = norm(&squares, &self.chunks);
         for (what, value) in [("the loss", losses.total), ("the norm of the gradient", grad_norm)] {
             if !value.is_finite() {
                 bail!("{what} is {value}: the training has failed and stops here");

@@ -22,24 +22,23 @@ const TOLD: [(&str, &str); 3] = [
     ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID"),
 ];
 
-/// Returns what a launcher has said, if one has started this process.
+/// Returns what a launcher has said, if this process is one of several.
 pub fn launched() -> Option<Launched> {
     told(|name| std::env::var(name).ok())
 }
 
-/// The same if it has started several.
-pub fn one_of_several() -> Option<Launched> {
-    launched().filter(|launched| launched.size > 1)
+/// Returns whether OpenMPI's mpirun has started this process, be it alone or with others. It binds one or two processes to a core
+/// each.
+pub fn launched_by_mpirun() -> bool {
+    std::env::var_os(TOLD[0].0).is_some()
 }
 
 fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
     let number = |name| variable(name)?.trim().parse::<usize>().ok();
-    let all = TOLD.into_iter().filter_map(|(size, rank)| {
-        let (size, rank) = (number(size)?, number(rank).unwrap_or(0));
-        Some(Launched { rank, size })
-    });
-    // One launcher may have started another.
-    all.rev().max_by_key(|launched| launched.size)
+    TOLD.into_iter().find_map(|(size, rank)| {
+        let size = number(size).filter(|&size| size > 1)?;
+        Some(Launched { rank: number(rank).unwrap_or(0), size })
+    })
 }
 
 /// This process as a member of its ranks. When it is dropped, it leaves them, which waits for the others.
@@ -66,7 +65,7 @@ impl Membership {
 /// Fails if there should be several ranks, but this process cannot talk to the others.
 #[cfg(feature = "mpi")]
 pub fn join() -> Result<Membership> {
-    let Some(Launched { size, .. }) = one_of_several() else { return Ok(Membership::alone()) };
+    let Some(Launched { size, .. }) = launched() else { return Ok(Membership::alone()) };
     let (universe, ranks) = super::mpi::join()?;
     if ranks.size() == 1 {
         bail!(
@@ -83,7 +82,7 @@ pub fn join() -> Result<Membership> {
 /// Fails if there should be several ranks.
 #[cfg(not(feature = "mpi"))]
 pub fn join() -> Result<Membership> {
-    if let Some(Launched { size, .. }) = one_of_several() {
+    if let Some(Launched { size, .. }) = launched() {
         bail!(
             "{size} processes were started, but this build has no MPI: each would train on its own; build with --features mpi \
              (docs/CLUSTER.md), or start one process"
@@ -102,7 +101,7 @@ mod tests {
             told(|name| variables.iter().find(|(other, _)| *other == name).map(|(_, value)| value.to_string()))
         };
         assert_eq!(of(&[]), None);
-        assert_eq!(of(&[("PMI_SIZE", "1"), ("PMI_RANK", "0")]), Some(Launched { rank: 0, size: 1 }));
+        assert_eq!(of(&[("PMI_SIZE", "1"), ("PMI_RANK", "0")]), None);
         let expected = Some(Launched { rank: 3, size: 4 });
         assert_eq!(of(&[("OMPI_COMM_WORLD_SIZE", "4"), ("OMPI_COMM_WORLD_RANK", "3")]), expected);
         assert_eq!(of(&[("PMI_SIZE", "4"), ("PMI_RANK", "3")]), expected);

@@ -4,6 +4,11 @@
 //! The environments are dealt to shards; their number is a setting and a power of two. Everything that is computed from
 //! many samples is computed shard by shard and combined in the order of the shards, gradients as a binary tree. A rank
 //! computes consecutive shards, which form a subtree. So one, two or four ranks give the same bits.
+//!
+//! In a gradient step each rank sends its gradient, cut into the slices of the ranks; adds up its own slice; tells the others
+//! its part of the losses and of the norm; moves its slice of the parameters; and sends that to all. At the end of an
+//! iteration they add up statistics and tell the first rank of the episodes that ended, and for a checkpoint the states of
+//! their environments.
 
 mod division;
 mod launch;
@@ -15,7 +20,7 @@ use std::ops::Range;
 use pulp::Arch;
 
 pub use division::{Division, Slices, Traffic, totals};
-pub use launch::{Launched, Membership, join, launched, one_of_several};
+pub use launch::{Launched, Membership, join, launched, launched_by_mpirun};
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {

@@ -2,6 +2,7 @@
 //!
 //! Rows after the checkpoint that is resumed from are cut off, so that no row is missing or duplicated.
 
+use std::borrow::Cow;
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
@@ -53,6 +54,11 @@ impl Metrics {
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => return Err(error).with_context(context),
         }
+        if let Some(columns) = &found.columns {
+            let lacking = header.split(',').enumerate().filter(|(place, _)| !columns.contains(place));
+            let lacking: Vec<&str> = lacking.map(|(_, name)| name).collect();
+            notes.push(format!("{METRICS} was begun without these columns and continues so: {}", lacking.join(", ")));
+        }
         if found.dropped > 0 {
             notes.push(format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
         }
@@ -76,7 +82,7 @@ impl Metrics {
     /// # Errors
     /// Fails if the file cannot be written; [`Metrics::repair`] must succeed before the next row.
     pub(super) fn row(&mut self, row: &str) -> Result<()> {
-        let mut row = std::borrow::Cow::from(row);
+        let mut row = Cow::from(row);
         if let Some(columns) = &self.columns {
             let cells: Vec<&str> = row.trim_end().split(',').collect();
             row = (columns.iter().map(|&i| cells[i]).collect::<Vec<_>>().join(",") + "\n").into();
@@ -135,10 +141,12 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     let mut columns = None;
     match line.strip_suffix(b"\n") {
         Some(found) if found == header.as_bytes() => {}
-        Some(found) if among(found, header).is_some() => columns = among(found, header),
         // A header that was written only in part, e.g. on a full disk.
         None if header.as_bytes().starts_with(&line) => return Ok(Some(Rows::default())),
-        _ => return Ok(None),
+        found => match found.and_then(|found| among(found, header)) {
+            Some(places) => columns = Some(places),
+            None => return Ok(None),
+        },
     }
     let commas = line.iter().filter(|&&byte| byte == b',').count();
     let mut found = Rows { length: line.len() as u64, columns, ..Rows::default() };
@@ -210,7 +218,7 @@ mod tests {
     fn a_table_that_was_begun_with_fewer_columns_continues_without_the_new_ones() {
         let (place, path) = table("1,0.5\n2,0.25\n");
         let (mut metrics, notes) = Metrics::open(&path, "iteration,speed,loss,drops", 0..1).unwrap();
-        assert!(notes.len() == 1 && notes[0].contains("1 rows"), "{notes:?}");
+        assert!(notes.len() == 2 && notes[0].contains("speed, drops") && notes[1].contains("1 rows"), "{notes:?}");
         metrics.row("2,9,0.125,\n").unwrap();
         metrics.sync().unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n1,0.5\n2,0.125\n");

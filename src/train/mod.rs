@@ -32,8 +32,8 @@ use saver::Saver;
 use session::Session;
 use together::{Next, follow, panicked};
 
-/// The time that the first rank has to tell of an error before another one does, and ends it.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// The time that the first rank has to save what it can and to tell of an error before another one does, and ends it.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
 /// several processes, they train together.
@@ -42,10 +42,17 @@ const PATIENCE: Duration = Duration::from_secs(2);
 /// Fails if settings, files or the scene cannot be used, if the run folder cannot be written to at the start or at the end, if a
 /// loss is not finite, or after a panic. One of several ranks ends all others then, and does not return.
 pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
-    let membership = ranks::join()?;
+    let membership = match ranks::join() {
+        // All meet the same error; one of them tells.
+        Err(_) if ranks::launched().is_some_and(|launched| launched.rank > 0) => return Ok(ExitCode::FAILURE),
+        joined => joined?,
+    };
     let ranks = &membership.ranks;
     if ranks.size() == 1 {
         return lead(args, requests, ranks);
+    }
+    if ranks.rank() > 0 {
+        run::speak_as(&format!("rank {}", ranks.rank()));
     }
     let work = || if ranks.rank() == 0 { lead(args, requests, ranks) } else { follow(requests, ranks) };
     // To leave the ranks means to wait for the others, who may be waiting for this one.
@@ -97,7 +104,7 @@ fn run_to_end(session: &mut Session, mut saver: Saver, report: &mut Report, requ
             Ok(Some(result)) => result,
             Ok(None) => {
                 session.count_divergence();
-                return stop(saver, report, requests.exit_code());
+                return stop(saver, report, requests.exit_code(), "stopped");
             }
             Err(error) => {
                 session.count_divergence();
@@ -118,7 +125,7 @@ fn run_to_end(session: &mut Session, mut saver: Saver, report: &mut Report, requ
         }
         if let Some(code) = next.stop {
             session.count_divergence();
-            return stop(saver, report, code);
+            return stop(saver, report, code, if next.by_file { "stopped by the file `stop`" } else { "stopped" });
         }
         if session.saves(&next)
             && let Err(error) = saver.save(report)
@@ -157,8 +164,9 @@ struct Made {
     recent: Recent,
     /// The score of its evaluation, which has no episodes if there was none.
     evaluation: Score,
-    /// What talking to the other ranks has cost this one.
+    /// What talking to the other ranks has cost this one while collecting and learning.
     traffic: Traffic,
+    /// Those of this rank's environments.
     figures: Figures,
 }
 
@@ -188,12 +196,24 @@ impl Session {
     }
 
     fn collect_learn_evaluate(&mut self, stop: &AtomicBool, report: Option<&Report>) -> Result<Option<Made>> {
+        // What was talked about since the last iteration is not counted.
+        self.agent.division.take_traffic();
         let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
         let traffic = self.agent.division.take_traffic();
         let mut evaluation = Score::of(&[]);
         if evaluates(self.agent.iteration, self.config.run.eval_every) {
             let Some(score) = self.evaluate(stop)? else { return Ok(None) };
             evaluation = score;
+            if let Some(report) = report {
+                report.say(&format!(
+                    "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
+                    self.agent.env_steps,
+                    evaluation.episodes,
+                    evaluation.goals,
+                    evaluation.rot_dist,
+                    100.0 * evaluation.drop_rate
+                ));
+            }
         }
         let Some(figures) = self.figures(stop, report) else { return Ok(None) };
         let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
@@ -239,16 +259,6 @@ impl Session {
 
     fn report(&mut self, report: &mut Report, made: &Made) {
         let Made { iteration, ended, recent, evaluation, traffic, figures } = made;
-        if evaluation.episodes > 0 {
-            report.say(&format!(
-                "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
-                self.agent.env_steps,
-                evaluation.episodes,
-                evaluation.goals,
-                evaluation.rot_dist,
-                100.0 * evaluation.drop_rate
-            ));
-        }
         let ended = Ended::of(ended, randomizes(&self.config));
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
@@ -302,11 +312,11 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     Report::new(saver.folder().path(), &tags, progress).described(described(&tags), session.config.to_text())
 }
 
-/// Saves the state at the end of the last complete iteration after a request to stop.
-fn stop(mut saver: Saver, report: &mut Report, code: ExitCode) -> Result<ExitCode> {
+/// Saves the state at the end of the last complete iteration after a request to stop, and returns the exit code.
+fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, stopped: &str) -> Result<ExitCode> {
     saver.save_at_last(report)?;
     if saver.has_begun() {
-        run::say(&format!("stopped after {}; resume with", saver.steps_made()));
+        run::say(&format!("{stopped} after {}; resume with", saver.steps_made()));
         run::say(&format!("  {}", saver.how_to_resume()));
     } else {
         run::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");

@@ -22,7 +22,7 @@ pub(super) enum Begin {
 }
 
 /// The saver of a training. It always holds the state at the end of the last complete iteration, which is what remains if the
-/// next one does not complete.
+/// next one does not complete; with several ranks, that at which they last handed over their states.
 ///
 /// Nothing in the folder of a resumed run is changed before the first iteration is done: until then, anyone who named the wrong
 /// run or checkpoint can stop.

@@ -29,12 +29,12 @@ pub(super) struct Session {
     pub agent: Agent<Repose>,
     /// The best evaluation so far; only the first rank knows it.
     pub best: Option<Evaluation>,
+    /// Whether the last iteration had the best evaluation so far.
+    pub improved: bool,
     /// The films of evaluation episodes, on the first rank.
     pub films: Films,
     /// The number of steps of this session on which the physics diverged.
     pub diverged: u64,
-    /// Whether the last iteration had the best evaluation so far.
-    pub improved: bool,
     /// Whether the warning about them was printed.
     pub warned: bool,
     /// Whether the steps that led to them are written.
@@ -100,6 +100,12 @@ impl Session {
     }
 
     fn of(plan: Plan, ranks: Arc<dyn Ranks>) -> Result<Self> {
+        let fork = matches!(plan.start, Start::Fork(..)).then(|| plan.context.clone());
+        let session = Self::created(plan, ranks);
+        if let Some(context) = fork { session.context(context) } else { session }
+    }
+
+    fn created(plan: Plan, ranks: Arc<dyn Ranks>) -> Result<Self> {
         let Plan { mut config, start, context, dumps } = plan;
         // The saved configuration contains the actual number of shards.
         config.run.shards = config.shards();
@@ -110,7 +116,13 @@ impl Session {
         let films = if first { Films::new(&config) } else { Films::none() };
         let (best, improved, diverged, warned) = (None, false, 0, false);
         let mut session = Self { config, task, agent, best, improved, films, diverged, warned, dumps, scene };
-        session.start(start, first).context(context)?;
+        let forks = matches!(start, Start::Fork(..));
+        let started = session.start(start, first);
+        if forks {
+            started?
+        } else {
+            started.context(context)?
+        }
         Ok(session)
     }
 

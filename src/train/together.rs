@@ -21,6 +21,8 @@ pub(super) struct Next {
     save: bool,
     /// The exit code if the training is to stop here.
     pub stop: Option<ExitCode>,
+    /// Whether the user has asked for that by a file.
+    pub by_file: bool,
     /// Whether this iteration had the best evaluation so far.
     improved: bool,
 }
@@ -56,18 +58,22 @@ impl Session {
     /// # Errors
     /// Fails if the program or the scene differs.
     pub(super) fn expect_alike(&self) -> Result<Option<String>> {
-        if ranks::launched().is_none() {
+        let alone = self.agent.division.is_alone();
+        if alone && !ranks::launched_by_mpirun() {
             return Ok(None);
         }
         let machine = Machine::this();
         let [low, high] = [self.scene & u64::from(u32::MAX), self.scene >> 32].map(|half| half as f64);
         let name = f64::from(crc32fast::hash(machine.name.as_bytes()));
         let [allowed, processors] = [machine.allowed, machine.processors].map(|count| count as f64);
-        let own = [f64::from(run::program_checksum()), low, high, name, allowed, processors];
+        let program = if alone { 0.0 } else { f64::from(run::program_checksum()) };
+        let own = [program, low, high, name, allowed, processors];
         let all = self.agent.division.gather(own.to_vec());
         let rows: Vec<&[f64]> = all.chunks(own.len()).collect();
-        ensure!(own[0] == rows[0][0], "the program on {} is not the one of rank 0", machine.name);
-        ensure!(own[1..3] == rows[0][1..3], "the scene on {} is not the one of rank 0", machine.name);
+        for (rank, row) in rows.iter().enumerate() {
+            ensure!(row[0] == rows[0][0], "rank {rank} runs another program than rank 0");
+            ensure!(row[1..3] == rows[0][1..3], "rank {rank} has another scene than rank 0");
+        }
         let bound = |row: &[f64]| {
             let ranks_there = rows.iter().filter(|other| other[3] == row[3]).count() as f64;
             row[4] <= ONE_CORE && row[4] * ranks_there < row[5]
@@ -91,7 +97,7 @@ impl Session {
         let save = requests.take_save();
         if self.agent.division.is_alone() {
             let stop = asked_to_stop.then_some(ExitCode::SUCCESS);
-            return Ok(Next { save, stop, improved: self.improved });
+            return Ok(Next { save, stop, by_file: asked_to_stop, improved: self.improved });
         }
         let stop = asked_to_stop || requests.stop().load(Ordering::Relaxed);
         let flags = [stop, save, self.improved].map(|flag| f64::from(u8::from(flag)));
@@ -105,7 +111,7 @@ impl Session {
         }
         let most = |i: usize| rows.iter().map(|row| row[i]).fold(0.0, f64::max);
         let stop = (most(0) > 0.0).then(|| run::exit_code(most(3) as i32));
-        Ok(Next { save: most(1) > 0.0, stop, improved: most(2) > 0.0 })
+        Ok(Next { save: most(1) > 0.0, stop, by_file: asked_to_stop, improved: most(2) > 0.0 })
     }
 
     /// Returns whether the state is saved after this iteration.

@@ -215,7 +215,7 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
 }
 
 #[test]
-fn a_gradient_step_sends_no_more_than_a_ring_would() {
+fn all_ranks_together_send_no_more_than_a_ring_would() {
     let work = |_, division: Division| {
         let mut agent = divided(8, &settings(), 5, division);
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
