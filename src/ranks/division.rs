@@ -231,7 +231,7 @@ mod tests {
     fn the_slices_of_the_ranks_are_whole_chunks_and_cover_the_array() {
         let chunks = [0..5, 5..10, 10..12, 12..17, 17..20];
         for (ranks, expected) in [
-            (1, Vec::from([0..20])),
+            (1, vec![Range { start: 0, end: 20 }]),
             (2, vec![0..10, 10..20]),
             (4, vec![0..5, 5..10, 10..12, 12..20]),
             (8, vec![0..0, 0..5, 5..5, 5..10, 10..12, 12..12, 12..17, 17..20]),
