@@ -149,7 +149,7 @@ impl<E: Env> Agent<E> {
     pub fn collect(&mut self, stop: &AtomicBool) -> Result<Option<E::Lesson>> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
-        self.ppo.limit_std(self.env_steps);
+        self.ppo.follow_ramps(self.env_steps);
         let iteration = self.iteration + 1;
         let whole = collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)?;
         Ok(whole.then_some(lesson))

@@ -158,7 +158,8 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let envs = config.env.num_envs;
     let turns = STEPS.div_ceil(envs * TURN);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let mut draw = || config.ppo.std_bounds(0)[1] as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
+    let mut draw =
+        || config.ppo.std.by_equal_factors(0) as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
     let randomization = Randomization::new(task, &config.randomization)?;
     let randomization = randomization.as_ref();
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task, randomization)).collect());

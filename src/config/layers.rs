@@ -223,9 +223,9 @@ mod tests {
         assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
         // A file may also set part of a ramp.
         assert_eq!(large.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
-        assert_eq!(large.ppo.max_std, Ramp { from: 0.6, to: 0.2, steps: 50_000_000 });
+        assert_eq!(large.ppo.std, Ramp { from: 0.6, to: 0.2, steps: 50_000_000 });
         assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
-        assert_eq!((going_on.ppo.std_bounds(0), going_on.ppo.value_clip()), ([0.2; 2], f64::INFINITY));
+        assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
         assert_eq!(going_on.training.goal_lifetime, 300);
         let all = include_str!("../../configs/randomization-all.toml");
         let [all, nothing] = [all, ""].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
@@ -288,8 +288,8 @@ mod tests {
             ("training.tolerance.form=1", "training.tolerance.form: unknown key"),
             ("training.tolerance.steps=-1", "training.tolerance.steps = -1: must be a whole number"),
             ("training.hold.to=0.4", "training.hold.to = 0.4: must be at least 1"),
-            ("ppo.min_std=0.5", "ppo.min_std = 0.5: must be at most ppo.max_std, which is 0.49"),
-            ("ppo.min_std.to=0.3", "must be at most ppo.max_std, which is 0.29"),
+            ("ppo.std.to=0", "ppo.std.to = 0: must be above 0"),
+            ("ppo.desired_kl.to=0", "must be above 0 at both ends, or 0 throughout"),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(part), "{bad}: {part} is not in\n{text}");
@@ -302,7 +302,8 @@ mod tests {
             ("training.tolerance_steps=0", "write it as a ramp"),
             ("training.hold_scale=0.3", "independent of the task's values"),
             ("training.bootstrap_reached=true", "training now always behaves"),
-            ("ppo.init_std=0.6", "starts with ppo.max_std"),
+            ("ppo.init_std=0.6", "the std follows a ramp"),
+            ("ppo.min_std=0.2", "the std is not learnt any more"),
             ("ppo.exploring_share=0", "it did not help"),
             ("ppo.activation=silu", "no policy that came with the program used it"),
         ] {

@@ -1,15 +1,19 @@
-//! Settings of version 0.1.0 that were removed, and what to use instead.
+//! Settings of version 0.1.0 and of the beginnings of 0.2.0 that were removed, and what to use instead.
 
 use toml::Value;
 
 /// Lists of keys, separated by spaces, with the advice for each list.
-const KEYS: [(&str, &str); 5] = [
+const KEYS: [(&str, &str); 6] = [
     (
         "training.task_reward_start training.task_reward_steps training.drop_reward_start training.drop_reward_steps \
-         training.tolerance_start training.tolerance_steps training.hold_start training.hold_steps ppo.max_std_steps",
+         training.tolerance_start training.tolerance_steps training.hold_start training.hold_steps",
         "write it as a ramp, e.g. training.drop_reward = { from = -50, to = -1500, steps = 150e6 }",
     ),
-    ("ppo.init_std", "the policy starts with ppo.max_std, e.g. ppo.max_std = { from = 0.6, to = 0.2, steps = 25e6 }"),
+    (
+        "ppo.max_std ppo.min_std",
+        "the std is not learnt any more, since it lay at its upper bound in every training; write that as ppo.std",
+    ),
+    ("ppo.init_std ppo.max_std_steps", "the std follows a ramp, e.g. ppo.std = { from = 0.6, to = 0.2, steps = 25e6 }"),
     (
         "training.tolerance_scale training.hold_scale",
         "training.tolerance is in rad and training.hold in steps, independent of the task's values",

@@ -167,7 +167,7 @@ pub struct PpoConfig {
     pub precision: Precision,
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
-    pub desired_kl: f64,
+    pub desired_kl: Ramp,
     pub gamma: f64,
     pub lambda: f64,
     pub clip: f64,
@@ -176,8 +176,7 @@ pub struct PpoConfig {
     pub bounds_coef: f64,
     pub max_grad_norm: f64,
     pub reward_scale: f64,
-    pub max_std: Ramp,
-    pub min_std: Ramp,
+    pub std: Ramp,
     pub away_std: f64,
     pub away_range: [f64; 2],
 }
@@ -287,11 +286,6 @@ impl PpoConfig {
     /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
         if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
-    }
-
-    /// Returns the smallest and largest standard deviation of the actions after `env_steps` control steps of the whole run.
-    pub fn std_bounds(&self, env_steps: u64) -> [f64; 2] {
-        [self.min_std.by_equal_steps(env_steps), self.max_std.by_equal_factors(env_steps)]
     }
 }
 

@@ -102,6 +102,13 @@ mod tests {
                 assert!((0.05..0.98).contains(&fused.clip_fraction), "{what}: some are clipped, but not all");
                 let [a, b] = [&kernels, &reference].map(|ppo| by_name(&ppo.policy, &ppo.gradient));
                 for ((name, a), (_, b)) in a.into_iter().zip(b) {
+                    if name == "log_std" {
+                        assert!(
+                            a == b && a.iter().all(|&x| x == 0.0),
+                            "{what}: the standard deviations are not learnt"
+                        );
+                        continue;
+                    }
                     let largest = b.iter().fold(0.0f32, |most, x| most.max(x.abs()));
                     let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
                     assert!(
@@ -148,7 +155,7 @@ mod tests {
             let difference =
                 |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt();
             let (apart, moved) = (difference(a, b), difference(a, first));
-            assert!(apart < 1e-2 * moved, "{name} moved by {moved}, but is {apart} from candle's");
+            assert!(apart < 1e-2 * moved || name == "log_std", "{name} moved by {moved}, but is {apart} from candle's");
         }
     }
 
@@ -158,8 +165,8 @@ mod tests {
         // 1e-8.
         for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
             let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
-            (ppo.config.epochs, ppo.config.minibatches, ppo.config.desired_kl) = (1, 1, 0.0);
-            (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
+            (ppo.config.epochs, ppo.config.minibatches, ppo.learning_rate.desired_kl) = (1, 1, 0.0);
+            (ppo.learning_rate.rate, ppo.config.max_grad_norm) = (1e-3, norm);
             let before = ppo.policy.parameters.clone();
             ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();
             let moved = before.iter().zip(&ppo.policy.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

@@ -14,6 +14,7 @@ mod format;
 mod gae;
 mod growth;
 mod kernels;
+mod learning_rate;
 mod measure;
 mod normalizer;
 mod parameters;
@@ -49,6 +50,7 @@ use adam::{Adam, norm, norm_chunks, squares};
 use backend::{GradientBackend, Minibatch, ShardSums};
 use candle::Reference;
 use kernels::{Arithmetic, Kernels};
+use learning_rate::LearningRate;
 
 /// A learner: the policy and everything that trains it.
 pub struct Ppo {
@@ -60,7 +62,7 @@ pub struct Ppo {
     /// The gradient of all parameters for the last minibatch.
     gradient: Vec<f32>,
     adam: Adam,
-    learning_rate: f64,
+    learning_rate: LearningRate,
     division: Division,
     /// The chunks of each group of parameters, by which the norm of the gradient is computed.
     chunks: Vec<Vec<Range<usize>>>,
@@ -124,15 +126,14 @@ impl Ppo {
     /// Fails if this machine does not support the configured precision, or if the observations lack the configured
     /// symmetry.
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, division: Division) -> Result<Self> {
-        let [_, std] = config.std_bounds(0);
-        let policy = Policy::random(&config.net(), spaces, std, seed)?;
+        let policy = Policy::random(&config.net(), spaces, config.std.by_equal_factors(0), seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
             Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
-        let (config, learning_rate) = (config.clone(), config.learning_rate);
+        let (config, learning_rate) = (config.clone(), LearningRate::new(config));
         let chunks = norm_chunks(&policy.layout.groups());
         let slices = division.slices(&chunks.concat());
         Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division, chunks, slices })
@@ -155,11 +156,12 @@ impl Ppo {
         Rollout::new(self.config.horizon, block_sizes, &self.policy.spaces)
     }
 
-    /// Clamps the standard deviations of the actions to their bounds after `env_steps` control steps of the run.
-    pub fn limit_std(&mut self, env_steps: u64) {
-        let [least, most] = self.config.std_bounds(env_steps).map(|std| std.ln() as f32);
-        let log_std = &mut self.policy.parameters[self.policy.layout.log_std.clone()];
-        log_std.iter_mut().for_each(|x| *x = x.max(least).min(most));
+    /// Sets the standard deviation of the actions and the desired KL divergence to where their ramps are after
+    /// `env_steps` control steps of the run.
+    pub fn follow_ramps(&mut self, env_steps: u64) {
+        self.learning_rate.follow_ramp(env_steps);
+        let std = self.config.std.by_equal_factors(env_steps);
+        self.policy.parameters[self.policy.layout.log_std.clone()].fill(std.ln() as f32);
     }
 
     /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
@@ -170,12 +172,8 @@ impl Ppo {
     /// Returns the policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
         let policy = self.policy.freeze();
-        let std = policy.std();
-        // The geometric mean. Away from the goal, all standard deviations are multiplied by one factor that raises this
-        // mean to `away_std`. The losses treat the factor as a constant, although it depends on the policy's standard
-        // deviations.
-        let typical = (std.iter().map(|s| s.ln()).sum::<f32>() / std.len() as f32).exp();
-        let away_scale = (self.config.away_std as f32 / typical).max(1.0);
+        // All actions have the same standard deviation.
+        let away_scale = (self.config.away_std as f32 / policy.std()[0]).max(1.0);
         Acting { policy, config: &self.config, away_scale }
     }
 
@@ -243,7 +241,7 @@ impl Ppo {
             grad_norm: mean(|step| step.grad_norm),
             std: std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64,
             explained_variance,
-            learning_rate: self.learning_rate,
+            learning_rate: self.learning_rate.rate,
         }
     }
 
@@ -294,14 +292,14 @@ impl Ppo {
             }
         }
         if !first {
-            self.adapt_learning_rate(losses.kl);
+            self.learning_rate.adapt(losses.kl);
         }
         // The entropy of the Gaussian at noise scale 1.
         let entropy = self.policy.log_std().iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum();
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
-        self.adam.step(parameters, &self.gradient, own, self.learning_rate, scale);
+        self.adam.step(parameters, &self.gradient, own, self.learning_rate.rate, scale);
         self.division.share(parameters, &self.slices);
         Ok(Step { losses, grad_norm, entropy })
     }
@@ -319,15 +317,9 @@ impl Ppo {
         Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
     }
 
-    /// Switches to the configured learning rate if it differs from that in `before` or if the rate is fixed; otherwise
-    /// keeps the adapted rate, clamped to its range.
+    /// Brings the learning rate of a fork, whose parent had the settings `before`, in line with its own settings.
     pub fn settle_learning_rate(&mut self, before: &PpoConfig) {
-        let PpoConfig { learning_rate, learning_rate_range: [lowest, highest], desired_kl, .. } = self.config;
-        if desired_kl == 0.0 || learning_rate != before.learning_rate {
-            self.learning_rate = learning_rate;
-        } else {
-            self.learning_rate = self.learning_rate.clamp(lowest, highest);
-        }
+        self.learning_rate.settle(before);
     }
 
     fn check_weights(&self) -> Result<()> {
@@ -336,20 +328,6 @@ impl Ppo {
             ensure!(finite, "the update made `{name}` infinite or NaN: the training has failed and stops here");
         }
         Ok(())
-    }
-
-    /// Adapts the learning rate to keep the KL divergence near the desired one, as the reference implementation does.
-    fn adapt_learning_rate(&mut self, kl: f64) {
-        let desired = self.config.desired_kl;
-        let [lowest, highest] = self.config.learning_rate_range;
-        if desired == 0.0 {
-            return;
-        }
-        if kl > 2.0 * desired {
-            self.learning_rate = (self.learning_rate / 1.5).max(lowest);
-        } else if kl < 0.5 * desired {
-            self.learning_rate = (self.learning_rate * 1.5).min(highest);
-        }
     }
 }
 
@@ -389,55 +367,14 @@ mod tests {
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
-    fn learner(desired_kl: f64) -> Ppo {
-        let mut config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
-        (config.desired_kl, config.learning_rate, config.learning_rate_range) = (desired_kl, 1e-3, [5e-4, 2e-3]);
-        Ppo::new(&config, SPACES, 0, Division::alone(1)).unwrap()
-    }
-
-    #[test]
-    fn the_learning_rate_follows_the_divergence_within_its_range() {
-        let mut ppo = learner(0.01);
-        // The KL divergence and the expected factor on the learning rate.
-        for (kl, factor) in [(0.021, 1.0 / 1.5), (0.019, 1.0), (0.006, 1.0), (0.004, 1.5), (0.0, 1.5)] {
-            ppo.learning_rate = 1e-3;
-            ppo.adapt_learning_rate(kl);
-            assert!((ppo.learning_rate / 1e-3 - factor).abs() < 1e-12, "KL {kl}: {}", ppo.learning_rate);
-        }
-        (0..9).for_each(|_| ppo.adapt_learning_rate(1.0));
-        assert_eq!(ppo.learning_rate, 5e-4);
-        (0..9).for_each(|_| ppo.adapt_learning_rate(1e-4));
-        assert_eq!(ppo.learning_rate, 2e-3);
-    }
-
-    #[test]
-    fn a_fork_takes_the_learning_rate_of_its_settings_where_they_name_another_or_keep_it_fixed() {
-        let mut ppo = learner(0.01);
-        let before = ppo.config.clone();
-        // The adapted rate, the rate in the new settings, the desired KL divergence and the expected rate.
-        for (adapted, named, desired, expected) in
-            [(7e-4, 1e-3, 0.01, 7e-4), (7e-4, 6e-4, 0.01, 6e-4), (7e-4, 1e-3, 0.0, 1e-3), (1e-4, 1e-3, 0.01, 5e-4)]
-        {
-            (ppo.learning_rate, ppo.config.learning_rate, ppo.config.desired_kl) = (adapted, named, desired);
-            ppo.settle_learning_rate(&before);
-            assert_eq!(ppo.learning_rate, expected);
-        }
-    }
-
     #[test]
     fn the_entropy_is_that_of_a_gaussian_with_these_standard_deviations() {
-        let mut ppo = learner(0.0);
+        let config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
+        let mut ppo = Ppo::new(&config, SPACES, 0, Division::alone(1)).unwrap();
         let rollout = Rollout::new(1, &[4], &SPACES);
         ppo.backend.begin(&ppo.policy, &rollout);
         // With a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of the two actions.
         let step = ppo.minibatch_step(&rollout, &[0, 1, 2, 3], true).unwrap();
         assert!((step.entropy - 2.0 * 0.908_113).abs() < 1e-5, "{}", step.entropy);
-    }
-
-    #[test]
-    fn without_a_desired_divergence_the_learning_rate_is_fixed() {
-        let mut ppo = learner(0.0);
-        [1e-6, 1.0].into_iter().for_each(|kl| ppo.adapt_learning_rate(kl));
-        assert_eq!(ppo.learning_rate, 1e-3);
     }
 }

@@ -31,7 +31,7 @@ fn an_experiment_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     let what = format!(
         "steps = 1280\nkeep = [640]\nruns = 2\nwindow = 256\nset = {SMALL:?}\n\
          [[stop]]\nat = 640\nmetric = \"policy/std\"\nabove = 1.1\n\
-         [variants.same]\nset = []\n[variants.louder]\nset = [\"ppo.max_std=0.8\", \"ppo.min_std=0.8\"]\n"
+         [variants.same]\nset = []\n[variants.louder]\nset = [\"ppo.std=0.8\"]\n"
     );
     fs::write(folder.join("what.toml"), what).unwrap();
     let mut killed = experiment(folder).stdout(Stdio::null()).spawn().unwrap();

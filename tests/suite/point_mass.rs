@@ -98,7 +98,8 @@ pub(crate) fn divided(envs: usize, settings: &PpoConfig, seed: u64, division: Di
 }
 
 pub(crate) fn settings() -> PpoConfig {
-    let settings = ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.max_std.from=0.5", "ppo.gamma=0.9"];
+    let settings =
+        ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.std={from=0.5,to=0.2,steps=25_000_000}", "ppo.gamma=0.9"];
     config(&[&settings[..], &["ppo.symmetry=none"]].concat()).ppo
 }
 
@@ -143,29 +144,18 @@ fn ppo_learns_on_tiles_where_there_are_any() {
 }
 
 #[test]
-fn a_policy_starts_with_the_upper_bound_of_its_standard_deviations_which_then_falls_by_equal_factors() {
-    let max_std = Ramp { from: 0.5, to: 0.125, steps: 100 };
-    let settings = PpoConfig { max_std, min_std: Ramp::constant(0.0), ..settings() };
+fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
+    let std = Ramp { from: 0.5, to: 0.125, steps: 100 };
+    let settings = PpoConfig { std, ..settings() };
     let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.5).abs() < 1e-6));
-    for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.125)] {
-        ppo.limit_std(env_steps);
+    for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
+        ppo.follow_ramps(env_steps);
         assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{env_steps}");
     }
-    let at_once = PpoConfig { max_std: Ramp { steps: 0, ..max_std }, ..settings };
+    let at_once = PpoConfig { std: Ramp { steps: 0, ..std }, ..settings };
     let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.125).abs() < 1e-6), "0 steps: the final value from the start");
-}
-
-#[test]
-fn standard_deviations_stay_above_a_lower_bound_and_are_raised_to_it() {
-    for (min_std, expected) in [(0.25, 0.5f32), (0.75, 0.75)] {
-        let (min_std, max_std) = (Ramp { from: 0.0, to: min_std, steps: 10 }, Ramp { from: 0.5, to: 1.0, steps: 10 });
-        let mut ppo =
-            Ppo::new(&PpoConfig { min_std, max_std, ..settings() }, PointMass::SPACES, 0, Division::alone(1)).unwrap();
-        ppo.limit_std(1000);
-        assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{min_std}");
-    }
 }
 
 #[test]

@@ -83,8 +83,8 @@ const LONG: &[&str] = &[
     "--set=training.hold_reward=1",
     "--set=training.task_reward={from=1,to=0.03,steps=4000}",
     "--set=ppo.symmetry=cube",
-    "--set=ppo.max_std={from=0.6,to=0.4,steps=4000}",
-    "--set=ppo.min_std={from=0,to=0.4,steps=4500}",
+    "--set=ppo.std={from=0.6,to=0.4,steps=4000}",
+    "--set=ppo.desired_kl={from=0.016,to=0.004,steps=4500}",
     "--set=ppo.away_std=0.7",
 ];
 
@@ -350,7 +350,7 @@ fn a_fatal_error_of_mujoco_names_the_environment_and_the_iteration_before_is_sav
     assert!(SCENE.contains("<size memory=\"2M\"/>"));
     fs::write(folder.path().join("small.xml"), SCENE.replace("memory=\"2M\"", "memory=\"80K\"")).unwrap();
     let mut args = train(&["--total-steps", "100000000", "--run-dir", "run", "--set", "env.model=small.xml"]);
-    args.extend(["--set", "env.max_episode_seconds=5", "--set", "ppo.max_std=2", "--set", "run.eval_every=1000000"]);
+    args.extend(["--set", "env.max_episode_seconds=5", "--set", "ppo.std=2", "--set", "run.eval_every=1000000"]);
     let output = program(folder.path(), &args);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");

@@ -252,7 +252,7 @@ fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
 
 #[test]
 fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
-    let away = ["ppo.max_std.from=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
+    let away = ["ppo.std.from=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
     let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
     let task = task(&[]);
     let cube = task.scene().free_body("cube").unwrap().qpos;

@@ -20,8 +20,10 @@ pub(super) struct Batch {
     pub observations: Tensor,
     /// `[M, A]`
     pub actions: Tensor,
-    /// The distributions that the actions were drawn from.
-    pub old: Gaussian,
+    /// `[M, A]`: means of the distributions that the actions were drawn from
+    pub old_means: Tensor,
+    /// `[M, 1]`: factors on the standard deviations
+    pub scales: Tensor,
     /// `[M]`: of the actions under those distributions
     pub old_log_probs: Tensor,
     /// `[M]`: of the critic at that time
@@ -61,15 +63,14 @@ impl Gaussian {
         (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
     }
 
-    /// Returns the mean over the samples of the KL divergence KL(`old` ‖ self), where both have the same scales.
+    /// Returns the mean over the samples of the KL divergence from the Gaussians with these means `[M, A]` and the same
+    /// standard deviations.
     ///
     /// # Errors
     /// Fails if the shapes do not match.
-    pub(super) fn kl(&self, old: &Self) -> Result<Tensor> {
-        let moved = (&old.means - self.means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
-        let log_std = self.log_std.detach();
-        let spread = (((&old.log_std * 2.0)?.exp()? + moved)? / (&log_std * 2.0)?.exp()?)?;
-        ((&log_std - &old.log_std)? + (spread * 0.5)?)?.sum_all()? - 0.5 * log_std.elem_count() as f64
+    pub(super) fn kl(&self, old_means: &Tensor) -> Result<Tensor> {
+        let moved = (old_means - self.means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
+        (moved / (&self.log_std * 2.0)?.exp()?)?.sum_all()? * 0.5
     }
 }
 
@@ -92,7 +93,7 @@ pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: 
 
     let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
-    let kl = new.kl(&batch.old)?;
+    let kl = new.kl(&batch.old_means)?;
     Ok(LossTensors { total, policy, value, excess, kl, ratios: ratios.detach() })
 }
 
@@ -106,11 +107,11 @@ mod tests {
         Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
     }
 
-    /// Returns Gaussians with standard deviations of 0.7 and 1.1 times the scales.
+    /// Returns Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales.
     fn gaussian(means: &[f32], scales: &[f32]) -> Gaussian {
         Gaussian {
             means: tensor(means, &[scales.len(), 2]),
-            log_std: tensor(&[0.7f32.ln(), 1.1f32.ln()], &[2]),
+            log_std: tensor(&[-0.5, 0.2], &[2]),
             scales: tensor(scales, &[scales.len(), 1]),
         }
     }
@@ -128,16 +129,15 @@ mod tests {
     /// import torch
     /// from torch.distributions import Normal, kl_divergence
     /// mean = torch.tensor([[0.1, -0.2], [0.5, 0.3], [-0.4, 0.8]], requires_grad=True)
-    /// log_std = torch.tensor([-0.5, 0.2], requires_grad=True)
+    /// log_std = torch.tensor([-0.5, 0.2])
     /// value = torch.tensor([0.3, -0.6, 1.4], requires_grad=True)
-    /// old_mean = torch.tensor([[0.0, -0.1], [0.4, 0.5], [-0.5, 0.5]])
-    /// old_std = torch.tensor([0.7, 1.1])
+    /// old_mean = torch.tensor([[-0.1, -0.1], [0.4, 0.5], [-0.5, 0.5]])
     /// scale = torch.tensor([[1.0], [1.5], [0.8]])
     /// old_value = torch.tensor([0.2, -0.1, 1.0])
     /// action = torch.tensor([[0.5, -1.0], [-0.3, 0.9], [0.2, 1.5]])
     /// advantage = torch.tensor([1.0, 0.5, -2.0])
     /// returns = torch.tensor([0.5, 0.1, 1.9])
-    /// dist, old = Normal(mean, scale * log_std.exp()), Normal(old_mean, scale * old_std)
+    /// dist, old = [Normal(mean, scale * log_std.exp()) for mean in (mean, old_mean)]
     /// log_prob = dist.log_prob(action).sum(1)
     /// ratio = (log_prob - old.log_prob(action).sum(1)).exp()
     /// policy = -torch.min(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
@@ -145,7 +145,7 @@ mod tests {
     /// critic = torch.max((value - returns) ** 2, (clipped - returns) ** 2).mean()
     /// kl = kl_divergence(old, dist).sum(1).mean()
     /// (policy + 2.0 * critic).backward()
-    /// for x in (log_prob + 2 * scale.log()[:, 0], ratio, policy, critic, kl, mean.grad, log_std.grad, value.grad):
+    /// for x in (log_prob + 2 * scale.log()[:, 0], ratio, policy, critic, kl, mean.grad, value.grad):
     ///     print(x.tolist())
     /// ```
     #[test]
@@ -153,31 +153,29 @@ mod tests {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.clip, config.value_clip, config.value_coef) = (0.2, 0.3, 2.0);
         let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
-        let log_std = Var::from_tensor(&tensor(&[-0.5, 0.2], &[2])).unwrap();
         let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
         let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
-        let old = gaussian(&[0.0, -0.1, 0.4, 0.5, -0.5, 0.5], &[1.0, 1.5, 0.8]);
+        let old = gaussian(&[-0.1, -0.1, 0.4, 0.5, -0.5, 0.5], &[1.0, 1.5, 0.8]);
         let batch = Batch {
             observations: tensor(&[0.0; 3], &[3, 1]),
             old_log_probs: old.log_prob(&actions).unwrap(),
             actions,
-            old,
+            old_means: old.means,
+            scales: old.scales.clone(),
             old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
             advantages: tensor(&[1.0, 0.5, -2.0], &[3]),
             returns: tensor(&[0.5, 0.1, 1.9], &[3]),
         };
-        let (means, scales) = (mean.as_tensor().clone(), batch.old.scales.clone());
-        let new = Gaussian { means, log_std: log_std.as_tensor().clone(), scales };
+        let new = Gaussian { means: mean.as_tensor().clone(), log_std: old.log_std, scales: old.scales };
         let found = losses(&config, &batch, &new, &value).unwrap();
         assert_close(&new.log_prob(&batch.actions).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
-        assert_close(&found.ratios, &[1.217_114_7, 0.860_722_24, 1.559_589_3]);
-        assert_close(&found.policy, &[0.496_272_44]);
+        assert_close(&found.ratios, &[1.389_307_4, 0.886_564_5, 1.721_431]);
+        assert_close(&found.policy, &[0.599_859_9]);
         assert_close(&found.value, &[0.296_666_7]);
-        assert_close(&found.kl, &[0.065_324_254]);
+        assert_close(&found.kl, &[0.046_028_256]);
         let grads = found.total.backward().unwrap();
-        let mean_grad = [0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_3];
+        let mean_grad = [0.0, 0.0, 0.142_810_81, -0.026_412_528, 2.924_584_2, 0.841_392_4];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
-        assert_close(grads.get(&log_std).unwrap(), &[0.582_585_3, -0.378_056_3]);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
     }
 
@@ -186,7 +184,8 @@ mod tests {
         let batch = Batch {
             observations: tensor(&[0.0], &[1, 1]),
             actions: tensor(&[0.2, 1.5], &[1, 2]),
-            old: gaussian(&[-0.5, 0.5], &[1.0]),
+            old_means: tensor(&[-0.5, 0.5], &[1, 2]),
+            scales: tensor(&[1.0], &[1, 1]),
             old_log_probs: tensor(&[-2.0], &[1]),
             old_values: tensor(&[1.0], &[1]),
             advantages: tensor(&[-2.0], &[1]),
@@ -196,7 +195,7 @@ mod tests {
         let with = |bounds_coef: f64| {
             let mut config = Config::resolve(None, &[]).unwrap().ppo;
             config.bounds_coef = bounds_coef;
-            let (log_std, scales) = (tensor(&[-0.5, 0.2], &[2]), tensor(&[1.0], &[1, 1]));
+            let Gaussian { log_std, scales, .. } = gaussian(&[0.0; 2], &[1.0]);
             let new = Gaussian { means: mean.as_tensor().clone(), log_std, scales };
             let found = losses(&config, &batch, &new, &tensor(&[1.4], &[1])).unwrap();
             assert_close(&found.excess, &[0.25]);
@@ -207,7 +206,8 @@ mod tests {
 
     #[test]
     fn a_distribution_has_no_divergence_from_itself() {
-        let kl = gaussian(&[0.3, -2.0], &[3.0]).kl(&gaussian(&[0.3, -2.0], &[3.0])).unwrap();
+        let gaussian = gaussian(&[0.3, -2.0], &[3.0]);
+        let kl = gaussian.kl(&gaussian.means).unwrap();
         assert!(kl.to_scalar::<f32>().unwrap().abs() < 1e-6);
     }
 }

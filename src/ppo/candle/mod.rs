@@ -19,18 +19,16 @@ use nets::Nets;
 /// The gradient backend in candle.
 pub(super) struct Reference {
     config: PpoConfig,
-    /// `[A]`: of the policy that collected the rollout.
-    old_log_std: Vec<f32>,
 }
 
 impl Reference {
     /// Creates the backend with these settings.
     pub(super) fn new(config: &PpoConfig) -> Self {
-        Self { config: config.clone(), old_log_std: Vec::new() }
+        Self { config: config.clone() }
     }
 
     /// Gathers these samples of a rollout.
-    fn minibatch(&self, policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
+    fn minibatch(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
         let Spaces { observation_size, action_size, .. } = policy.spaces;
         let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
             let located = samples.iter().map(|&sample| rollout.locate(sample));
@@ -44,11 +42,8 @@ impl Reference {
         Ok(Batch {
             observations: rows(observation_size, observations)?,
             actions: rows(action_size, array(action_size, |block| &block.actions))?,
-            old: Gaussian {
-                means: rows(action_size, array(action_size, |block| &block.means))?,
-                log_std: Tensor::new(&self.old_log_std[..], &Device::Cpu)?,
-                scales: rows(1, array(1, |block| &block.noise_scales))?,
-            },
+            old_means: rows(action_size, array(action_size, |block| &block.means))?,
+            scales: rows(1, array(1, |block| &block.noise_scales))?,
             old_log_probs: column(|block| &block.log_probs)?,
             old_values: column(|block| &block.values)?,
             advantages: column(|block| &block.advantages)?,
@@ -58,9 +53,7 @@ impl Reference {
 }
 
 impl GradientBackend for Reference {
-    fn begin(&mut self, policy: &Policy, _: &Rollout) {
-        self.old_log_std = policy.log_std().to_vec();
-    }
+    fn begin(&mut self, _: &Policy, _: &Rollout) {}
 
     fn gradient(
         &mut self,
@@ -71,11 +64,11 @@ impl GradientBackend for Reference {
     ) -> Result<Vec<ShardSums>> {
         let (mut sums, mut gradients) = (Vec::new(), Vec::new());
         for shard in minibatch.samples.chunks(minibatch.in_shard()) {
-            let (batch, nets) = (self.minibatch(policy, rollout, shard)?, Nets::new(policy)?);
+            let (batch, nets) = (Self::minibatch(policy, rollout, shard)?, Nets::new(policy)?);
             let means = nets.actor.forward(&batch.observations)?;
             let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
-            let log_std = nets.log_std.as_tensor().clone();
-            let new = Gaussian { means, log_std, scales: batch.old.scales.clone() };
+            let log_std = Tensor::new(policy.log_std(), &Device::Cpu)?;
+            let new = Gaussian { means, log_std, scales: batch.scales.clone() };
             let losses = loss::losses(&self.config, &batch, &new, &values)?;
             let mut gradient = vec![0.0; out.len()];
             let share = 1.0 / minibatch.shards as f64;

@@ -16,8 +16,6 @@ pub(super) struct Nets {
     pub actor: Sequential,
     /// `[M, O]` → `[M, 1]`
     pub critic: Sequential,
-    /// `[A]`
-    pub log_std: Var,
     /// All variables, and the ranges of their values among the parameters of the policy.
     variables: Vec<(Range<usize>, Var)>,
 }
@@ -53,8 +51,7 @@ impl Nets {
             Ok(net)
         };
         let (actor, critic) = (net(&layout.actor)?, net(&layout.critic)?);
-        let log_std = variable(&layout.log_std, &[layout.log_std.len()])?;
-        Ok(Self { actor, critic, log_std, variables })
+        Ok(Self { actor, critic, variables })
     }
 
     /// Writes the gradient of each variable in `grads` to its range of the gradient of all parameters.

@@ -37,14 +37,12 @@ pub(super) struct Sums {
     pub ratio_error: f32,
     /// `[A]`: squared differences of the means from those that acted, divided by the squared noise scales.
     pub moved: Vec<f32>,
-    /// `[A]`: the gradient with respect to the logarithms of the standard deviations.
-    pub log_std_grad: Vec<f32>,
 }
 
 impl Sums {
     /// Creates the sums over no samples.
     pub(super) fn new(action_size: usize) -> Self {
-        Self { moved: vec![0.0; action_size], log_std_grad: vec![0.0; action_size], ..Self::default() }
+        Self { moved: vec![0.0; action_size], ..Self::default() }
     }
 }
 
@@ -98,9 +96,6 @@ impl<'a> Loss<'a> {
         sums.surrogate += f64::from(surrogate);
         sums.clipped += usize::from(error > self.clip);
         sums.ratio_error = sums.ratio_error.max(error);
-        for (sum, z) in sums.log_std_grad.iter_mut().zip(&*grad) {
-            *sum += slope * (z * z - 1.0);
-        }
         for ((sum, mean), old_mean) in sums.moved.iter_mut().zip(mean).zip(old_mean) {
             let moved = (mean - old_mean) * sharpness;
             *sum += moved * moved;
@@ -131,15 +126,10 @@ impl<'a> Loss<'a> {
     }
 }
 
-/// Returns the mean over `samples` samples of the KL divergence KL(old ‖ new) of diagonal Gaussians, given the sums of
-/// squared differences of their means `[A]` and the logarithms of their standard deviations `[A]`.
-pub(super) fn kl(moved: &[f64], samples: usize, old_log_std: &[f32], log_std: &[f32]) -> f64 {
-    let terms = moved.iter().zip(old_log_std).zip(log_std).map(|((&moved, &old), &new)| {
-        let (old, new) = (f64::from(old), f64::from(new));
-        let spread = ((2.0 * old).exp() + moved / samples as f64) / (2.0 * new).exp();
-        new - old + 0.5 * spread - 0.5
-    });
-    terms.sum()
+/// Returns the sum over samples of the KL divergence of diagonal Gaussians with the same standard deviations, given the
+/// sums of squared differences of their means `[A]` and the logarithms of the standard deviations `[A]`.
+pub(super) fn kl(moved: &[f64], log_std: &[f32]) -> f64 {
+    moved.iter().zip(log_std).map(|(moved, &log_std)| 0.5 * moved / (2.0 * f64::from(log_std)).exp()).sum()
 }
 
 #[cfg(test)]
@@ -160,19 +150,17 @@ mod tests {
         let mut rollout = Rollout::new(1, &[3], &spaces);
         let block = &mut rollout.blocks[0];
         block.actions = vec![0.5, -1.0, -0.3, 0.9, 0.2, 1.5];
-        block.means = vec![0.0, -0.1, 0.4, 0.5, -0.5, 0.5];
+        block.means = vec![-0.1, -0.1, 0.4, 0.5, -0.5, 0.5];
         block.advantages = vec![1.0, 0.5, -2.0];
         block.values[..3].copy_from_slice(&[0.2, -0.1, 1.0]);
         block.returns = vec![0.5, 0.1, 1.9];
         block.noise_scales = vec![1.0, 1.5, 0.8];
-        let old_log_std = [0.7f32.ln(), 1.1f32.ln()];
+        let log_std = [-0.5f32, 0.2];
         for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
-            let std = old_log_std.map(|log_std| block.noise_scales[i] * log_std.exp());
+            let std = log_std.map(|log_std| block.noise_scales[i] * log_std.exp());
             let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std[j]);
-            *log_prob =
-                -0.5 * (z[0] * z[0] + z[1] * z[1]) - old_log_std[0] - old_log_std[1] - std::f32::consts::TAU.ln();
+            *log_prob = -0.5 * (z[0] * z[0] + z[1] * z[1]) - log_std[0] - log_std[1] - std::f32::consts::TAU.ln();
         }
-        let log_std = [-0.5, 0.2];
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
@@ -180,13 +168,12 @@ mod tests {
         let mut sums = Sums::new(2);
         let mut grad = [0.0; 6];
         loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums);
-        assert_close(&grad, &[0.0, 0.0, 0.138_648_05, -0.025_642_639, 2.649_627, 0.762_288_3]);
-        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.496_272_44]);
-        assert_close(&sums.log_std_grad, &[0.582_585_3, -0.378_056_3]);
-        assert_close(&[sums.ratio_error], &[0.559_589_3]);
+        assert_close(&grad, &[0.0, 0.0, 0.142_810_81, -0.026_412_528, 2.924_584_2, 0.841_392_4]);
+        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.599_859_9]);
+        assert_close(&[sums.ratio_error], &[0.721_431]);
         assert_eq!(sums.clipped, 2);
         let moved: Vec<f64> = sums.moved.iter().map(|&x| f64::from(x)).collect();
-        assert_close(&[kl(&moved, 3, &old_log_std, &log_std) as f32], &[0.065_324_254]);
+        assert_close(&[kl(&moved, &log_std) as f32 / 3.0], &[0.046_028_256]);
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);

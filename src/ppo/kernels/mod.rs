@@ -55,7 +55,6 @@ pub(super) struct Kernels {
     parts: Vec<Partial>,
     /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
-    old_log_std: Vec<f32>,
 }
 
 /// The result of a job.
@@ -77,14 +76,7 @@ const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 impl Kernels {
     /// Creates the backend with these settings.
     pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
-        Self {
-            config: config.clone(),
-            arithmetic,
-            workspaces: Vec::new(),
-            parts: Vec::new(),
-            seen: Vec::new(),
-            old_log_std: Vec::new(),
-        }
+        Self { config: config.clone(), arithmetic, workspaces: Vec::new(), parts: Vec::new(), seen: Vec::new() }
     }
 
     /// Makes room for this number of groups of up to `samples` samples. Returns the number of rows that pass through a
@@ -113,7 +105,7 @@ impl Kernels {
     }
 
     /// Returns the sums of a shard from the results of its groups.
-    fn shard_sums(&self, parts: &[Partial], samples: usize, log_std: &[f32]) -> ShardSums {
+    fn shard_sums(parts: &[Partial], log_std: &[f32]) -> ShardSums {
         let sum = |of: fn(&Sums) -> f64| parts.iter().map(|part| of(&part.sums)).sum::<f64>();
         let moved: Vec<f64> = (0..log_std.len())
             .map(|i| parts.iter().step_by(2).map(|part| f64::from(part.sums.moved[i])).sum())
@@ -122,7 +114,7 @@ impl Kernels {
             surrogate: sum(|sums| sums.surrogate),
             value_error: sum(|sums| sums.value_error),
             excess: sum(|sums| sums.excess),
-            kl: loss::kl(&moved, samples, &self.old_log_std, log_std) * samples as f64,
+            kl: loss::kl(&moved, log_std),
             clipped: sum(|sums| sums.clipped as f64),
             ratio_error: parts.iter().map(|part| f64::from(part.sums.ratio_error)).fold(0.0, f64::max),
         }
@@ -150,7 +142,6 @@ impl GradientBackend for Kernels {
             rest = after;
         }
         parts.into_par_iter().for_each(|(seen, block)| reader.read(block.acted_on(), seen));
-        self.old_log_std = policy.log_std().to_vec();
     }
 
     fn gradient(
@@ -195,9 +186,8 @@ impl GradientBackend for Kernels {
         let [actor, critic, of_log_std] = policy.layout.groups();
         self.add_up(Role::Actor, all_groups, &mut out[actor]);
         self.add_up(Role::Critic, all_groups, &mut out[critic]);
+        out[of_log_std].fill(0.0);
         let parts = &self.parts[..2 * all_groups];
-        let of_groups: Vec<&[f32]> = parts.iter().step_by(2).map(|part| &part.sums.log_std_grad[..]).collect();
-        tree_sum(&mut out[of_log_std], &of_groups);
-        Ok(parts.chunks(2 * groups).map(|parts| self.shard_sums(parts, in_shard, log_std)).collect())
+        Ok(parts.chunks(2 * groups).map(|parts| Self::shard_sums(parts, log_std)).collect())
     }
 }
