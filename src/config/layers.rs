@@ -215,15 +215,22 @@ mod tests {
     }
 
     #[test]
+    fn a_file_may_set_part_of_a_ramp() {
+        let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
+        let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
+        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
+    }
+
+    #[test]
     fn the_other_files_that_come_with_the_program_say_what_differs() {
-        let large = include_str!("../../configs/repose-large.toml");
+        let published = include_str!("../../configs/isaac-lab.toml");
         let going_on = include_str!("../../configs/repose-continue.toml");
-        let [large, going_on] =
-            [large, going_on].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
-        assert_eq!((large.env.num_envs, large.ppo.hidden), (8192, vec![512, 512, 256, 128]));
-        // A file may also set part of a ramp.
-        assert_eq!(large.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
-        assert_eq!(large.ppo.std, Ramp { from: 0.6, to: 0.2, steps: 50_000_000 });
+        let [published, going_on] =
+            [published, going_on].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
+        let EnvConfig { reach_goal_bonus, max_consecutive_successes, .. } = published.env;
+        assert_eq!((published.env.max_episode_steps(), published.env.substeps()), (600, 2));
+        assert_eq!((reach_goal_bonus, max_consecutive_successes), (250.0, 1));
+        assert_eq!((published.training.task_reward, published.training.hold_reward), (Ramp::constant(1.0), 0.0));
         assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
         assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
         assert_eq!(going_on.training.goal_lifetime, 300);

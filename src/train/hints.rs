@@ -93,7 +93,7 @@ mod tests {
     fn no_settings_that_come_with_the_program_cause_a_line() {
         let files = [
             "",
-            include_str!("../../configs/repose-large.toml"),
+            include_str!("../../configs/isaac-lab.toml"),
             include_str!("../../configs/repose-continue.toml"),
             include_str!("../../configs/repose-robust.toml"),
             include_str!("../../configs/randomization-all.toml"),
