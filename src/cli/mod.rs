@@ -172,8 +172,8 @@ pub struct TrainArgs {
     /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
-    /// Start from the policy (weights and normaliser) of this checkpoint or run, or of builtin or robust, which come with the program; all else
-    /// is as in any new run
+    /// Start from the policy (weights and normaliser) of this checkpoint or run, or of builtin or robust, which come with the program, with nets
+    /// of its size; all else is as in any new run
     #[arg(long, value_name = "FILE|RUN|NAME", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
     /// Start a new run from the full state of this run or checkpoint (weights, hands, counters; ramps continue), with changed

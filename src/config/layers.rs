@@ -67,6 +67,21 @@ impl Config {
         layered(file, &user.map(Source::table).transpose()?.into_iter().collect::<Vec<_>>(), overrides)
     }
 
+    /// Returns the settings of a training that begins with a policy of this net: as [`Config::resolve`] does, but the base has this
+    /// net.
+    ///
+    /// # Errors
+    /// Fails as [`Config::resolve`] does.
+    pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        let NetConfig { hidden, activation, symmetry } = net;
+        let values = [Value::try_from(hidden), Value::try_from(activation), Value::try_from(symmetry)];
+        let values = values.map(|value| value.expect("a plain value"));
+        let ppo: Table = OF_NETS.map(String::from).into_iter().zip(values).collect();
+        let mut tables = vec![Table::from_iter([("ppo".into(), Value::Table(ppo))])];
+        tables.extend(user.map(Source::table).transpose()?);
+        layered(user.map(|source| source.path.as_path()), &tables, overrides)
+    }
+
     /// Parses a complete configuration that a run has written, overlaid with `overrides`.
     ///
     /// # Errors

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::saver::{Begin, best_so_far};
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, Override, user_file};
+use crate::config::{Config, NetConfig, Override, PolicyConfig, user_file};
 use crate::env::SPACES;
 use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Checkpoint, Evaluation};
@@ -69,14 +69,19 @@ impl Plan {
     /// # Errors
     /// Fails if the settings or the initial policy cannot be used.
     pub(super) fn begin(args: &TrainArgs) -> Result<Self> {
-        let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &overrides(args))?;
+        let (user, overrides) = (user_file(args.settings.config.as_deref())?, overrides(args));
+        let Some(place) = &args.init else {
+            let mut config = Config::resolve(user.as_ref(), &overrides)?;
+            settle_model(&mut config)?;
+            return Ok(Self::new(config, args));
+        };
+        let origin = Origin::of(place)?;
+        let (checkpoint, PolicyConfig { net, .. }) = origin.load_for_any_scene()?;
+        let mut config = Config::resolve_around(&net, user.as_ref(), &overrides)?;
         settle_model(&mut config)?;
-        let mut plan = Self::new(config, args);
-        if let Some(place) = &args.init {
-            plan.context = format!("cannot start from the policy {}", place.display());
-            plan.start = Start::Policy(policy_to_begin_with(place, &plan.config)?);
-        }
-        Ok(plan)
+        expect_net(&checkpoint, &net, &config).with_context(|| format!("cannot start from the policy {origin}"))?;
+        let context = format!("cannot start from the policy {}", place.display());
+        Ok(Self { start: Start::Policy(checkpoint), context, ..Self::new(config, args) })
     }
 
     /// Plans to resume a training from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
@@ -209,20 +214,14 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Loads the policy of a checkpoint or run for a training with this configuration to begin with.
-fn policy_to_begin_with(place: &Path, config: &Config) -> Result<Checkpoint> {
-    let origin = Origin::of(place)?;
-    let (checkpoint, of_it) = origin.load_for_any_scene()?;
-    let fitting = || {
-        let net = config.ppo.net();
-        checkpoint.expect_policy(&net, &SPACES)?;
-        let (found, expected) = ((of_it.net.activation, of_it.net.symmetry), (net.activation, net.symmetry));
-        ensure!(
-            found == expected,
-            "its activation and symmetry are {found:?}, but those of this training are {expected:?}"
-        );
-        Ok(())
-    };
-    fitting().with_context(|| format!("cannot start from the policy {origin}"))?;
-    Ok(checkpoint)
+/// Checks that a policy with this net can begin a training with these settings.
+fn expect_net(checkpoint: &Checkpoint, of_policy: &NetConfig, config: &Config) -> Result<()> {
+    let net = config.ppo.net();
+    checkpoint.expect_policy(&net, &SPACES)?;
+    let (found, expected) = ((of_policy.activation, of_policy.symmetry), (net.activation, net.symmetry));
+    ensure!(
+        found == expected,
+        "its activation and symmetry are {found:?}, but those of this training are {expected:?}"
+    );
+    Ok(())
 }

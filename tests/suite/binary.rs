@@ -265,8 +265,12 @@ fn policies_and_runs_of_0_1_0_are_played_and_begun_with() {
     for place in ["old", "old/policy.safetensors", "old/checkpoints/latest.safetensors"] {
         let play = ["play", "--ckpt", place, "--episodes", "1", "--json", "--set", "env.max_episode_seconds=0.1"];
         assert_eq!(json(&succeeded(program(folder.path(), &play)))["episode_length"], 10.0, "{place}");
-        let args = ["--init", place, "--set", "ppo.hidden=[1]", "--set", "ppo.symmetry=none", "--total-steps", "128"];
-        succeeded(program(folder.path(), &train(&args)));
+        // The training has the policy's net, whatever the default is.
+        let args = ["--init", place, "--set", "env.num_envs=16", "--total-steps", "128", "--run-dir", "begun"];
+        succeeded(program(folder.path(), &[&["train"][..], &args].concat()));
+        let config = fs::read_to_string(folder.path().join("begun/config.toml")).unwrap();
+        assert!(config.contains("hidden = [1]") && config.contains("symmetry = \"none\""), "{config}");
+        fs::remove_dir_all(folder.path().join("begun")).unwrap();
     }
 }
 
