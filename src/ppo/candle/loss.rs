@@ -174,7 +174,7 @@ mod tests {
         assert_close(&found.value, &[0.296_666_7]);
         assert_close(&found.kl, &[0.046_028_256]);
         let grads = found.total.backward().unwrap();
-        let mean_grad = [0.0, 0.0, 0.142_810_81, -0.026_412_528, 2.924_584_2, 0.841_392_4];
+        let mean_grad = [0.0, 0.0, 0.142_810_8, -0.026_412_528, 2.924_584_2, 0.841_392_4];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
     }
