@@ -35,7 +35,8 @@ static ALLOCATOR: Watching = Watching;
 
 #[test]
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
-    let config = Config::resolve(None, &["env.num_envs=256".parse().unwrap()]).unwrap();
+    let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
+    let config = Config::resolve(None, &sets).unwrap();
     let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
     let mut iterate = || {
         LARGEST.store(0, Ordering::Relaxed);
