@@ -11,7 +11,7 @@ const KEYS: [(&str, &str); 6] = [
     ),
     (
         "ppo.max_std ppo.min_std",
-        "the std is not learnt any more, since it lay at its upper bound in every training; write that as ppo.std",
+        "the std is not learnt any more; ppo.std is what ppo.max_std was",
     ),
     ("ppo.init_std ppo.max_std_steps", "the std follows a ramp, e.g. ppo.std = { from = 0.6, to = 0.2, steps = 25e6 }"),
     (
