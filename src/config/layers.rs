@@ -400,6 +400,8 @@ mod tests {
             ("env.num_envs=1.5", "must be a whole number, not negative"),
             ("ppo.hidden=3", "must be an array"),
             ("ppo.hidden=[]", "must hold one to 64 sizes"),
+            ("ppo.critic_hidden=[0]", "ppo.critic_hidden = [0]: must hold at most 64 sizes"),
+            ("ppo.critic_hidden=[0.5]", "must be an array of values that are each a whole number"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
             ("ppo.away_range=[0.5,0.5]", "must be [near, far] with 0 <= near < far"),

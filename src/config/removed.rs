@@ -9,10 +9,7 @@ const KEYS: [(&str, &str); 6] = [
          training.tolerance_start training.tolerance_steps training.hold_start training.hold_steps",
         "write it as a ramp, e.g. training.drop_reward = { from = -50, to = -1500, steps = 150e6 }",
     ),
-    (
-        "ppo.max_std ppo.min_std",
-        "the std is not learnt any more; ppo.std is what ppo.max_std was",
-    ),
+    ("ppo.max_std ppo.min_std", "the std is not learnt any more; ppo.std is what ppo.max_std was"),
     ("ppo.init_std ppo.max_std_steps", "the std follows a ramp, e.g. ppo.std = { from = 0.6, to = 0.2, steps = 25e6 }"),
     (
         "training.tolerance_scale training.hold_scale",
