@@ -16,7 +16,7 @@ import time
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-LARGE, SMALL = [512, 512, 256, 128], [256, 128, 64]
+LARGE, DEFAULT, SMALL = [512, 512, 256, 128], [512, 256, 128], [256, 128, 64]
 # The iterations after which and until which a training is timed: compilation and the first rollouts are over.
 ITERATIONS = (10, 30)
 
@@ -36,13 +36,13 @@ class Sides:
         threads = ["--threads", str(self.threads)]
         return json.loads(run([self.program, "bench", "--only", part, "--json", *threads, *options]))[key]
 
-    def learner(self, hidden, envs, minibatches):
+    def learner(self, hidden, envs, minibatches, *settings):
         return self.bench("learner", "learner_samples_per_s", f"ppo.hidden={hidden}", f"env.num_envs={envs}",
-                          f"ppo.minibatches={minibatches}")
+                          f"ppo.minibatches={minibatches}", *settings)
 
-    def torch(self, hidden, batch):
+    def torch(self, hidden, batch, *options):
         return json.loads(run([sys.executable, HERE / "torch_learner.py", "--hidden", ",".join(map(str, hidden)),
-                               "--batch", str(batch), "--threads", str(self.threads)]))["samples_per_s"]
+                               "--batch", str(batch), "--threads", str(self.threads), *options]))["samples_per_s"]
 
     def training(self):
         """Returns env steps/s of `train` without options over the iterations that the peer is timed in."""
@@ -88,6 +88,11 @@ def main():
                                                                 lambda: sides.torch(LARGE, 8192)),
         "learner samples/s, nets 256 128 64, batch 4096": (lambda: sides.learner(SMALL, 1024, 4),
                                                            lambda: sides.torch(SMALL, 4096)),
+        "learner samples/s, nets 512 256 128, batch 4096": (lambda: sides.learner(DEFAULT, 1024, 4),
+                                                            lambda: sides.torch(DEFAULT, 4096)),
+        "learner samples/s, nets 512 256 128, batch 4096, bf16": (
+            lambda: sides.learner(DEFAULT, 1024, 4, "ppo.precision=bf16"),
+            lambda: max(sides.torch(DEFAULT, 4096, "--bf16"), sides.torch(DEFAULT, 4096, "--bf16", "--compile"))),
         # Measured in turn within one run, so that the speed of the machine is the same for both sides.
         "environments / bare physics": (lambda: sides.bench("physics", "pool_share"), lambda: 1.0),
         "end to end steps/s, default training; batch API, torch.compile": (

@@ -218,7 +218,7 @@ pub enum Backend {
 pub enum Precision {
     /// `f32`.
     F32,
-    /// bf16 with sums in `f32`, on the matrix tiles of processors that have them.
+    /// bf16 with sums in `f32`, on the tiles or dot products of processors that have them.
     Bf16,
     /// The rounding of bf16 without its speed, on any processor.
     Bf16Rounded,

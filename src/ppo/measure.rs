@@ -59,10 +59,10 @@ pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
         for (o, i, inner) in products(policy) {
             let weight = Matrix::new(&weights[..o * i], o, i);
             let (x, dz) = (Matrix::new(&x[..ROWS * i], ROWS, i), Matrix::new(&dz[..ROWS * o], ROWS, o));
-            multiplier.product(&mut out[..ROWS * o], x, weight.transposed(), false);
-            multiplier.product(&mut out[..o * i], dz.transposed(), x, true);
+            multiplier.product(&mut out[..ROWS * o], x, weight.transposed().into(), false);
+            multiplier.product(&mut out[..o * i], dz.transposed(), x.into(), true);
             if inner {
-                multiplier.product(&mut out[..ROWS * i], dz, weight, false);
+                multiplier.product(&mut out[..ROWS * i], dz, weight.into(), false);
             }
         }
         start.elapsed().as_secs_f64()

@@ -171,7 +171,7 @@ impl Ppo {
 
     /// Returns the policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
-        let policy = self.policy.freeze();
+        let policy = self.policy.freeze_for(self.arithmetic);
         // All actions have the same standard deviation.
         let away_scale = (self.config.away_std as f32 / policy.std()[0]).max(1.0);
         Acting { policy, config: &self.config, away_scale }

@@ -159,7 +159,13 @@ impl Policy {
 
     /// Returns the policy in its current state.
     pub fn freeze(&self) -> FrozenPolicy<'_> {
-        let [actor, critic] = [&self.layout.actor, &self.layout.critic].map(|layers| self.net(layers).for_few_rows());
+        self.freeze_for(Arithmetic::F32)
+    }
+
+    /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
+    pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
+        let nets = [&self.layout.actor, &self.layout.critic];
+        let [actor, critic] = nets.map(|layers| self.net(layers).for_few_rows().packed(arithmetic, false));
         FrozenPolicy { policy: self, actor, critic, reader: self.reader(), std: self.std() }
     }
 }

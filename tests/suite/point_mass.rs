@@ -133,9 +133,9 @@ fn ppo_learns_with_candles_tensors_too() {
     assert!(first > 0.5 && last < 0.15, "{first} → {last}");
 }
 
-/// Only on a processor with bf16 tiles; on others, the tests of the program check the refusal.
+/// Only on a processor with a unit for bf16; on others, the tests of the program check the refusal.
 #[test]
-fn ppo_learns_on_tiles_where_there_are_any() {
+fn ppo_learns_in_bf16_where_the_processor_has_it() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
     if Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).is_ok() {
         let [first, last] = distances(&settings, 0);

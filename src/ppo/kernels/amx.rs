@@ -1,90 +1,29 @@
 //! Products of bf16 matrices on the tiles of x86-64 processors (AMX), with sums in f32.
 //!
 //! Stable Rust has no intrinsics for these instructions, so this file, and only this one, uses assembly.
-//! [`super::bf16`] packs the operands into tiles; [`Tiles::product`] is safe. Instructions: Intel 64 and IA-32
-//! Architectures Software Developer's Manual, volume 1, chapter 18. Permission: Linux,
+//! Instructions: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 1, chapter 18. Permission: Linux,
 //! Documentation/arch/x86/xstate.rst.
 
 #![expect(unsafe_code, reason = "assembly")]
 
-use std::sync::OnceLock;
-
-use anyhow::Result;
-
-use super::bf16::{LINES, Packed, Side, TILE};
-use super::product::Matrix;
-
-/// Rows and columns of the product that are computed together: two by two tiles.
-const BLOCK: usize = 2 * LINES;
+pub(super) use machine::TileSession;
 
 /// The permission to use the tiles.
 #[derive(Clone, Copy, Debug)]
 pub struct Tiles(());
 
 impl Tiles {
-    /// Requests the tiles from the processor and the kernel, once per process.
+    /// Requests the tiles from the processor and the kernel.
     ///
     /// # Errors
-    /// Fails if the tiles are missing, may not be used, or multiply wrongly; the message says which.
-    pub fn request() -> Result<Self> {
-        static ANSWER: OnceLock<Result<(), &'static str>> = OnceLock::new();
-        let answer = ANSWER.get_or_init(|| {
-            machine::request()?;
-            if Tiles(()).multiply_rightly() { Ok(()) } else { Err("this processor's tiles compute wrong products") }
-        });
-        answer.map(|()| Self(())).map_err(anyhow::Error::msg)
+    /// Fails if the tiles are missing or may not be used; the message says which.
+    pub fn request() -> Result<Self, &'static str> {
+        machine::request().map(|()| Self(()))
     }
 
-    /// Writes the product of packed matrices to `out` `[rows, columns]`, by rows, or adds it if `add` is set.
-    ///
-    /// # Panics
-    /// Panics if the sizes do not match.
-    pub fn product(self, out: &mut [f32], columns: usize, lhs: &Packed, rhs: &Packed, add: bool) {
-        let (rows, depth) = (out.len() / columns, lhs.depth());
-        assert_eq!(out.len(), rows * columns, "elements of the product");
-        assert_eq!(depth, rhs.depth(), "tiles along the lines of both matrices");
-        let pair = 2 * depth * TILE;
-        assert_eq!(lhs.tiles().len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
-        assert_eq!(rhs.tiles().len(), columns.div_ceil(BLOCK) * pair, "tiles of the right matrix");
-        let session = machine::TileSession::begin();
-        // The tiles of the right matrix in use stay in the cache while those of the left one stream past.
-        for (j, rhs) in rhs.tiles().chunks_exact(pair).enumerate() {
-            for (i, lhs) in lhs.tiles().chunks_exact(pair).enumerate() {
-                let (height, width) = ((rows - i * BLOCK).min(BLOCK), (columns - j * BLOCK).min(BLOCK));
-                let first = i * BLOCK * columns + j * BLOCK;
-                if (height, width) == (BLOCK, BLOCK) {
-                    session.multiply(&mut out[first..], columns, lhs, rhs, add);
-                    continue;
-                }
-                // A block that extends beyond the edge is computed in a separate buffer.
-                let mut whole = [0.0; BLOCK * BLOCK];
-                session.multiply(&mut whole, BLOCK, lhs, rhs, false);
-                for (row, whole) in whole.chunks_exact(BLOCK).take(height).enumerate() {
-                    let out = &mut out[first + row * columns..][..width];
-                    for (out, x) in out.iter_mut().zip(whole) {
-                        *out = if add { *out + x } else { *x };
-                    }
-                }
-            }
-        }
-    }
-
-    /// Returns whether a product of whole numbers, which needs no rounding, is exact.
-    fn multiply_rightly(self) -> bool {
-        let (rows, depth, columns) = (37, 70, 50);
-        let numbers =
-            |count: usize, step: usize| (0..count).map(|i| (i * step % 17) as f32 - 8.0).collect::<Vec<f32>>();
-        let (a, b) = (numbers(rows * depth, 5), numbers(depth * columns, 3));
-        let (mut lhs, mut rhs) = (Packed::default(), Packed::default());
-        lhs.pack(Matrix::new(&a, rows, depth), Side::Left);
-        rhs.pack(Matrix::new(&b, depth, columns), Side::Right);
-        let mut out = vec![1.0; rows * columns];
-        self.product(&mut out, columns, &lhs, &rhs, true);
-        (0..rows * columns).all(|i| {
-            let (row, column) = (i / columns, i % columns);
-            let sum: f32 = (0..depth).map(|k| a[row * depth + k] * b[k * columns + column]).sum();
-            out[i] == 1.0 + sum
-        })
+    /// Configures the tiles of this thread until the end of the session.
+    pub fn begin(self) -> TileSession {
+        TileSession::begin()
     }
 }
 
@@ -94,8 +33,7 @@ mod machine {
     use std::arch::x86_64::{__cpuid, __cpuid_count};
     use std::marker::PhantomData;
 
-    use super::super::bf16::{DEPTH, LINES, TILE};
-    use super::BLOCK;
+    use super::super::bf16::{DEPTH, LINES, MultiplyBlock, Tile, depth_of_block};
 
     /// Bytes in a row of a tile, both in memory and in the processor.
     const ROW_BYTES: usize = 64;
@@ -130,7 +68,7 @@ mod machine {
     }
 
     /// The configured tiles of this thread, released on drop.
-    pub(super) struct TileSession(PhantomData<*const ()>);
+    pub struct TileSession(PhantomData<*const ()>);
 
     #[repr(align(64))]
     struct Setup([u8; 64]);
@@ -149,20 +87,19 @@ mod machine {
     };
 
     impl TileSession {
-        pub(super) fn begin() -> Self {
-            // SAFETY: `Tiles` exists only where the processor has these instructions and the kernel permits them. The
+        pub fn begin() -> Self {
+            // SAFETY: `Tiles`, which alone calls this, exists only where the processor has these instructions and the kernel permits them. The
             // configuration stays loaded until `drop`: only `multiply` and plain copies run in between, and the
             // compiler uses no tiles itself.
             unsafe { asm!("ldtilecfg [{}]", in(reg) &SETUP.0, options(readonly, nostack)) };
             Self(PhantomData)
         }
+    }
 
-        /// Computes 32 × 32 values of a product, whose rows are `columns` values apart in `out`.
-        pub(super) fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[u16], rhs: &[u16], add: bool) {
-            let depth = lhs.len() / (2 * TILE);
-            assert!(depth > 0 && lhs.len() == 2 * depth * TILE && rhs.len() == lhs.len());
-            assert!(columns >= BLOCK && out.len() >= (BLOCK - 1) * columns + BLOCK);
-            const { assert!(TILE * 2 == LINES * ROW_BYTES && DEPTH * 2 == ROW_BYTES) };
+    impl MultiplyBlock for TileSession {
+        fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[Tile], rhs: &[Tile], add: bool) {
+            let depth = depth_of_block(out, columns, lhs, rhs);
+            const { assert!(size_of::<Tile>() == LINES * ROW_BYTES && DEPTH * 2 == ROW_BYTES) };
             // SAFETY: each operand is 2 × `depth` consecutive tiles of 1024 bytes, and each of the `depth` iterations
             // of the loop reads one tile of each half. `out` has 32 rows of 32 values at that distance.
             unsafe {
@@ -198,9 +135,9 @@ mod machine {
                     "tilestored [{c1} + {apart}*1], tmm2",
                     "tilestored [{c1} + {apart}*1 + 64], tmm3",
                     a0 = inout(reg) lhs.as_ptr() => _,
-                    a1 = inout(reg) lhs.as_ptr().add(depth * TILE) => _,
+                    a1 = inout(reg) lhs.as_ptr().add(depth) => _,
                     b0 = inout(reg) rhs.as_ptr() => _,
-                    b1 = inout(reg) rhs.as_ptr().add(depth * TILE) => _,
+                    b1 = inout(reg) rhs.as_ptr().add(depth) => _,
                     c0 = in(reg) out.as_mut_ptr(),
                     c1 = in(reg) second_rows,
                     depth = inout(reg) depth => _,
@@ -225,7 +162,9 @@ mod machine {
 
 #[cfg(not(all(target_arch = "x86_64", target_os = "linux")))]
 mod machine {
-    pub fn request() -> Result<(), &'static str> {
+    use super::super::bf16::{MultiplyBlock, Tile};
+
+    pub(super) fn request() -> Result<(), &'static str> {
         Err("bf16 tiles (AMX) are used only on x86-64 Linux")
     }
 
@@ -235,54 +174,9 @@ mod machine {
         pub fn begin() -> Self {
             unreachable!("there are no tiles here")
         }
-
-        pub fn multiply(&self, _: &mut [f32], _: usize, _: &[u16], _: &[u16], _: bool) {}
     }
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::ppo::kernels::bf16::rounded;
-    use crate::rng;
-
-    /// On a machine without tiles, only the error message is tested.
-    #[test]
-    fn products_of_rounded_numbers_agree_with_doubles() {
-        let tiles = match Tiles::request() {
-            Ok(tiles) => tiles,
-            Err(error) => return assert!(error.to_string().contains("AMX"), "{error}"),
-        };
-        let mut rng = rng::stream(0, "test", 0);
-        for (rows, depth, columns) in
-            [(32, 32, 32), (1, 1, 1), (256, 157, 256), (20, 256, 64), (100, 33, 17), (3, 70, 500)]
-        {
-            let mut random =
-                |count: usize| -> Vec<f32> { (0..count).map(|_| rng::uniform(&mut rng, -2.0, 2.0) as f32).collect() };
-            let (a, b, before) = (random(rows * depth), random(depth * columns), random(rows * columns));
-            for add in [false, true] {
-                // Both operands, once stored by rows and once by columns.
-                for (lhs, rhs) in [
-                    (Matrix::new(&a, rows, depth), Matrix::new(&b, depth, columns)),
-                    (Matrix::new(&a, depth, rows).transposed(), Matrix::new(&b, columns, depth).transposed()),
-                ] {
-                    let (mut left, mut right) = (Packed::default(), Packed::default());
-                    left.pack(lhs, Side::Left);
-                    right.pack(rhs, Side::Right);
-                    let mut out = before.clone();
-                    tiles.product(&mut out, columns, &left, &right, add);
-                    let at = |m: Matrix, i: usize, j: usize| {
-                        f64::from(rounded(m.data()[i * m.strides()[0] as usize + j * m.strides()[1] as usize]))
-                    };
-                    for (i, &found) in out.iter().enumerate() {
-                        let terms = (0..depth).map(|k| at(lhs, i / columns, k) * at(rhs, k, i % columns));
-                        let start = if add { f64::from(before[i]) } else { 0.0 };
-                        let (sum, size) = terms.fold((start, start.abs()), |(s, z), x| (s + x, z + x.abs()));
-                        let error = (f64::from(found) - sum).abs();
-                        assert!(error <= 1e-6 * size.max(1.0), "{rows}×{depth}×{columns}: {found} not {sum}");
-                    }
-                }
-            }
-        }
+    impl MultiplyBlock for TileSession {
+        fn multiply(&self, _: &mut [f32], _: usize, _: &[Tile], _: &[Tile], _: bool) {}
     }
 }

@@ -1,17 +1,19 @@
-//! bf16, the upper half of an f32: rounding, and packing of operands into the tiles that [`super::amx`] multiplies.
+//! bf16, the upper half of an f32: rounding, and packing of operands into the tiles that [`super::units`] multiplies.
 
 use pulp::Arch;
 
 use super::product::Matrix;
 
-/// Lines in a tile: rows of the left matrix or columns of the right one.
+/// Lines in a tile. The lines of an operand are the rows of the left matrix or the columns of the right one.
 pub(super) const LINES: usize = 16;
 
 /// Values of each line in a tile.
 pub(super) const DEPTH: usize = 32;
 
-/// Values in a tile.
-pub(super) const TILE: usize = LINES * DEPTH;
+/// A tile, at the start of a cache line.
+#[derive(Clone, Debug)]
+#[repr(C, align(64))]
+pub struct Tile(pub [u16; LINES * DEPTH]);
 
 /// Rounds to the nearest bf16, ties to even; NaN stays NaN.
 #[inline(always)]
@@ -27,26 +29,49 @@ pub(super) fn rounded(x: f32) -> f32 {
     f32::from_bits(u32::from(round(x)) << 16)
 }
 
-/// The position of a matrix in a product.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Side {
-    /// The left operand: lines are rows. A tile has 16 lines of 32 values.
-    Left,
-    /// The right operand: lines are columns. A tile has 16 rows, each with one pair of values from each of 16 lines.
-    Right,
+/// Rows and columns of a product that are computed together: two by two tiles.
+pub(super) const BLOCK: usize = 2 * LINES;
+
+/// A unit of the processor that multiplies tiles, in use by this thread.
+pub(super) trait MultiplyBlock {
+    /// Writes [`BLOCK`] × [`BLOCK`] values of a product, whose rows are `columns` values apart in `out`, or adds them if `add`
+    /// is set. Of each operand these are the tiles along its first sixteen lines, then along the other sixteen.
+    ///
+    /// # Panics
+    /// Panics if the sizes do not match.
+    fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[Tile], rhs: &[Tile], add: bool);
+}
+
+/// Panics unless these are the operands of a block, and `out` has room for it. Returns the tiles along a line.
+pub(super) fn depth_of_block(out: &[f32], columns: usize, lhs: &[Tile], rhs: &[Tile]) -> usize {
+    let depth = lhs.len() / 2;
+    assert!(depth > 0 && lhs.len() == 2 * depth && rhs.len() == lhs.len(), "tiles of a block");
+    assert!(columns >= BLOCK && out.len() >= (BLOCK - 1) * columns + BLOCK, "room for a block");
+    depth
+}
+
+/// The order of the values in a tile.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Order {
+    /// 16 lines of 32 values.
+    #[default]
+    Lines,
+    /// 16 rows, each with one pair of values from each of 16 lines.
+    Pairs,
 }
 
 /// A matrix in tiles, padded with zeros: first all tiles along the first sixteen lines, then along the next sixteen, up
 /// to an even number of such groups.
 #[derive(Default)]
 pub struct Packed {
-    tiles: Vec<u16>,
+    tiles: Vec<Tile>,
     depth: usize,
+    order: Order,
 }
 
 impl Packed {
     /// Returns the tiles.
-    pub fn tiles(&self) -> &[u16] {
+    pub fn tiles(&self) -> &[Tile] {
         &self.tiles
     }
 
@@ -55,20 +80,23 @@ impl Packed {
         self.depth
     }
 
-    /// Packs a matrix as the left or right operand, reusing the memory of the previous one.
-    pub fn pack(&mut self, matrix: Matrix, side: Side) {
-        // From here on, either operand is `lines` lines of `numbers` values.
-        let matrix = if side == Side::Left { matrix } else { matrix.transposed() };
+    /// Returns the order of the values in a tile.
+    pub fn order(&self) -> Order {
+        self.order
+    }
+
+    /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
+    pub fn pack(&mut self, matrix: Matrix, order: Order) {
         let [lines, numbers] = matrix.size();
-        self.depth = numbers.div_ceil(DEPTH);
+        (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
         let groups = lines.div_ceil(2 * LINES) * 2;
-        self.tiles.resize(groups * self.depth * TILE, 0);
+        self.tiles.resize(groups * self.depth, Tile([0; LINES * DEPTH]));
         Arch::new().dispatch(
             #[inline(always)]
             || {
-                for (i, tile) in self.tiles.chunks_exact_mut(TILE).enumerate() {
+                for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
                     let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
-                    pack_tile(tile, matrix, [line, number], side);
+                    pack_tile(tile, matrix, [line, number], order);
                 }
             },
         );
@@ -77,37 +105,53 @@ impl Packed {
 
 /// Fills a tile, starting at this line and this position in the line.
 #[inline(always)]
-fn pack_tile(tile: &mut [u16], matrix: Matrix, [line, number]: [usize; 2], side: Side) {
+fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [usize; 2], order: Order) {
     let ([lines, numbers], data) = (matrix.size(), matrix.data());
     let (lines, numbers) = (lines.saturating_sub(line).min(LINES), (numbers - number).min(DEPTH));
-    // One of the strides is 1. Values along it are rounded as whole vectors, then moved into place.
-    let [across, along] = matrix.strides().map(|stride| stride as usize);
-    let place = |line: usize, number: usize| match side {
-        Side::Left => line * DEPTH + number,
-        Side::Right => number / 2 * DEPTH + 2 * line + number % 2,
-    };
     if (lines, numbers) != (LINES, DEPTH) {
         tile.fill(0);
     }
     if lines == 0 {
         return;
     }
+    // One of the strides is 1. Values along it are rounded as whole vectors, then moved into place.
+    let [across, along] = matrix.strides().map(|stride| stride as usize);
     if along == 1 {
         for i in 0..lines {
             let from = &data[(line + i) * across + number..][..numbers];
-            let mut row = [0; DEPTH];
-            row.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
-            for (j, &x) in row.iter().enumerate() {
-                tile[place(i, j)] = x;
+            match order {
+                Order::Lines => tile[i * DEPTH..].iter_mut().zip(from).for_each(|(to, &x)| *to = round(x)),
+                Order::Pairs => {
+                    let mut row = [0; DEPTH];
+                    row.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
+                    let (pairs, _) = row.as_chunks::<2>();
+                    for (to, pair) in tile[2 * i..].chunks_mut(DEPTH).zip(pairs) {
+                        to[..2].copy_from_slice(pair);
+                    }
+                }
             }
         }
     } else {
-        for j in 0..numbers {
-            let from = &data[(number + j) * along + line..][..lines];
+        let column = |j: usize| {
             let mut column = [0; LINES];
-            column.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
-            for (i, &x) in column.iter().enumerate() {
-                tile[place(i, j)] = x;
+            if j < numbers {
+                let from = &data[(number + j) * along + line..][..lines];
+                column.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
+            }
+            column
+        };
+        for j in (0..numbers).step_by(2) {
+            let pairs = column(j).into_iter().zip(column(j + 1));
+            match order {
+                Order::Pairs => {
+                    let (to, _) = tile[j * LINES..][..DEPTH].as_chunks_mut::<2>();
+                    to.iter_mut().zip(pairs).for_each(|(to, (even, odd))| *to = [even, odd]);
+                }
+                Order::Lines => {
+                    for (to, (even, odd)) in tile.chunks_mut(DEPTH).zip(pairs) {
+                        to[j..j + 2].copy_from_slice(&[even, odd]);
+                    }
+                }
             }
         }
     }
@@ -142,24 +186,23 @@ mod tests {
         let by_rows: Vec<f32> = (0..rows * columns).map(|i| number(i / columns, i % columns)).collect();
         let by_columns: Vec<f32> = (0..rows * columns).map(|i| number(i % rows, i / rows)).collect();
         for matrix in [Matrix::new(&by_rows, rows, columns), Matrix::new(&by_columns, columns, rows).transposed()] {
-            for side in [Side::Left, Side::Right] {
-                let mut packed = Packed { tiles: vec![7; 9999], depth: 3 }; // left from a previous matrix
-                packed.pack(matrix, side);
-                let [lines, numbers] = if side == Side::Left { [rows, columns] } else { [columns, rows] };
-                assert_eq!(packed.depth(), numbers.div_ceil(DEPTH));
-                let groups = lines.div_ceil(2 * LINES) * 2;
-                assert_eq!(packed.tiles().len(), groups * packed.depth() * TILE);
-                for (i, &x) in packed.tiles().iter().enumerate() {
-                    let (tile, row, cell) = (i / TILE, i % TILE / DEPTH, i % DEPTH);
-                    let (line, along) = match side {
-                        Side::Left => (row, cell),
-                        Side::Right => (cell / 2, 2 * row + cell % 2),
+            for order in [Order::Lines, Order::Pairs] {
+                // Left from a previous matrix.
+                let mut packed = Packed { tiles: vec![Tile([7; LINES * DEPTH]); 20], depth: 3, order };
+                packed.pack(matrix, order);
+                assert_eq!((packed.depth(), packed.order()), (columns.div_ceil(DEPTH), order));
+                let groups = rows.div_ceil(2 * LINES) * 2;
+                assert_eq!(packed.tiles().len(), groups * packed.depth());
+                for (i, &x) in packed.tiles().iter().flat_map(|Tile(tile)| tile).enumerate() {
+                    let (tile, row, cell) = (i / (LINES * DEPTH), i % (LINES * DEPTH) / DEPTH, i % DEPTH);
+                    let (line, along) = match order {
+                        Order::Lines => (row, cell),
+                        Order::Pairs => (cell / 2, 2 * row + cell % 2),
                     };
                     let (line, along) = (tile / packed.depth() * LINES + line, tile % packed.depth() * DEPTH + along);
-                    let inside = line < lines && along < numbers;
-                    let (row, column) = if side == Side::Left { (line, along) } else { (along, line) };
-                    let expected = if inside { number(row, column) } else { 0.0 };
-                    assert_eq!(x, round(expected), "{side:?}: {row}, {column}");
+                    let inside = line < rows && along < columns;
+                    let expected = if inside { number(line, along) } else { 0.0 };
+                    assert_eq!(x, round(expected), "{order:?}: {line}, {along}");
                 }
             }
         }

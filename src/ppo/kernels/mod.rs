@@ -9,11 +9,13 @@
 
 mod activation;
 mod amx;
+mod avx512;
 mod bf16;
 mod loss;
 mod multiplier;
 mod net;
 mod product;
+mod units;
 
 use std::sync::Mutex;
 
@@ -155,7 +157,8 @@ impl GradientBackend for Kernels {
         let groups = groups_of_shard(in_shard, minibatch.shards);
         let all_groups = groups * minibatch.own_shards;
         let rows = self.reserve(policy, all_groups, in_shard.div_ceil(groups));
-        let nets = [&policy.layout.actor, &policy.layout.critic].map(|layers| policy.net(layers));
+        let nets = [&policy.layout.actor, &policy.layout.critic];
+        let nets = nets.map(|layers| policy.net(layers).packed(self.arithmetic, true));
         let log_std = policy.log_std();
         let loss = Loss::new(rollout, minibatch.count(), &self.config, log_std);
         let bounds: Vec<usize> = (0..=groups).map(|i| in_shard * i / groups).collect();

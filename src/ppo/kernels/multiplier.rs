@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result};
 
-use super::amx::Tiles;
-use super::bf16::{Packed, Side, rounded};
+use super::bf16::{Packed, rounded};
 use super::product::{Matrix, product};
+use super::units::{Unit, pack_right};
 use crate::config::Precision;
 
 /// An arithmetic that this machine supports.
@@ -14,23 +14,52 @@ pub enum Arithmetic {
     F32,
     /// Operands rounded to bf16, products and sums in f32.
     Rounded,
-    /// Operands rounded to bf16, products on tiles, sums in f32.
-    Tiles(Tiles),
+    /// Operands rounded to bf16, products on a unit of the processor, sums in f32.
+    Bf16(Unit),
 }
 
 impl Arithmetic {
     /// Returns the arithmetic for a precision.
     ///
     /// # Errors
-    /// Fails if the precision requires tiles and this machine lacks them.
+    /// Fails if the precision requires a unit that this machine lacks.
     pub fn new(precision: Precision) -> Result<Self> {
         Ok(match precision {
             Precision::F32 => Self::F32,
             Precision::Bf16Rounded => Self::Rounded,
-            Precision::Bf16 => Self::Tiles(
-                Tiles::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
+            Precision::Bf16 => Self::Bf16(
+                Unit::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
             ),
         })
+    }
+
+    /// Returns a right operand as its products read it, for many products, if it has to be rearranged for them.
+    pub(crate) fn packed(self, rhs: Matrix) -> Option<Packed> {
+        matches!(self, Self::Bf16(_)).then(|| {
+            let mut packed = Packed::default();
+            pack_right(rhs, &mut packed);
+            packed
+        })
+    }
+}
+
+/// A right operand.
+#[derive(Clone, Copy)]
+pub(crate) struct Right<'a> {
+    matrix: Matrix<'a>,
+    packed: Option<&'a Packed>,
+}
+
+impl<'a> Right<'a> {
+    /// Creates the operand from a matrix, and from what [`Arithmetic::packed`] has made of it, if it has.
+    pub(crate) fn new(matrix: Matrix<'a>, packed: Option<&'a Packed>) -> Self {
+        Self { matrix, packed }
+    }
+}
+
+impl<'a> From<Matrix<'a>> for Right<'a> {
+    fn from(matrix: Matrix<'a>) -> Self {
+        Self { matrix, packed: None }
     }
 }
 
@@ -51,7 +80,8 @@ impl Multiplier {
     ///
     /// # Panics
     /// Panics if the sizes do not match.
-    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
+    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Right, add: bool) {
+        let Right { matrix: rhs, packed: ready } = rhs;
         assert_eq!(lhs.size()[1], rhs.size()[0], "columns of the first and rows of the second matrix");
         assert_eq!(out.len(), lhs.size()[0] * rhs.size()[1], "elements of the product");
         match self.arithmetic {
@@ -60,12 +90,15 @@ impl Multiplier {
                 let [left, right] = &mut self.rounded;
                 product(out, round_into(left, lhs), round_into(right, rhs), add);
             }
-            Arithmetic::Tiles(tiles) => {
+            Arithmetic::Bf16(unit) => {
                 let [left, right] = &mut self.packed;
-                left.pack(lhs, Side::Left);
-                right.pack(rhs, Side::Right);
+                unit.pack_left(lhs, left);
+                let right = ready.unwrap_or_else(|| {
+                    pack_right(rhs, right);
+                    right
+                });
                 let [_, columns] = rhs.size();
-                tiles.product(out, columns, left, right, add);
+                unit.product(out, columns, left, right, add);
             }
         }
     }

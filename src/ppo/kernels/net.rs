@@ -2,7 +2,8 @@
 
 use super::super::parameters;
 use super::activation::{add_bias, add_bias_activate, slopes_and_sums};
-use super::multiplier::{Arithmetic, Multiplier};
+use super::bf16::Packed;
+use super::multiplier::{Arithmetic, Multiplier, Right};
 use super::product::Matrix;
 use crate::config::Activation;
 
@@ -20,6 +21,8 @@ struct Dense<'a> {
     weight: &'a [f32],
     /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
     turned: Option<Vec<f32>>,
+    /// The weight, transposed and as it is, as products in bf16 read it, if it was packed.
+    packed: [Option<Packed>; 2],
     bias: &'a [f32],
     inputs: usize,
     outputs: usize,
@@ -70,6 +73,7 @@ impl<'a> Net<'a> {
         let layer = |layer: &parameters::Layer| Dense {
             weight: &parameters[layer.weight.clone()],
             turned: None,
+            packed: [None, None],
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
             outputs: layer.outputs,
@@ -86,6 +90,17 @@ impl<'a> Net<'a> {
                 turned[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
             }
             layer.turned = Some(turned);
+        }
+        self
+    }
+
+    /// Returns the net with its weights packed for this arithmetic, which each product would else do anew: for forward passes
+    /// and, if `learning`, for backward passes. The results are the same, bit for bit.
+    pub(crate) fn packed(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
+        for layer in &mut self.layers {
+            let weight = layer.weight();
+            let backward = if learning { arithmetic.packed(weight) } else { None };
+            layer.packed = [arithmetic.packed(weight.transposed()), backward];
         }
         self
     }
@@ -111,7 +126,8 @@ impl<'a> Net<'a> {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
-            work.multiplier.product(y, layer.x(x, rows), layer.turned(rows), false);
+            let weight = Right::new(layer.turned(rows), layer.packed[0].as_ref());
+            work.multiplier.product(y, layer.x(x, rows), weight, false);
             if l + 1 == self.layers.len() {
                 add_bias(y, layer.bias);
             } else {
@@ -140,9 +156,10 @@ impl<'a> Net<'a> {
             slopes_and_sums(grad, &work.outputs[l][..grad.len()], activation, bias_grad);
             let grad = Matrix::new(grad, rows, layer.outputs);
             let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
-            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), add);
+            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows).into(), add);
             if l > 0 {
-                work.multiplier.product(&mut below[..rows * layer.inputs], grad, layer.weight(), false);
+                let weight = Right::new(layer.weight(), layer.packed[1].as_ref());
+                work.multiplier.product(&mut below[..rows * layer.inputs], grad, weight, false);
                 std::mem::swap(above, below);
             }
         }
@@ -173,6 +190,29 @@ impl Dense<'_> {
 mod tests {
     use super::super::super::parameters::Layout;
     use super::*;
+    use crate::config::Precision;
+
+    #[test]
+    fn packed_weights_change_no_bit() {
+        let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
+        let layout = Layout::new([&[70, 33], &[33]], 157, 20);
+        let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
+        for rows in [1, 32, 50] {
+            let [plain, packed] = [false, true].map(|packed| {
+                let net = Net::new(&layout.actor, &parameters, Activation::Elu);
+                let net = if packed { net.packed(arithmetic, true) } else { net };
+                let mut work = Workspace::new([&layout.actor, &layout.critic], rows, true, arithmetic);
+                work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
+                let outputs = net.forward(rows, &mut work).to_vec();
+                let (_, grad) = work.outputs_and_grad(&net, rows);
+                grad.iter_mut().enumerate().for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
+                let mut gradient = vec![0.0; net.parameter_count()];
+                net.backward(rows, &mut work, &mut gradient, false);
+                (outputs, gradient)
+            });
+            assert!(plain.1.iter().any(|&x| x != 0.0) && plain == packed, "{rows} rows");
+        }
+    }
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
