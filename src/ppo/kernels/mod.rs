@@ -5,7 +5,8 @@
 //! forward pass, the loss and the backward pass while all of it is in the cache of that core, and accumulates the
 //! gradient of its group. Then the gradients of the groups are added as a binary tree. The grouping depends only on the
 //! numbers of samples and shards, so the result is the same for any number of threads. After the first minibatch, the
-//! only float arrays that are allocated are the packing buffers of gemm and small temporaries of the sums.
+//! only float arrays that are allocated are the packing buffers of gemm and small temporaries of the sums; bf16 also
+//! packs the weights anew for each minibatch.
 
 mod activation;
 mod amx;
