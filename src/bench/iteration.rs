@@ -51,8 +51,7 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origi
     let mut acting = config.ppo.clone();
     let (checkpoint, of_it) = origin.load_for_any_scene()?;
     let net = of_it.net;
-    (acting.hidden, acting.critic_hidden) = (net.hidden, net.critic_hidden);
-    (acting.activation, acting.symmetry) = (net.activation, net.symmetry);
+    (acting.hidden, acting.activation, acting.symmetry) = (net.hidden, net.activation, net.symmetry);
     let randomization = Randomization::new(task, &config.randomization)?;
     let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
     // The lesson at the end of a training.

@@ -13,10 +13,10 @@ use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use crate::run;
 
 /// The keys of `[ppo]` that describe a policy.
-const OF_NETS: [&str; 4] = ["hidden", "critic_hidden", "activation", "symmetry"];
+const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
 
 /// Values of settings that older policy files lack; they may differ from today's defaults.
-const BEFORE: &str = "[ppo]\ncritic_hidden = []\nsymmetry = \"none\"";
+const BEFORE: &str = "[ppo]\nsymmetry = \"none\"";
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -73,10 +73,9 @@ impl Config {
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let NetConfig { hidden, critic_hidden, activation, symmetry } = net;
-        let sizes = [hidden, critic_hidden].map(Value::try_from);
-        let words = [Value::try_from(activation), Value::try_from(symmetry)];
-        let values = sizes.into_iter().chain(words).map(|value| value.expect("a plain value"));
+        let NetConfig { hidden, activation, symmetry } = net;
+        let values = [Value::try_from(hidden), Value::try_from(activation), Value::try_from(symmetry)];
+        let values = values.map(|value| value.expect("a plain value"));
         let ppo: Table = OF_NETS.map(String::from).into_iter().zip(values).collect();
         let mut tables = vec![Table::from_iter([("ppo".into(), Value::Table(ppo))])];
         tables.extend(user.map(Source::table).transpose()?);
@@ -400,8 +399,6 @@ mod tests {
             ("env.num_envs=1.5", "must be a whole number, not negative"),
             ("ppo.hidden=3", "must be an array"),
             ("ppo.hidden=[]", "must hold one to 64 sizes"),
-            ("ppo.critic_hidden=[0]", "ppo.critic_hidden = [0]: must hold at most 64 sizes"),
-            ("ppo.critic_hidden=[0.5]", "must be an array of values that are each a whole number"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
             ("ppo.away_range=[0.5,0.5]", "must be [near, far] with 0 <= near < far"),

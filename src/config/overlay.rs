@@ -111,9 +111,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
             Ok(Value::Integer(*x as i64))
         }
         (Value::Array(expected), Value::Array(values)) => {
-            // Arrays that are empty by default are sizes of layers.
-            let kind = expected.first().unwrap_or(&Value::Integer(0));
-            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(kind, v)).collect();
+            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&expected[0], v)).collect();
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Float(_), _) => Err("a number".into()),

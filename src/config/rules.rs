@@ -145,16 +145,12 @@ fn randomization(config: &Config, rules: &mut Rules) {
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
-    for (key, sizes, fewest) in
-        [("ppo.hidden", &config.ppo.hidden, 1), ("ppo.critic_hidden", &config.ppo.critic_hidden, 0)]
-    {
-        let fit = (fewest..=64).contains(&sizes.len()) && sizes.iter().all(|size| (1..=16384).contains(size));
-        let shown = format!("{:?}", &sizes[..sizes.len().min(65)]);
-        let number = if fewest == 0 { "at most" } else { "one to" };
-        rules.check(fit, key, &shown, &format!("hold {number} 64 sizes from 1 to 16384"));
-        let weights = sizes.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
-        rules.check(weights <= 1 << 25, key, shown, "have at most 2^25 weights between its layers");
-    }
+    let hidden = &config.ppo.hidden;
+    let sizes_fit = (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h));
+    let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
+    rules.check(sizes_fit, "ppo.hidden", &sizes, "hold one to 64 sizes from 1 to 16384");
+    let weights = hidden.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
+    rules.check(weights <= 1 << 25, "ppo.hidden", sizes, "have at most 2^25 weights between its layers");
 }
 
 fn learning(config: &Config, rules: &mut Rules) {

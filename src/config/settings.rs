@@ -161,7 +161,6 @@ pub struct PpoConfig {
     pub minibatches: usize,
     pub minibatch_size: usize,
     pub hidden: Vec<usize>,
-    pub critic_hidden: Vec<usize>,
     pub activation: Activation,
     pub symmetry: Symmetry,
     pub backend: Backend,
@@ -242,21 +241,12 @@ pub struct RunConfig {
 /// The settings of a learner that its policy keeps for life.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NetConfig {
-    /// The sizes of the hidden layers of the actor.
+    /// The sizes of the hidden layers, the same for actor and critic.
     pub hidden: Vec<usize>,
-    /// The sizes of the hidden layers of the critic; none: those of the actor.
-    pub critic_hidden: Vec<usize>,
     /// The activation function after each of them.
     pub activation: Activation,
     /// The states that it treats as the same.
     pub symmetry: Symmetry,
-}
-
-impl NetConfig {
-    /// Returns the sizes of the hidden layers of actor and critic.
-    pub fn sizes(&self) -> [&[usize]; 2] {
-        [&self.hidden, if self.critic_hidden.is_empty() { &self.hidden } else { &self.critic_hidden }]
-    }
 }
 
 impl Config {
@@ -285,12 +275,7 @@ impl Config {
 impl PpoConfig {
     /// Returns the structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
-        NetConfig {
-            hidden: self.hidden.clone(),
-            critic_hidden: self.critic_hidden.clone(),
-            activation: self.activation,
-            symmetry: self.symmetry,
-        }
+        NetConfig { hidden: self.hidden.clone(), activation: self.activation, symmetry: self.symmetry }
     }
 
     /// Returns the number of samples in a minibatch of a rollout with this many.

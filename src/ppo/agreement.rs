@@ -25,7 +25,7 @@ mod tests {
     fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
-        (config.critic_hidden, config.bounds_coef) = (vec![40], 0.1);
+        config.bounds_coef = 0.1;
         let mut ppo = Ppo::new(&config, SPACES, 3, Division::alone(1)).unwrap();
         ppo.policy.see(&[vec![&[[0.3; 157], [0.9; 157]].concat()]], &ppo.division);
         let mut rollout = Rollout::new(16, &[32, 32, 21], &SPACES);

@@ -205,7 +205,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
-        let layout = Layout::new(net.sizes(), spaces.observation_size, spaces.action_size);
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))
     }
 
@@ -217,7 +217,7 @@ impl Checkpoint {
 
     fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
         self.expect_policy(net, &spaces)?;
-        let views = Layout::new(net.sizes(), spaces.observation_size, spaces.action_size).views();
+        let views = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size).views();
         let parameters = self.take_floats("", &views)?;
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];

@@ -19,18 +19,18 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a net would become narrower or change its depth, or if the tensors are not those of `from`.
     pub fn grow(&mut self, from: &NetConfig, to: &NetConfig, spaces: Spaces, seed: u64) -> Result<()> {
-        if from.sizes() == to.sizes() {
+        if from.hidden == to.hidden {
             return Ok(());
         }
-        let keys = ["ppo.hidden", "ppo.critic_hidden"];
-        for (key, (old, new)) in keys.into_iter().zip(from.sizes().into_iter().zip(to.sizes())) {
-            let wider = old.len() == new.len() && old.iter().zip(new).all(|(old, new)| old <= new);
-            ensure!(
-                wider,
-                "{key} = {new:?}: nets of {old:?} can only be made wider, with the same number of layers and none smaller"
-            );
-        }
-        let layout = |net: &NetConfig| Layout::new(net.sizes(), spaces.observation_size, spaces.action_size);
+        let wider =
+            from.hidden.len() == to.hidden.len() && from.hidden.iter().zip(&to.hidden).all(|(old, new)| old <= new);
+        ensure!(
+            wider,
+            "ppo.hidden = {:?}: nets of {:?} can only be made wider, with the same number of layers and none smaller",
+            to.hidden,
+            from.hidden
+        );
+        let layout = |net: &NetConfig| Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         let (old, new) = (layout(from), layout(to));
         let mut policy = Policy::random(to, spaces, 1.0, seed)?.parameters;
         for (old, new) in layers(&old).zip(layers(&new)) {
@@ -92,8 +92,7 @@ mod tests {
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
     fn net(hidden: &[usize]) -> NetConfig {
-        let critic_hidden = Vec::new();
-        NetConfig { hidden: hidden.to_vec(), critic_hidden, activation: Activation::Elu, symmetry: Symmetry::None }
+        NetConfig { hidden: hidden.to_vec(), activation: Activation::Elu, symmetry: Symmetry::None }
     }
 
     fn learner(hidden: &[usize], seed: u64) -> Ppo {

@@ -98,7 +98,7 @@ impl Policy {
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
     pub fn new(net: &NetConfig, spaces: Spaces, parameters: Vec<f32>, normalizer: Normalizer) -> Result<Self> {
-        let layout = Layout::new(net.sizes(), spaces.observation_size, spaces.action_size);
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         assert_eq!(parameters.len(), layout.count(), "number of parameters");
         let perception = Perception::new(net.symmetry, &spaces)?;
         Ok(Self { layout, parameters, normalizer, activation: net.activation, spaces, perception })
@@ -111,7 +111,7 @@ impl Policy {
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
     pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Result<Self> {
-        let layout = Layout::new(net.sizes(), spaces.observation_size, spaces.action_size);
+        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         let mut rng = rng::stream(seed, "weights", 0);
         let mut parameters = vec![std.ln() as f32; layout.count()];
         let mut fill = |layer: &Layer, shrink: f32| {
@@ -154,7 +154,7 @@ impl Policy {
 
     /// Returns the buffers of both nets for blocks of up to `rows` rows.
     pub(super) fn workspace(&self, rows: usize, learning: bool, arithmetic: Arithmetic) -> Workspace {
-        Workspace::new([&self.layout.actor, &self.layout.critic], rows, learning, arithmetic)
+        Workspace::new(&self.layout.actor, rows, learning, arithmetic)
     }
 
     /// Returns the policy in its current state.

@@ -178,7 +178,7 @@ impl GradientBackend for Kernels {
                     row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
                 }
                 net.forward(block.len(), work);
-                let (outputs, grad) = work.outputs_and_grad(net, block.len());
+                let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
                 match role {
                     Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
                     Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),

@@ -28,11 +28,11 @@ struct Dense<'a> {
     outputs: usize,
 }
 
-/// Buffers for passing a block of up to `rows` rows through actor and critic, one after the other.
+/// Buffers for passing a block of up to `rows` rows through nets with the same hidden layers.
 pub struct Workspace {
     /// `[rows, I]`: inputs of the nets.
     pub inputs: Vec<f32>,
-    /// `[rows, outputs]` for each layer of the net that needs more.
+    /// `[rows, outputs]` for each layer.
     outputs: Vec<Vec<f32>>,
     /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the layer below it.
     grads: [Vec<f32>; 2],
@@ -41,14 +41,13 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Creates a workspace for these nets. The backward pass requires `learning`.
-    pub fn new(nets: [&[parameters::Layer]; 2], rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
-        let width = |l: usize| nets.iter().filter_map(|net| net.get(l)).map(|layer| layer.outputs).max();
-        let widths: Vec<usize> = (0..).map_while(width).collect();
-        let widest = widths.iter().max().expect("a net has layers");
+    /// Creates a workspace for a net with these layers, or with the same hidden layers and fewer outputs. The backward
+    /// pass requires `learning`.
+    pub fn new(layers: &[parameters::Layer], rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
+        let widest = layers.iter().map(|layer| layer.outputs).max().expect("a net has layers");
         Self {
-            inputs: vec![0.0; rows * nets[0][0].inputs],
-            outputs: widths.iter().map(|width| vec![0.0; rows * width]).collect(),
+            inputs: vec![0.0; rows * layers[0].inputs],
+            outputs: layers.iter().map(|layer| vec![0.0; rows * layer.outputs]).collect(),
             grads: [0, 1].map(|_| vec![0.0; if learning { rows * widest } else { 0 }]),
             multiplier: Multiplier::new(arithmetic),
             rows,
@@ -60,10 +59,11 @@ impl Workspace {
         self.rows
     }
 
-    /// Returns the outputs of this net for `rows` rows, and the buffer for the gradient with respect to them.
-    pub(crate) fn outputs_and_grad(&mut self, net: &Net, rows: usize) -> (&[f32], &mut [f32]) {
-        let count = rows * net.outputs();
-        (&self.outputs[net.layers.len() - 1][..count], &mut self.grads[0][..count])
+    /// Returns the outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
+    /// respect to them.
+    pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
+        let last = self.outputs.last().expect("a net has layers");
+        (&last[..rows * outputs], &mut self.grads[0][..rows * outputs])
     }
 }
 
@@ -195,16 +195,16 @@ mod tests {
     #[test]
     fn packed_weights_change_no_bit() {
         let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
-        let layout = Layout::new([&[70, 33], &[33]], 157, 20);
+        let layout = Layout::new(&[70, 33], 157, 20);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
                 let net = Net::new(&layout.actor, &parameters, Activation::Elu);
                 let net = if packed { net.packed(arithmetic, true) } else { net };
-                let mut work = Workspace::new([&layout.actor, &layout.critic], rows, true, arithmetic);
+                let mut work = Workspace::new(&layout.actor, rows, true, arithmetic);
                 work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
                 let outputs = net.forward(rows, &mut work).to_vec();
-                let (_, grad) = work.outputs_and_grad(&net, rows);
+                let (_, grad) = work.outputs_and_grad(rows, net.outputs());
                 grad.iter_mut().enumerate().for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
                 let mut gradient = vec![0.0; net.parameter_count()];
                 net.backward(rows, &mut work, &mut gradient, false);
@@ -216,9 +216,9 @@ mod tests {
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
-        let layout = Layout::new([&[300, 64], &[64, 200, 16]], 157, 20);
+        let layout = Layout::new(&[300, 64], 157, 20);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
-        let mut work = Workspace::new([&layout.actor, &layout.critic], 64, false, Arithmetic::F32);
+        let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
         work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
         for layers in [&layout.actor, &layout.critic] {
             let net = || Net::new(layers, &parameters, Activation::Elu);
