@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::{Config, Override, Source};
+use shadow_repose::config::{Config, Override, Ramp, Source};
 use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::load;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
@@ -52,7 +52,8 @@ pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
         let mut checkpoint = Checkpoint::parse(bytes)?;
         let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
         // The rest of the memory of a training grows with these, which are the user's choice.
-        (config.env.num_envs, config.ppo.horizon, config.ppo.minibatches, config.ppo.epochs) = (1, 3, 1, 1);
+        config.ppo.horizon = Ramp::constant(3.0);
+        (config.env.num_envs, config.ppo.minibatches, config.ppo.epochs) = (1, 1, 1);
         config.run.shards = 1;
         let mut agent = Agent::of_task(task, &config)?;
         agent.restore(&mut checkpoint)?;

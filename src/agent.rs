@@ -30,8 +30,6 @@ pub struct Agent<E: Env> {
     scratch: Scratch,
     /// The lesson at a given number of control steps.
     lessons: Box<dyn Fn(u64) -> E::Lesson + Send>,
-    /// The number of control steps in an iteration, over the environments of all ranks.
-    steps: u64,
     /// The number of finished iterations.
     pub iteration: u64,
     /// The number of control steps so far, over all environments.
@@ -105,7 +103,6 @@ impl<E: Env> Agent<E> {
         lessons: impl Fn(u64) -> E::Lesson + Send + 'static,
     ) -> Result<Self> {
         let mut pool = EnvPool::of_shards(seed, envs, &division);
-        let steps = (config.horizon * pool.count() / division.own().len() * division.shards()) as u64;
         let ppo = Ppo::new(config, E::SPACES, seed, division.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
@@ -117,7 +114,6 @@ impl<E: Env> Agent<E> {
             rollout,
             scratch,
             lessons: Box::new(lessons),
-            steps,
             iteration: 0,
             env_steps: 0,
             fork: None,
@@ -136,7 +132,8 @@ impl<E: Env> Agent<E> {
         let collected = Instant::now();
         let Some(update) = self.ppo.update(&mut self.rollout, self.iteration + 1, stop)? else { return Ok(None) };
         self.rollout.carry_over();
-        let steps = self.steps;
+        let steps = self.rollout.samples() / self.division.own().len() * self.division.shards();
+        let steps = steps as u64;
         (self.iteration, self.env_steps) = (self.iteration + 1, self.env_steps + steps);
         let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
@@ -149,7 +146,7 @@ impl<E: Env> Agent<E> {
     pub fn collect(&mut self, stop: &AtomicBool) -> Result<Option<E::Lesson>> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
-        self.ppo.follow_ramps(self.env_steps);
+        self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
         let iteration = self.iteration + 1;
         let whole = collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)?;
         Ok(whole.then_some(lesson))
@@ -193,8 +190,13 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     let Progress { iteration, env_steps, ref fork, .. } = checkpoint.progress;
     // The parent of a fork may have made a different number of steps in each iteration.
     let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
-    let own = iteration.checked_sub(before).and_then(|own| own.checked_mul(config.steps_per_iteration()));
-    let possible = own.is_some() && own == env_steps.checked_sub(steps_before);
+    let own = iteration.checked_sub(before).zip(env_steps.checked_sub(steps_before));
+    // An iteration makes at least as many steps as the first one, and at most as many as the last one.
+    let (least, most) = (config.steps_per_iteration(), (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as u64);
+    let possible = own.is_some_and(|(own, steps)| {
+        let bounds = own.checked_mul(least).zip(own.checked_mul(most));
+        bounds.is_some_and(|(least, most)| (least..=most).contains(&steps)) && steps.is_multiple_of(least)
+    });
     ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
     for name in [NUMBERS, COUNTERS] {
         let shape = checkpoint.shape(name).context("it holds a policy alone, which can be played but not resumed")?;

@@ -64,12 +64,12 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origi
     let mut bare = BarePool::new(task, randomization.as_ref(), config.env.num_envs);
     let mut seen = learner.rollout(&agent.pool.block_sizes());
     let mut found: [Vec<f64>; 4] = Default::default();
-    for round in 0..BEFORE.div_ceil(config.ppo.horizon) + ROUNDS {
+    for round in 0..BEFORE.div_ceil(config.ppo.first_horizon()) + ROUNDS {
         agent.pool.envs_mut().for_each(RecordingEnv::begin);
         let collecting = Instant::now();
         agent.collect(&NEVER)?.context("nothing stops it")?;
         let collect_s = collecting.elapsed().as_secs_f64();
-        if round >= BEFORE.div_ceil(config.ppo.horizon) {
+        if round >= BEFORE.div_ceil(config.ppo.first_horizon()) {
             let physics_s = bare.replay(&mut agent.pool)?;
             for (from, to) in agent.rollout.blocks.iter().zip(&mut seen.blocks) {
                 to.observations.copy_from_slice(&from.observations);

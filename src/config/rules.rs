@@ -155,9 +155,13 @@ fn nets(config: &Config, rules: &mut Rules) {
 
 fn learning(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
-    let samples = config.env.num_envs.saturating_mul(ppo.horizon);
-    let rule = "make at most 2^22 samples (num_envs * horizon)";
-    rules.check(samples <= 1 << 22, "ppo.horizon", ppo.horizon, rule);
+    let horizon = ppo.horizon;
+    let whole = [horizon.from, horizon.to].iter().all(|steps| steps.fract() == 0.0);
+    let multiple = horizon.from < 1.0 || whole && horizon.to % horizon.from == 0.0;
+    rules.check(multiple, "ppo.horizon", horizon, "be a whole number, or end with a whole multiple of it");
+    let most = config.env.num_envs as f64 * horizon.to;
+    rules.check(most <= (1 << 22).into(), "ppo.horizon", horizon, "make at most 2^22 samples (num_envs * horizon)");
+    let samples = config.steps_per_iteration() as usize;
     // One of the two holds; a number of minibatches of 0 is reported elsewhere.
     let by_size = ppo.minibatch_size > 0;
     let (key, parts) =

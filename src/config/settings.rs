@@ -156,7 +156,7 @@ pub struct RandomizationConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PpoConfig {
-    pub horizon: usize,
+    pub horizon: Ramp,
     pub epochs: usize,
     pub minibatches: usize,
     pub minibatch_size: usize,
@@ -250,14 +250,14 @@ pub struct NetConfig {
 }
 
 impl Config {
-    /// Returns the number of control steps in one iteration.
+    /// Returns the number of control steps in the first iteration.
     pub fn steps_per_iteration(&self) -> u64 {
-        (self.env.num_envs * self.ppo.horizon) as u64
+        self.env.num_envs.saturating_mul(self.ppo.first_horizon()) as u64
     }
 
     /// Returns the number of samples in a minibatch.
     pub fn samples_per_minibatch(&self) -> usize {
-        self.ppo.minibatch_of(self.env.num_envs * self.ppo.horizon)
+        self.ppo.minibatch_of(self.steps_per_iteration() as usize, self.ppo.first_horizon())
     }
 
     /// Returns the number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
@@ -278,9 +278,23 @@ impl PpoConfig {
         NetConfig { hidden: self.hidden.clone(), activation: self.activation, symmetry: self.symmetry }
     }
 
-    /// Returns the number of samples in a minibatch of a rollout with this many.
-    pub fn minibatch_of(&self, samples: usize) -> usize {
-        if self.minibatch_size == 0 { samples / self.minibatches } else { self.minibatch_size }
+    /// Returns the number of control steps of each environment in the first iteration.
+    pub fn first_horizon(&self) -> usize {
+        self.horizon.from.max(1.0) as usize
+    }
+
+    /// Returns the number of control steps of each environment in an iteration that begins after `env_steps` control steps of the
+    /// run: the largest multiple of the first one that the ramp has reached.
+    pub fn horizon_at(&self, env_steps: u64) -> usize {
+        let first = self.first_horizon();
+        (self.horizon.by_equal_steps(env_steps) / first as f64 + 1e-9) as usize * first
+    }
+
+    /// Returns the number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
+    /// horizons of a run.
+    pub fn minibatch_of(&self, samples: usize, horizon: usize) -> usize {
+        let in_first = samples / (horizon / self.first_horizon());
+        if self.minibatch_size == 0 { in_first / self.minibatches } else { self.minibatch_size }
     }
 
     /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.

@@ -21,7 +21,7 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     ppo.backend.begin(&ppo.policy, rollout);
     // Samples from the whole rollout, as in a shuffled minibatch.
     let samples = rollout.samples();
-    let step = samples / ppo.config.minibatch_of(samples);
+    let step = samples / ppo.config.minibatch_of(samples, rollout.horizon());
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
     while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {

@@ -151,14 +151,18 @@ impl Ppo {
         hasher.finalize()
     }
 
-    /// Creates a rollout of the configured horizon for blocks with these numbers of environments.
+    /// Creates a rollout of the first horizon for blocks with these numbers of environments.
     pub fn rollout(&self, block_sizes: &[usize]) -> Rollout {
-        Rollout::new(self.config.horizon, block_sizes, &self.policy.spaces)
+        Rollout::new(self.config.first_horizon(), block_sizes, &self.policy.spaces)
     }
 
-    /// Sets the standard deviation of the actions and the desired KL divergence to where their ramps are after
-    /// `env_steps` control steps of the run.
-    pub fn follow_ramps(&mut self, env_steps: u64) {
+    /// Sets the standard deviation of the actions, the desired KL divergence and the horizon of the rollout to where their
+    /// ramps are after `env_steps` control steps of the run.
+    pub fn follow_ramps(&mut self, env_steps: u64, rollout: &mut Rollout) {
+        let horizon = self.config.horizon_at(env_steps);
+        if horizon != rollout.horizon() {
+            rollout.resize(horizon, &self.policy.spaces);
+        }
         self.learning_rate.follow_ramp(env_steps);
         let std = self.config.std.by_equal_factors(env_steps);
         self.policy.parameters[self.policy.layout.log_std.clone()].fill(std.ln() as f32);
@@ -201,7 +205,7 @@ impl Ppo {
         let in_shard = rollout.samples() / own.len();
         // Each part takes this number of samples from each shard.
         let shards = self.division.shards();
-        let size = self.config.minibatch_of(in_shard * shards) / shards;
+        let size = self.config.minibatch_of(in_shard * shards, rollout.horizon()) / shards;
         let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
         let mut shuffles: Vec<Rng> = own.clone().map(stream).collect();
         let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();

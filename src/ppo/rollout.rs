@@ -73,6 +73,16 @@ impl Rollout {
         (&self.blocks[block], (sample - self.firsts[block]) as usize)
     }
 
+    /// Makes it one of `horizon` steps, which begins with the same observations and is otherwise empty.
+    pub fn resize(&mut self, horizon: usize, spaces: &Spaces) {
+        let sizes: Vec<usize> = self.blocks.iter().map(|block| block.envs).collect();
+        let mut resized = Self::new(horizon, &sizes, spaces);
+        for (new, old) in resized.first_observations_mut().into_iter().zip(self.first_observations_mut()) {
+            new.copy_from_slice(old);
+        }
+        *self = resized;
+    }
+
     /// Moves the observations after the last step to the first step, for the next iteration.
     pub fn carry_over(&mut self) {
         self.blocks.iter_mut().for_each(RolloutBlock::carry_over);

@@ -34,7 +34,7 @@ fn settings_that_cannot_be_are_named_all_at_once() {
         &[
             "my.toml",
             "ppo.learningrate: unknown key; did you mean ppo.learning_rate?",
-            "ppo.horizon = \"long\": must be a whole number",
+            "ppo.horizon = \"long\": must be a number, or { from = …",
             "env.num_envs = 0: must be at least 1",
             "ppo.gamma = 1.5: must lie in [0, 1]",
             "env.ctrl_dt = 0.015: must be a whole multiple of env.sim_dt = 0.01",

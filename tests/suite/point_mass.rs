@@ -150,7 +150,7 @@ fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
     let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.5).abs() < 1e-6));
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
-        ppo.follow_ramps(env_steps);
+        ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
         assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{env_steps}");
     }
     let at_once = PpoConfig { std: Ramp { steps: 0, ..std }, ..settings };
@@ -265,7 +265,7 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
 
 #[test]
 fn iterations_and_steps_are_counted_where_they_are_made() {
-    let mut agent = agent_of(9, &PpoConfig { horizon: 8, ..settings() }, 0);
+    let mut agent = agent_of(9, &PpoConfig { horizon: Ramp::constant(8.0), ..settings() }, 0);
     let made = agent.iterate(&NEVER).unwrap().expect("nothing stops it");
     assert_eq!((agent.iteration, agent.env_steps, made.steps), (1, 72, 72));
     assert!(agent.iterate(&AtomicBool::new(true)).unwrap().is_none());

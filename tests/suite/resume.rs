@@ -78,6 +78,37 @@ fn a_run_that_is_resumed_is_left_as_it_was_until_an_iteration_is_done() {
 }
 
 #[test]
+fn rollouts_grow_by_whole_multiples_and_resume_on_either_side_of_it() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let more = ["--set", "run.checkpoint_every=1", "--set", "ppo.horizon={from=8,to=24,steps=512}"];
+    let args = train(&[&more[..], &["--total-steps", "1280", "--run-dir", "run", "--keep", "9"]].concat());
+    succeeded(program(folder, &args));
+    let rows = metrics(&folder.join("run"));
+    let at = rows[0].iter().position(|name| name == "env_steps").unwrap();
+    let steps: Vec<&str> = rows[1..].iter().map(|row| row[at].as_str()).collect();
+    // 16 hands make 8 steps each up to 256, 16 up to 512, and then 24.
+    assert_eq!(steps, ["128", "256", "512", "896", "1280"]);
+    let expected = result(folder, "run");
+    for iteration in [1, 2, 3] {
+        succeeded(program(
+            folder,
+            &["train", "--resume", &checkpoint(iteration), "--total-steps", "1280", "--keep", "9"],
+        ));
+        assert!(result(folder, "run") == expected, "from iteration {iteration}");
+    }
+    for (set, reason) in [
+        ("ppo.horizon={from=8,to=20}", "must be a whole number, or end with a whole multiple of it"),
+        ("ppo.horizon={from=8,to=4}", "must be a whole number, or end with a whole multiple of it"),
+        ("ppo.horizon=2.5", "must be a whole number"),
+        ("ppo.horizon={from=16,to=1600000}", "must make at most 2^22 samples"),
+    ] {
+        let output = program(folder, &train(&["--set", set]));
+        assert!(output.status.code() == Some(1) && stderr(&output).contains(reason), "{set}: {}", stderr(&output));
+    }
+}
+
+#[test]
 fn a_run_whose_folder_is_deleted_before_its_first_iteration_is_done_is_made_anew() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
