@@ -20,7 +20,6 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         ("training.tolerance", training.tolerance),
         ("training.hold", training.hold),
         ("ppo.std", ppo.std),
-        ("ppo.horizon", ppo.horizon),
         ("ppo.desired_kl", ppo.desired_kl),
     ];
     let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.steps > total).collect();
@@ -76,7 +75,7 @@ mod tests {
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &of(&["run.total_steps=20000000"])[..] else { panic!("one line") };
-        assert!(line.contains("training.hold, ppo.std, ppo.horizon, which last up to 25000000 steps"), "{line}");
+        assert!(line.contains("training.tolerance, training.hold, ppo.std, which last up to 25000000 steps"), "{line}");
         assert!(!line.contains("task_reward"), "its ramp ends in time: {line}");
         let [line] = &of(&["ppo.minibatches=32"])[..] else { panic!("one line") };
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
