@@ -266,13 +266,13 @@ mod tests {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
             Config::resolve(None, &sets).unwrap().training.tolerance
         };
-        let default = Ramp { from: 0.4, to: 0.07, steps: 25_000_000 };
+        let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000 };
         assert_eq!(tolerance(&[]), default);
         assert_eq!(tolerance(&["training.tolerance=0.07"]), Ramp::constant(0.07));
         assert_eq!(tolerance(&["training.tolerance.to=0.05"]), Ramp { to: 0.05, ..default });
         assert_eq!(tolerance(&["training.tolerance.steps=1e6"]), Ramp { steps: 1_000_000, ..default });
-        let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=20000000}"]);
-        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 20_000_000 });
+        let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=30000000}"]);
+        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 30_000_000 });
         assert_eq!(tolerance(&["training.tolerance={to=0.06}"]), Ramp { to: 0.06, ..default });
         // Part of a ramp that was set to a constant before.
         let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
