@@ -84,8 +84,8 @@ impl Agent<Repose> {
         let randomization = Randomization::new(task, &config.randomization)?;
         let envs = config.env.num_envs / division.shards() * division.own().len();
         let envs = (0..envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
-        let training = config.training.clone();
-        Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &training))
+        let of_run = config.clone();
+        Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &of_run))
     }
 }
 

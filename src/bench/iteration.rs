@@ -55,10 +55,9 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origi
     let randomization = Randomization::new(task, &config.randomization)?;
     let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
     // The lesson at the end of a training.
-    let (training, end) = (config.training.clone(), config.run.total_steps);
+    let at_end = Lesson::at(config.run.total_steps, config);
     let division = || Division::alone(config.shards());
-    let lesson = move |_| Lesson::at(end, &training);
-    let mut agent = Agent::new(envs, &acting, config.run.seed, division(), lesson)?;
+    let mut agent = Agent::new(envs, &acting, config.run.seed, division(), move |_| at_end)?;
     agent.ppo.begin_with(&checkpoint)?;
     let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, division())?;
     let mut bare = BarePool::new(task, randomization.as_ref(), config.env.num_envs);

@@ -16,7 +16,7 @@ use serde_json::json;
 use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
-use crate::env::{ACTION_SIZE, End, Env, EnvPool, OBSERVATION_SIZE, Randomization, StepBuffers, Task};
+use crate::env::{ACTION_SIZE, End, Env, EnvPool, Lesson, OBSERVATION_SIZE, Randomization, StepBuffers, Task};
 use crate::load::Origin;
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::rng;
@@ -163,6 +163,9 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let randomization = Randomization::new(task, &config.randomization)?;
     let randomization = randomization.as_ref();
     let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task, randomization)).collect());
+    let mut lesson = Lesson::task(&config.env);
+    lesson.randomized = Lesson::at(0, config).randomized;
+    pool.set_lesson(lesson);
     let mut bare = BarePool::new(task, randomization, envs);
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
     pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());

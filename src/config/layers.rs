@@ -233,7 +233,7 @@ mod tests {
     fn a_file_may_set_part_of_a_ramp() {
         let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
         let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
-        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000 });
+        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
     }
 
     #[test]
@@ -250,14 +250,18 @@ mod tests {
         assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
         assert_eq!(going_on.training.goal_lifetime, 300);
         let all = include_str!("../../configs/randomization-all.toml");
-        let [all, nothing] = [all, ""].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
-        let keys = |config: &Config| Table::try_from(&config.randomization).unwrap();
-        let same = |(key, value): &(String, Value)| keys(&nothing)[key] == *value;
-        let same: Vec<String> = keys(&all).into_iter().filter(same).map(|(key, _)| key).collect();
-        assert_eq!(same, ["each", "push_steps"], "everything else is on");
         let source = include_str!("../../configs/randomization-source.toml");
-        let source = Config::from_text(Path::new("x.toml"), source, &[]).unwrap().randomization;
-        assert_eq!((source.friction, source.cube_mass, source.cube_com), ([0.8, 1.2], [0.8, 1.2], 0.01));
+        let [all, source] = [all, source].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
+        let varied = |config: &Config| -> Vec<String> {
+            let nothing = |value: &Value| ["0.0", "[1.0, 1.0]", "[0, 0]", "{}"].contains(&value.to_string().trim());
+            let keys = Table::try_from(&config.randomization).unwrap();
+            keys.into_iter().filter(|(_, value)| !nothing(value)).map(|(key, _)| key).collect()
+        };
+        assert_eq!(varied(&all).len(), 16, "everything is on");
+        assert_eq!(varied(&source), ["share", "each", "friction", "cube_mass", "cube_com", "push_steps"]);
+        let share = |config: &Config| (config.randomization.share, config.randomization.each);
+        assert_eq!([share(&all), share(&source)], [(Ramp::constant(1.0), 1.0); 2]);
+        assert!(!published.randomization.happens());
     }
 
     #[test]
@@ -266,17 +270,27 @@ mod tests {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
             Config::resolve(None, &sets).unwrap().training.tolerance
         };
-        let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000 };
+        let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000, after: 0 };
         assert_eq!(tolerance(&[]), default);
         assert_eq!(tolerance(&["training.tolerance=0.07"]), Ramp::constant(0.07));
         assert_eq!(tolerance(&["training.tolerance.to=0.05"]), Ramp { to: 0.05, ..default });
         assert_eq!(tolerance(&["training.tolerance.steps=1e6"]), Ramp { steps: 1_000_000, ..default });
         let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=30000000}"]);
-        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 30_000_000 });
+        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 30_000_000, after: 0 });
         assert_eq!(tolerance(&["training.tolerance={to=0.06}"]), Ramp { to: 0.06, ..default });
         // Part of a ramp that was set to a constant before.
         let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
-        assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0 });
+        assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0, after: 0 });
+        // A ramp may begin later, whether its default does or not.
+        assert_eq!(tolerance(&["training.tolerance.after=1e6"]), Ramp { after: 1_000_000, ..default });
+        let share = |sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            Config::resolve(None, &sets).unwrap().randomization.share
+        };
+        let later = Ramp { from: 0.0, to: 0.5, steps: 20_000_000, after: 40_000_000 };
+        assert_eq!(share(&[]), later);
+        assert_eq!(share(&["randomization.share.to=0.7"]), Ramp { to: 0.7, ..later });
+        assert_eq!(share(&["randomization.share=0.7"]), Ramp::constant(0.7), "from the first step on");
     }
 
     #[test]

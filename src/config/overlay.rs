@@ -1,5 +1,7 @@
 //! Overlaying one table of settings with another: keys and types are those of the base; what does not fit is reported.
 
+use std::borrow::Cow;
+
 use toml::{Table, Value};
 
 use super::ramp::Ramp;
@@ -66,7 +68,8 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             // A plain number in place of a ramp is a constant.
             (Some(expected), Value::Integer(_) | Value::Float(_)) if is_ramp(expected) => {
                 let parts = ["from", "to"].map(|part| (part.to_owned(), value.clone()));
-                let constant = Table::from_iter(parts.into_iter().chain([("steps".to_owned(), Value::Integer(0))]));
+                let zeros = ["steps", AFTER].map(|part| (part.to_owned(), Value::Integer(0)));
+                let constant = Table::from_iter(parts.into_iter().chain(zeros));
                 overlay(merged, &Table::from_iter([(key.clone(), constant.into())]), base, prefix, problems);
             }
             // A table of values by names that are checked elsewhere replaces the one before.
@@ -78,7 +81,7 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 };
                 overlay(target, inner, &zeros, &format!("{name}."), problems);
             }
-            (Some(Value::Table(expected)), Value::Table(inner)) => {
+            (Some(of), Value::Table(inner)) if let Value::Table(expected) = with_all_parts(of).as_ref() => {
                 let Some(Value::Table(target)) = merged.get_mut(key) else {
                     unreachable!("the merged tables are those of the base")
                 };
@@ -90,6 +93,20 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             },
         }
     }
+}
+
+/// The part of a ramp that the base may leave out.
+const AFTER: &str = "after";
+
+/// Returns a value of the base; a ramp with all its parts.
+fn with_all_parts(base: &Value) -> Cow<'_, Value> {
+    let mut base = Cow::Borrowed(base);
+    if is_ramp(&base)
+        && let Value::Table(ramp) = base.to_mut()
+    {
+        ramp.entry(AFTER).or_insert(Value::Integer(0));
+    }
+    base
 }
 
 /// Returns whether this value of the base is a ramp.

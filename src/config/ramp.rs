@@ -4,23 +4,26 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. A
-/// plain number in the settings is a constant.
+/// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. It
+/// may begin later than with the first step. A plain number in the settings is a constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ramp {
-    /// The value at the first step.
+    /// The value at the first step, and until the ramp begins.
     pub from: f64,
     /// The value at the last step and from then on.
     pub to: f64,
-    /// The length of the ramp in control steps; 0: the value is `to` from the first step on.
+    /// The length of the ramp in control steps; 0: the value is `to` from its first step on.
     pub steps: u64,
+    /// The control steps of the run after which the ramp begins.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub after: u64,
 }
 
 impl Ramp {
     /// Returns a ramp whose value does not change.
     pub fn constant(value: f64) -> Self {
-        Self { from: value, to: value, steps: 0 }
+        Self { from: value, to: value, steps: 0, after: 0 }
     }
 
     /// Returns the value after `env_steps` control steps; it changes by the same difference in each step.
@@ -35,17 +38,32 @@ impl Ramp {
         self.from.powf(1.0 - share) * self.to.powf(share)
     }
 
+    /// Returns the control steps of the run after which the value does not change any more.
+    pub fn end(&self) -> u64 {
+        self.after.saturating_add(self.steps)
+    }
+
     /// Returns the fraction of the ramp that is over, from 0 to 1.
     fn share(&self, env_steps: u64) -> f64 {
-        if self.steps == 0 { 1.0 } else { (env_steps as f64 / self.steps as f64).min(1.0) }
+        match env_steps.checked_sub(self.after) {
+            None => 0.0,
+            Some(_) if self.steps == 0 => 1.0,
+            Some(passed) => (passed as f64 / self.steps as f64).min(1.0),
+        }
     }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_zero(steps: &u64) -> bool {
+    *steps == 0
 }
 
 impl fmt::Display for Ramp {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let Self { from, to, steps } = self;
+        let Self { from, to, steps, after } = self;
+        let after = if *after == 0 { String::new() } else { format!(", after = {after}") };
         let constant = *self == Self::constant(*to);
-        if constant { to.fmt(f) } else { write!(f, "{{ from = {from}, to = {to}, steps = {steps} }}") }
+        if constant { to.fmt(f) } else { write!(f, "{{ from = {from}, to = {to}, steps = {steps}{after} }}") }
     }
 }
 
@@ -55,7 +73,7 @@ mod tests {
 
     #[test]
     fn a_ramp_begins_with_one_value_ends_with_the_other_and_stays_there() {
-        let ramp = Ramp { from: 0.4, to: 0.1, steps: 1000 };
+        let ramp = Ramp { from: 0.4, to: 0.1, steps: 1000, after: 0 };
         assert_eq!([0, 1000, 9000].map(|steps| ramp.by_equal_steps(steps)), [0.4, 0.1, 0.1]);
         assert_eq!([0, 1000, 9000].map(|steps| ramp.by_equal_factors(steps)), [0.4, 0.1, 0.1]);
         assert!((ramp.by_equal_steps(500) - 0.25).abs() < 1e-12);
@@ -63,8 +81,19 @@ mod tests {
     }
 
     #[test]
+    fn a_ramp_may_begin_later_and_keeps_its_first_value_until_then() {
+        let ramp = Ramp { from: 0.0, to: 0.5, steps: 1000, after: 4000 };
+        assert_eq!([0, 3999, 4000, 5000, 9000].map(|steps| ramp.by_equal_steps(steps)), [0.0, 0.0, 0.0, 0.5, 0.5]);
+        assert!((ramp.by_equal_steps(4500) - 0.25).abs() < 1e-12);
+        let step = Ramp { steps: 0, ..ramp };
+        assert_eq!([0, 3999, 4000].map(|steps| step.by_equal_steps(steps)), [0.0, 0.0, 0.5]);
+        assert_eq!([ramp.end(), step.end(), Ramp { after: u64::MAX, ..ramp }.end()], [5000, 4000, u64::MAX]);
+        assert_eq!(ramp.to_string(), "{ from = 0, to = 0.5, steps = 1000, after = 4000 }");
+    }
+
+    #[test]
     fn a_ramp_of_no_steps_is_at_its_end_from_the_first_step_on() {
-        let ramp = Ramp { from: 0.4, to: 0.1, steps: 0 };
+        let ramp = Ramp { from: 0.4, to: 0.1, steps: 0, after: 0 };
         assert_eq!([ramp.by_equal_steps(0), ramp.by_equal_factors(0), ramp.by_equal_steps(5)], [0.1; 3]);
         assert_eq!([0, 7].map(|steps| Ramp::constant(0.07).by_equal_factors(steps)), [0.07; 2]);
         assert_eq!(Ramp::constant(-0.3).by_equal_steps(3), -0.3);

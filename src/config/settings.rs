@@ -133,7 +133,7 @@ pub struct TrainingConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RandomizationConfig {
-    pub share: f64,
+    pub share: Ramp,
     pub each: f64,
     pub friction: [f64; 2],
     pub cube_mass: [f64; 2],
@@ -300,6 +300,13 @@ impl PpoConfig {
     /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
         if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
+    }
+}
+
+impl RandomizationConfig {
+    /// Returns whether a training has randomised episodes, at its beginning or later.
+    pub fn happens(&self) -> bool {
+        self.share != Ramp::constant(0.0)
     }
 }
 

@@ -27,9 +27,10 @@ impl Conditions {
         self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
     }
 
-    /// Draws the conditions of the episode of `rng`, and gives the simulation its physics; the state must be reset after it.
-    pub(super) fn begin(&mut self, rng: &Rng, sim: &mut Simulation, task: &Task) {
-        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng));
+    /// Draws the conditions of the episode of `rng`, which is randomised with probability `share`, and gives the simulation its
+    /// physics; the state must be reset after it.
+    pub(super) fn begin(&mut self, rng: &Rng, share: f64, sim: &mut Simulation, task: &Task) {
+        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, share));
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {

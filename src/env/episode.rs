@@ -22,13 +22,16 @@ pub struct EpisodeStats {
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// Whether it was randomised. This follows from the seed and its number, so it is not saved.
+    /// Whether it was randomised. [`Self::save`] leaves this to the caller.
     pub randomized: bool,
 }
 
 impl EpisodeStats {
     /// The number of `f64` values that [`Self::save`] writes.
     pub(super) const NUMBERS: usize = 6;
+
+    /// The number of counters that it writes.
+    pub(super) const COUNTERS: usize = 5;
 
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);

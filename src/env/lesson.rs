@@ -2,7 +2,7 @@
 
 use std::ops::AddAssign;
 
-use crate::config::{EnvConfig, TrainingConfig};
+use crate::config::{Config, EnvConfig};
 
 /// The task as trained at a given step: when a goal is reached, how long goals stay, and what is rewarded.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -16,6 +16,8 @@ pub struct Lesson {
     /// Whether reaching a goal ends it with [`super::End::Redirected`], so that its value is the same as if it stayed. No value
     /// then depends on the hold so far, which is not observed. In the task itself the next goal follows immediately.
     pub goals_end: bool,
+    /// Probability that an episode that begins is randomised, where the environment can do that.
+    pub randomized: f64,
     /// Weight of the task's own reward.
     pub task_reward: f64,
     /// Reward per rad by which the rotation error shrinks; negative where the error grows.
@@ -45,6 +47,7 @@ impl Lesson {
             hold: env.max_consecutive_successes,
             redirect_chance: 0.0,
             goals_end: false,
+            randomized: 0.0,
             task_reward: 1.0,
             progress_reward: 0.0,
             hold_reward: 0.0,
@@ -53,13 +56,15 @@ impl Lesson {
     }
 
     /// Returns the lesson after `env_steps` control steps of the whole run.
-    pub fn at(env_steps: u64, training: &TrainingConfig) -> Self {
+    pub fn at(env_steps: u64, config: &Config) -> Self {
+        let training = &config.training;
         Self {
             // By equal factors: halving the error is equally hard at any size.
             tolerance: training.tolerance.by_equal_factors(env_steps),
             hold: training.hold.by_equal_steps(env_steps).round() as u32,
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
             goals_end: true,
+            randomized: config.randomization.share.by_equal_steps(env_steps),
             task_reward: training.task_reward.by_equal_steps(env_steps),
             progress_reward: training.progress_reward,
             hold_reward: training.hold_reward,
@@ -111,7 +116,7 @@ mod tests {
 
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        Lesson::at(env_steps, &Config::resolve(None, &sets).unwrap().training)
+        Lesson::at(env_steps, &Config::resolve(None, &sets).unwrap())
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The randomised episodes of a training: what each draws, and the models that it needs.
 //!
-//! An episode's draw depends only on the seed and the number of the episode. A resumed run therefore draws the same again, and
-//! nothing of it is saved.
+//! What a randomised episode draws depends only on the seed and the number of the episode. A resumed run therefore draws the same
+//! again, and all that is saved is whether the episode is randomised.
 
 use std::sync::Arc;
 
@@ -77,7 +77,7 @@ impl Randomization {
     pub fn new(task: &Task, config: &RandomizationConfig) -> Result<Option<Arc<Self>>> {
         let noise = Spread::of(&config.noise).context("randomization.noise")?;
         let bias = Spread::of(&config.bias).context("randomization.bias")?;
-        if config.share == 0.0 {
+        if !config.happens() {
             return Ok(None);
         }
         let shifts = config.cube_com > 0.0;
@@ -111,12 +111,12 @@ impl Randomization {
         self.config.delay[1]
     }
 
-    /// Draws the episode of `rng`, which may be at any position; `None` if the episode is not randomised. All numbers are drawn
-    /// in any case, so that one setting does not change what is drawn for another.
-    pub fn draw(&self, rng: &Rng) -> Option<Draw> {
+    /// Draws the episode of `rng`, which may be at any position; `None` if the episode is not randomised, which happens with
+    /// probability 1 - `share`. All numbers are drawn in any case, so that one setting does not change what is drawn for another.
+    pub fn draw(&self, rng: &Rng, share: f64) -> Option<Draw> {
         let of = &self.config;
         let rng = &mut rng::beside(rng, "randomization");
-        let randomized = rng::uniform(rng, 0.0, 1.0) < of.share;
+        let randomized = rng::uniform(rng, 0.0, 1.0) < share;
         let mut is_varied = [(); QUANTITIES].map(|()| rng::uniform(rng, 0.0, 1.0) < of.each).into_iter();
         let mut varied = || is_varied.next().expect("one for each quantity");
         let mut between = |[low, high]: [f64; 2], rng: &mut Rng| {

@@ -259,7 +259,7 @@ impl Env for Repose {
         let task = self.task.clone();
         let (hand, config) = (&task.hand, &task.config);
         self.rng = rng;
-        self.conditions.begin(&self.rng, &mut self.sim, &task);
+        self.conditions.begin(&self.rng, self.lesson.randomized, &mut self.sim, &task);
         self.sim.reset();
         for joint in &hand.joints {
             let noise = rng::uniform(&mut self.rng, -config.reset_dof_pos_noise, config.reset_dof_pos_noise);
@@ -374,6 +374,7 @@ impl Resumable for Repose {
         state.numbers.extend(self.servos.last());
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
+        state.counters.push(u64::from(self.episode.randomized));
         self.episode.save(state);
         // Always the same number of values.
         state.numbers.extend(self.servos.under_way(self.conditions.most_delay(&self.task)).flatten());
@@ -381,7 +382,15 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        self.conditions.begin(&self.rng, &mut self.sim, &self.task);
+        let [age, held] = state.counters()?;
+        // `age` has no tighter limit: a fork may have shorter episodes.
+        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
+        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
+        (self.age, self.held) = (age as u32, held as u32);
+        // Older versions did not save whether the episode is randomised: the share was constant.
+        let is_saved = state.counters_left() > EpisodeStats::COUNTERS;
+        let [randomized] = if is_saved { state.counters()?.map(|flag| flag as f64) } else { [self.lesson.randomized] };
+        self.conditions.begin(&self.rng, randomized, &mut self.sim, &self.task);
         let fixed = 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS;
         // A fork may have other delays than its parent.
         let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / ACTION_SIZE;
@@ -395,11 +404,6 @@ impl Resumable for Repose {
         let clipped = self.previous_action.iter().all(|action| (-1.0..=1.0).contains(action));
         ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.previous_action);
         let targets = state.numbers()?;
-        let [age, held] = state.counters()?;
-        // `age` has no tighter limit: a fork may have shorter episodes.
-        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
-        (self.age, self.held) = (age as u32, held as u32);
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
         let under_way: Vec<Targets> = (0..under_way).map(|_| state.numbers()).collect::<Result<_>>()?;
         self.servos.restore(targets, &under_way, self.conditions.delay(&self.task));

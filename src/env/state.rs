@@ -67,6 +67,11 @@ impl<'a> SavedEnv<'a> {
         self.numbers.len()
     }
 
+    /// Returns how many counters are left.
+    pub fn counters_left(&self) -> usize {
+        self.counters.len()
+    }
+
     /// Reads all numbers except the last `kept`.
     ///
     /// # Errors

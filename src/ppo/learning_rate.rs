@@ -84,7 +84,7 @@ mod tests {
 
     #[test]
     fn the_desired_divergence_follows_its_ramp_by_equal_factors() {
-        let mut of = adapting_to(Ramp { from: 0.016, to: 0.004, steps: 1000 });
+        let mut of = adapting_to(Ramp { from: 0.016, to: 0.004, steps: 1000, after: 0 });
         // Control steps of the run, and the divergence there above which the rate falls.
         for (env_steps, most) in [(0, 0.032), (500, 0.016), (1000, 0.008), (5000, 0.008)] {
             of.follow_ramp(env_steps);

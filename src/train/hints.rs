@@ -22,8 +22,8 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         ("ppo.std", ppo.std),
         ("ppo.desired_kl", ppo.desired_kl),
     ];
-    let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.steps > total).collect();
-    if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.steps).max() {
+    let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.end() > total).collect();
+    if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.end()).max() {
         let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
         hints.push(format!(
             "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
@@ -49,10 +49,10 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         }
     }
     let models = scene.saturating_mul(config.env.num_envs);
-    if config.randomization.share > 0.0 && models > MUCH {
+    if config.randomization.happens() && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
-            "[randomization]: each of {} hands gets its own model of this scene: {gib:.1} GiB in all",
+            "[randomization]: each of {} hands gets its own model of this scene: {gib:.1} GiB in all; none with randomization.share=0",
             config.env.num_envs
         ));
     }
@@ -69,13 +69,13 @@ mod tests {
     fn of(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
         let default = Config::resolve(None, &[]).unwrap();
-        hints(&Config::resolve(None, &sets).unwrap(), &default, 1 << 23)
+        hints(&Config::resolve(None, &sets).unwrap(), &default, 1 << 20)
     }
 
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
-        let [line] = &of(&["run.total_steps=20000000"])[..] else { panic!("one line") };
-        assert!(line.contains("training.tolerance, training.hold, ppo.std, which last up to 25000000 steps"), "{line}");
+        let [line] = &of(&["run.total_steps=18000000"])[..] else { panic!("one line") };
+        assert!(line.contains("training.tolerance, training.hold, ppo.std, which last up to 20000000 steps"), "{line}");
         assert!(!line.contains("task_reward"), "its ramp ends in time: {line}");
         let [line] = &of(&["ppo.minibatches=32"])[..] else { panic!("one line") };
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
@@ -85,8 +85,9 @@ mod tests {
             "{line}"
         );
         assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
-        let [line] = &of(&["randomization.share=0.5"])[..] else { panic!("one line") };
-        assert!(line.contains("each of 1024 hands gets its own model of this scene: 8.0 GiB"), "{line}");
+        let [line] = &of(&["env.num_envs=8192"])[..] else { panic!("one line") };
+        assert!(line.contains("each of 8192 hands gets its own model of this scene: 8.0 GiB in all"), "{line}");
+        assert!(of(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
     }
 
     #[test]

@@ -259,7 +259,7 @@ impl Session {
 
     fn report(&mut self, report: &mut Report, made: &Made) {
         let Made { iteration, ended, recent, evaluation, traffic, figures } = made;
-        let ended = Ended::of(ended, randomizes(&self.config));
+        let ended = Ended::of(ended, self.config.randomization.happens());
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
         let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
@@ -301,13 +301,8 @@ fn evaluates(iteration: u64, every: u64) -> bool {
     iteration.is_multiple_of(every) || iteration == EARLY && every > EARLY
 }
 
-/// Returns whether a training has randomised episodes.
-fn randomizes(config: &Config) -> bool {
-    config.randomization.share > 0.0
-}
-
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
-    let tags = tags(Lesson::task(&session.config.env), randomizes(&session.config));
+    let tags = tags(Lesson::task(&session.config.env), session.config.randomization.happens());
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
     Report::new(saver.folder().path(), &tags, progress).described(described(&tags), session.config.to_text())
 }

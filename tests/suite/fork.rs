@@ -79,7 +79,7 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
     for set in [
         "horizon = { from = 4.0,",
         "gamma = 0.9\n",
-        "tolerance = { from = 0.4, to = 0.2, steps = 25000000 }",
+        "tolerance = { from = 0.4, to = 0.2, steps = 20000000 }",
         "seed = 7",
     ] {
         assert!(own.contains(set) && !parent.contains(set), "{own}");

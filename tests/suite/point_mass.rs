@@ -145,7 +145,7 @@ fn ppo_learns_in_bf16_where_the_processor_has_it() {
 
 #[test]
 fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
-    let std = Ramp { from: 0.5, to: 0.125, steps: 100 };
+    let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
     let settings = PpoConfig { std, ..settings() };
     let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).unwrap();
     assert!(ppo.policy().std().iter().all(|std| (std - 0.5).abs() < 1e-6));

@@ -8,7 +8,9 @@ use std::sync::atomic::AtomicBool;
 
 use serde_json::Value;
 use shadow_repose::config::Config;
-use shadow_repose::env::{Draw, Env, EnvState, OBSERVATION_SIZE, Randomization, Repose, Resumable, Score, Task};
+use shadow_repose::env::{
+    Draw, Env, EnvState, Lesson, OBSERVATION_SIZE, Randomization, Repose, Resumable, Score, Task,
+};
 use shadow_repose::evaluate::{Actor, Episodes, evaluate};
 use shadow_repose::load::Loaded;
 use shadow_repose::rng;
@@ -183,9 +185,12 @@ fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<Draw>) {
     config = config.changed(None, &sets).unwrap();
     let task = task(&[]);
     let randomization = Randomization::new(&task, &config.randomization).unwrap();
-    let env = Repose::randomized(&task, randomization.as_ref());
+    let mut env = Repose::randomized(&task, randomization.as_ref());
+    let lesson = Lesson::at(0, &config);
+    env.set_lesson(lesson);
     let draw = move |episode| {
-        randomization.as_ref().and_then(|randomization| randomization.draw(&rng::stream(0, "episode", episode)))
+        let rng = rng::stream(0, "episode", episode);
+        randomization.as_ref().and_then(|randomization| randomization.draw(&rng, lesson.randomized))
     };
     (env, draw)
 }
@@ -283,6 +288,45 @@ fn a_saved_environment_goes_on_with_its_draw_its_noise_and_the_actions_under_way
 }
 
 #[test]
+fn a_state_of_a_version_that_saved_no_draws_follows_from_the_share() {
+    let (mut env, _) = randomized(&[]);
+    played(&mut env, 3);
+    let mut state = EnvState::default();
+    env.save(&mut state);
+    // The counters end with five of the episode; the one before them says whether it is randomised.
+    let place = state.counters.len() - 6;
+    assert_eq!(state.counters.remove(place), 1);
+    let (mut other, _) = randomized(&[]);
+    let mut observation = vec![0.0; OBSERVATION_SIZE];
+    other.restore(&mut state.rows(1).unwrap().next().unwrap(), &mut observation).unwrap();
+    assert_eq!((other.draw(), other.draw().is_some()), (env.draw(), true));
+}
+
+#[test]
+fn randomised_episodes_begin_with_their_ramp_and_those_under_way_stay_what_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("all.toml"), ALL).unwrap();
+    let trained = |run: &str, steps: &str| {
+        let share = "randomization.share={from=0,to=1,steps=0,after=1280}";
+        let args = ["--config", "all.toml", "--run-dir", run, "--set", "env.max_episode_seconds=0.4", "--set", share];
+        succeeded(program(folder, &train(&[&args[..], &["--total-steps", steps]].concat())));
+    };
+    let latest = |run: &str| weights(folder.join(run).join("checkpoints/latest.safetensors"));
+    trained("whole", "5120");
+    let table = metrics(&folder.join("whole"));
+    let column = |name: &str| table[0].iter().position(|of| of == name).unwrap();
+    let (steps, length) = (column("env_steps"), column("randomized/length"));
+    let ends = |row: &&Vec<String>| !row[length].is_empty() && row[length] != "NaN";
+    let first = table[1..].iter().find(ends).expect("randomised episodes end")[steps].parse::<u64>().unwrap();
+    assert!((1281..5120).contains(&first), "they begin after 1280 steps: the first one ended at {first}");
+    // The hands are in the middle of episodes that began before the ramp.
+    trained("part", "1408");
+    succeeded(program(folder, &["train", "--resume", "part", "--total-steps", "5120"]));
+    assert!(latest("whole") == latest("part"));
+}
+
+#[test]
 fn a_randomised_training_has_the_same_bits_when_resumed_and_on_any_number_of_threads() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
@@ -301,7 +345,8 @@ fn a_randomised_training_has_the_same_bits_when_resumed_and_on_any_number_of_thr
         |run: &str| metrics(&folder.join(run))[0].iter().filter(|name| name.starts_with("randomized/")).count();
     assert_eq!(columns("one"), 7);
     // A fork of a training without any of this, with delays that its environments did not have.
-    succeeded(program(folder, &train(&["--total-steps", "1280", "--run-dir", "plain"])));
+    let plain = ["--total-steps", "1280", "--run-dir", "plain", "--set", "randomization.share=0"];
+    succeeded(program(folder, &train(&plain)));
     let fork = ["train", "--fork", "plain/checkpoints/latest.safetensors", "--config", "all.toml", "--run-dir", "fork"];
     succeeded(program(folder, &[&fork[..], &["--total-steps", "2560"]].concat()));
     assert_eq!((columns("plain"), columns("fork")), (0, 7));
@@ -456,7 +501,17 @@ fn an_interrupted_robustness_table_has_the_rows_so_far() {
 }
 
 #[test]
-fn the_defaults_vary_nothing() {
-    let config = config(&[]);
-    assert!(Randomization::new(&task(&[]), &config.randomization).unwrap().is_none());
+fn the_default_varies_nothing_before_its_ramp_begins() {
+    let at = |env_steps| Lesson::at(env_steps, &config(&[])).randomized;
+    assert_eq!([0, 40_000_000, 60_000_000, 300_000_000].map(at), [0.0, 0.0, 0.5, 0.5]);
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    for (run, share) in [("default", &[][..]), ("none", &["--set", "randomization.share=0"])] {
+        let args =
+            [&["--total-steps", "1280", "--run-dir", run, "--set", "env.max_episode_seconds=0.4"], share].concat();
+        succeeded(program(folder, &train(&args)));
+    }
+    let [default, none] =
+        ["default", "none"].map(|run| weights(folder.join(run).join("checkpoints/latest.safetensors")));
+    assert!(default == none, "the first steps of both are the same bits");
 }

@@ -151,8 +151,8 @@ fn hands_that_are_dealt_to_ranks_learn_the_same_bits() {
     let task = Task::new(&config.env).unwrap();
     let work = |ranks: usize| {
         on_ranks(ranks, 8, |_, division| {
-            let (envs, training) = ((0..16 / ranks).map(|_| Repose::new(&task)).collect(), config.training.clone());
-            let lessons = move |env_steps| Lesson::at(env_steps, &training);
+            let (envs, of_run) = ((0..16 / ranks).map(|_| Repose::new(&task)).collect(), config.clone());
+            let lessons = move |env_steps| Lesson::at(env_steps, &of_run);
             learnt(&mut Agent::new(envs, &config.ppo, 3, division, lessons).unwrap(), 3)
         })
     };

@@ -21,7 +21,7 @@ fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
     let mut all: Vec<&str> = task.iter().map(String::as_str).collect();
     all.extend(["training.goal_lifetime=0"]);
     all.extend(settings);
-    Lesson::at(env_steps, &config(&all).training)
+    Lesson::at(env_steps, &config(&all))
 }
 
 fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
