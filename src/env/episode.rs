@@ -22,7 +22,7 @@ pub struct EpisodeStats {
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// Whether it was randomised. [`Self::save`] leaves this to the caller.
+    /// Whether it was randomised. Who saves the episode saves this.
     pub randomized: bool,
 }
 
