@@ -29,7 +29,7 @@ const SCORES: [(&str, &str, &str); 7] = [
 ];
 
 /// All other quantities: name, title, description.
-const OTHERS: [(&str, &str, &str); 34] = [
+const OTHERS: [(&str, &str, &str); 35] = [
     ("reward/rotation", "reward: rotation", "The task's reward for a small rotation error, mean per step."),
     (
         "reward/distance",
@@ -50,6 +50,7 @@ const OTHERS: [(&str, &str, &str); 34] = [
     ("training/hold", "hold in training (steps)", "The steps within the tolerance that reach a goal in training."),
     ("training/task_reward", "weight of the task's reward", "The weight of the task's reward in training."),
     ("training/drop_reward", "reward of a drop", "What training adds to the reward of a step that drops the cube."),
+    ("training/randomized", "share of episodes", "Probability that an episode that begins is randomised."),
     ("loss/policy", "policy loss", "The clipped surrogate, negated, mean over the minibatches."),
     ("loss/value", "value loss", "The squared error of the values, mean over the minibatches."),
     ("policy/entropy", "entropy (nats)", "Entropy of the action distribution."),

@@ -261,7 +261,7 @@ mod tests {
         assert_eq!(varied(&source), ["share", "each", "friction", "cube_mass", "cube_com", "push_steps"]);
         let share = |config: &Config| (config.randomization.share, config.randomization.each);
         assert_eq!([share(&all), share(&source)], [(Ramp::constant(1.0), 1.0); 2]);
-        assert!(!published.randomization.happens());
+        assert!(!published.randomization.happens() && !going_on.randomization.happens());
     }
 
     #[test]

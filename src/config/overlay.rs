@@ -81,6 +81,16 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 };
                 overlay(target, inner, &zeros, &format!("{name}."), problems);
             }
+            // A whole ramp that does not say when it begins does so at once, whatever the base says. So it is written, too.
+            (Some(of), Value::Table(whole))
+                if is_ramp(of)
+                    && !whole.contains_key(AFTER)
+                    && ["from", "to", "steps"].iter().all(|part| whole.contains_key(*part)) =>
+            {
+                let mut whole = whole.clone();
+                whole.insert(AFTER.to_owned(), Value::Integer(0));
+                overlay(merged, &Table::from_iter([(key.clone(), whole.into())]), base, prefix, problems);
+            }
             (Some(of), Value::Table(inner)) if let Value::Table(expected) = with_all_parts(of).as_ref() => {
                 let Some(Value::Table(target)) = merged.get_mut(key) else {
                     unreachable!("the merged tables are those of the base")
@@ -136,7 +146,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::String(_), _) => Err("a string".into()),
         (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Array(_), _) => Err(format!("an array, e.g. {expected}")),
-        (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = … }".into()),
+        (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = …, after = … }".into()),
         (Value::Table(table), _) if table.is_empty() => {
             Err("a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }".into())
         }

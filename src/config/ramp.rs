@@ -5,7 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 /// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. It
-/// may begin later than with the first step. A plain number in the settings is a constant.
+/// may begin after the first step. A plain number in the settings is a constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ramp {
@@ -69,6 +69,9 @@ impl fmt::Display for Ramp {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use super::super::Config;
     use super::*;
 
     #[test]
@@ -97,5 +100,18 @@ mod tests {
         assert_eq!([ramp.by_equal_steps(0), ramp.by_equal_factors(0), ramp.by_equal_steps(5)], [0.1; 3]);
         assert_eq!([0, 7].map(|steps| Ramp::constant(0.07).by_equal_factors(steps)), [0.07; 2]);
         assert_eq!(Ramp::constant(-0.3).by_equal_steps(3), -0.3);
+    }
+
+    #[test]
+    fn a_ramp_without_a_later_beginning_survives_being_written_and_read_where_the_default_has_one() {
+        for given in ["0", "0.7", "{from=0,to=0.5,steps=20_000_000}", "{from=0.2,to=0.5,steps=0,after=7}"] {
+            let config = Config::resolve(None, &[format!("randomization.share={given}").parse().unwrap()]).unwrap();
+            let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]).unwrap();
+            let forked = config.changed(None, &["ppo.gamma=0.9".parse().unwrap()]).unwrap();
+            let shares = [&config, &again, &forked].map(|config| config.randomization.share);
+            assert_eq!(shares, [shares[0]; 3], "{given}");
+            assert_eq!(again.randomization.happens(), given != "0");
+            assert_eq!(shares[0].after, if given.contains("after") { 7 } else { 0 }, "{given}");
+        }
     }
 }

@@ -306,7 +306,7 @@ impl PpoConfig {
 impl RandomizationConfig {
     /// Returns whether a training has randomised episodes, at its beginning or later.
     pub fn happens(&self) -> bool {
-        self.share != Ramp::constant(0.0)
+        self.share.from > 0.0 || self.share.to > 0.0
     }
 }
 

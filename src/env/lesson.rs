@@ -73,10 +73,10 @@ impl Lesson {
     }
 
     /// Returns the values that change during training, by name.
-    pub fn named(&self) -> [(&'static str, f64); 4] {
-        let Self { tolerance, hold, task_reward, drop_reward, .. } = *self;
-        let hold = f64::from(hold);
-        [("tolerance", tolerance), ("hold", hold), ("task_reward", task_reward), ("drop_reward", drop_reward)]
+    pub fn named(&self) -> [(&'static str, f64); 5] {
+        let Self { tolerance, hold, task_reward, drop_reward, randomized, .. } = *self;
+        let rewards = [("task_reward", task_reward), ("drop_reward", drop_reward)];
+        [("tolerance", tolerance), ("hold", f64::from(hold)), rewards[0], rewards[1], ("randomized", randomized)]
     }
 
     /// Returns the shaping of a step that turned the cube `progress` rad towards the goal.

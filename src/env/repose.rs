@@ -387,9 +387,15 @@ impl Resumable for Repose {
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
         ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
-        // Older versions did not save whether the episode is randomised: the share was constant.
+        // Older versions did not save whether the episode is randomised. The share was constant; a fork may have another one.
         let is_saved = state.counters_left() > EpisodeStats::COUNTERS;
-        let [randomized] = if is_saved { state.counters()?.map(|flag| flag as f64) } else { [self.lesson.randomized] };
+        let randomized = if is_saved {
+            let [flag] = state.counters()?;
+            ensure!(flag <= 1, "an episode is randomised or not, but the state says {flag}");
+            flag as f64
+        } else {
+            self.lesson.randomized
+        };
         self.conditions.begin(&self.rng, randomized, &mut self.sim, &self.task);
         let fixed = 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS;
         // A fork may have other delays than its parent.

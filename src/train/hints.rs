@@ -49,11 +49,17 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         }
     }
     let models = scene.saturating_mul(config.env.num_envs);
-    if config.randomization.happens() && models > MUCH {
+    let share = config.randomization.share;
+    let randomizes = [0, total].into_iter().any(|steps| share.by_equal_steps(steps) > 0.0);
+    if config.randomization.happens() && !randomizes && share != default.randomization.share {
+        hints.push(format!("randomization.share = {share}: nothing is randomised in {total} steps"));
+    }
+    if randomizes && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
-            "[randomization]: each of {} hands gets its own model of this scene: {gib:.1} GiB in all; none with randomization.share=0",
-            config.env.num_envs
+            "[randomization]: each of {} hands gets its own model of this scene, from {} steps on: {gib:.1} GiB in all; none with \
+             randomization.share=0",
+            config.env.num_envs, share.after
         ));
     }
     hints
@@ -86,8 +92,14 @@ mod tests {
         );
         assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
         let [line] = &of(&["env.num_envs=8192"])[..] else { panic!("one line") };
-        assert!(line.contains("each of 8192 hands gets its own model of this scene: 8.0 GiB in all"), "{line}");
+        assert!(
+            line.contains("each of 8192 hands gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
+            "{line}"
+        );
         assert!(of(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
+        assert!(of(&["env.num_envs=8192", "run.total_steps=30_000_000"]).is_empty(), "it ends before");
+        let [line] = &of(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
+        assert!(line.ends_with("nothing is randomised in 100000000 steps"), "{line}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::sync::atomic::AtomicBool;
 
 use serde_json::Value;
-use shadow_repose::config::Config;
+use shadow_repose::config::{Config, Ramp};
 use shadow_repose::env::{
     Draw, Env, EnvState, Lesson, OBSERVATION_SIZE, Randomization, Repose, Resumable, Score, Task,
 };
@@ -514,4 +514,12 @@ fn the_default_varies_nothing_before_its_ramp_begins() {
     let [default, none] =
         ["default", "none"].map(|run| weights(folder.join(run).join("checkpoints/latest.safetensors")));
     assert!(default == none, "the first steps of both are the same bits");
+    // It has no such episodes after a resume and in a fork, either.
+    succeeded(program(folder, &["train", "--resume", "none", "--total-steps", "2560"]));
+    succeeded(program(folder, &["train", "--fork", "none", "--total-steps", "3840", "--run-dir", "fork"]));
+    for run in ["none", "fork"] {
+        let share = config_of(&folder.join(run)).randomization.share;
+        assert!(share == Ramp::constant(0.0), "{run}: {share}");
+        assert!(!metrics(&folder.join(run))[0].iter().any(|name| name.starts_with("randomized/")), "{run}");
+    }
 }
