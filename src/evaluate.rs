@@ -18,6 +18,7 @@ use crate::ppo::{FrozenPolicy, Workspace};
 use crate::ranks::Division;
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
+use crate::sim::stepping;
 
 /// The number of episodes that run together.
 const LANES: usize = 64;
@@ -141,7 +142,7 @@ fn play(
         let first = first + own.start;
         let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start);
         let starting = lanes[..started].par_iter_mut().zip(rows).enumerate();
-        starting.for_each(|(i, (lane, row))| lane.start(episodes, first + i, row));
+        starting.for_each(|(i, (lane, row))| stepping("episode", first + i, || lane.start(episodes, first + i, row)));
         let mut ends: Vec<Option<End>> = vec![None; lanes.len()];
         let rows = observations.chunks_exact(OBSERVATION_SIZE).skip(own.start);
         for (i, observation) in rows.take(started).enumerate() {
@@ -161,7 +162,8 @@ fn play(
                 .filter(|(_, (((lane, _), _), _))| lane.running)
                 .try_for_each(|(i, (((lane, action), row), end))| {
                     // Unwind safe: a state that a panic left inconsistent is not used again.
-                    let stepped = catch_unwind(AssertUnwindSafe(|| *end = lane.env.step(action, row).end));
+                    let step = || catch_unwind(AssertUnwindSafe(|| *end = lane.env.step(action, row).end));
+                    let stepped = stepping("episode", first + i, step);
                     stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
                 })?;
             for (i, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.running) {

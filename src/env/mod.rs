@@ -21,7 +21,7 @@ pub use episode::{EpisodeStats, Recent, Score, divergence};
 pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::{Lesson, Shaping};
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
-pub use pool::{EnvBlock, EnvPool, StepBuffers, stepping};
+pub use pool::{EnvBlock, EnvPool, StepBuffers};
 pub use randomization::{Draw, Randomization};
 pub use repose::{Diverged, Repose, StepDetails};
 pub use reward::RewardTerms;

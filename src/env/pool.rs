@@ -3,7 +3,6 @@
 //! Environment i reads and writes its own row of each array and owns everything else that it needs. The randomness of an
 //! episode depends on its number alone. The results therefore do not depend on which thread steps which block, or when.
 
-use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -13,6 +12,7 @@ use super::{End, Env, EnvState, Resumable, Transition};
 use crate::ranks::Division;
 use crate::rng;
 use crate::schedule::{block_sizes, panic_message};
+use crate::sim::stepping;
 use crate::spaces::Spaces;
 
 /// N environments that start their next episode automatically.
@@ -101,9 +101,9 @@ impl<E: Env> EnvPool<E> {
             (block.first as u64..).zip(&mut block.slots).for_each(|(episode, slot)| slot.next_episode = episode);
         }
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
-            for (slot, row) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)) {
+            for (i, (slot, row)) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)).enumerate() {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
-                slot.start(block.seed, block.stride, row);
+                stepping("environment", block.first + i, || slot.start(block.seed, block.stride, row));
                 slot.env.skip_ahead(age);
             }
         });
@@ -170,7 +170,7 @@ impl<E: Resumable> EnvPool<E> {
                 slot.env.restore(&mut state, row)?;
                 state.finish()
             };
-            restore().with_context(|| format!("environment {}", first + i))?;
+            stepping("environment", first + i, restore).with_context(|| format!("environment {}", first + i))?;
         }
         self.blocks.iter_mut().for_each(|block| block.finished.clear());
         Ok(())
@@ -203,7 +203,6 @@ impl<E: Env> EnvBlock<E> {
         let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
         for (i, ((slot, action), ((reward, end), (row, final_row)))) in slots.zip(results).enumerate() {
-            STEPPING.set(Some(self.first + i));
             let step = || {
                 let transition: Transition = slot.env.step(action, row);
                 (*reward, *end) = (transition.reward, transition.end);
@@ -220,22 +219,13 @@ impl<E: Env> EnvBlock<E> {
                 }
             };
             // Unwind safe: a state that a panic left inconsistent is not used again.
-            if let Err(panic) = catch_unwind(AssertUnwindSafe(step)) {
-                bail!("environment {} panicked: {}", self.first + i, panic_message(&*panic));
+            let number = self.first + i;
+            if let Err(panic) = stepping("environment", number, || catch_unwind(AssertUnwindSafe(step))) {
+                bail!("environment {number} panicked: {}", panic_message(&*panic));
             }
         }
-        STEPPING.set(None);
         Ok(())
     }
-}
-
-thread_local! {
-    static STEPPING: Cell<Option<usize>> = const { Cell::new(None) };
-}
-
-/// Returns the number of the environment that this thread is stepping, if any, for reporting fatal errors.
-pub fn stepping() -> Option<usize> {
-    STEPPING.get()
 }
 
 impl<E: Env> Slot<E> {

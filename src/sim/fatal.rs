@@ -3,6 +3,7 @@
 
 #![expect(unsafe_code, reason = "MuJoCo takes a C function")]
 
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, Once};
 
@@ -12,7 +13,20 @@ type Rescue = Box<dyn FnOnce(&str) + Send>;
 
 static RESCUE: Mutex<Option<Rescue>> = Mutex::new(None);
 
-/// Registers `rescue` to be called with MuJoCo's message, on the thread that failed, before MuJoCo ends the process. It
+thread_local! {
+    static STEPPED: Cell<Option<(&'static str, usize)>> = const { Cell::new(None) };
+}
+
+/// Does the `work` of stepping or resetting one of many simulations, "environment 12" or "episode 3". A fatal error during it
+/// is reported with this name.
+pub fn stepping<T>(kind: &'static str, number: usize, work: impl FnOnce() -> T) -> T {
+    STEPPED.set(Some((kind, number)));
+    let done = work();
+    STEPPED.set(None);
+    done
+}
+
+/// Registers `rescue` to be called with a message, on the thread that failed, before MuJoCo ends the process. It
 /// replaces any function registered before. Other threads keep running meanwhile; if MuJoCo fails on one of them too, that
 /// thread waits until `rescue` has returned.
 pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
@@ -34,13 +48,14 @@ fn report_fatal(message: &MjLogMessage) {
     if message.level() != MjtLogLevel::mjLOG_ERROR {
         return;
     }
-    let said = message.subject().to_string();
+    let whose = STEPPED.get().map_or(String::new(), |(kind, number)| format!("{kind} {number}: "));
+    let said = format!("{whose}MuJoCo cannot continue: {}", message.subject());
     let mut rescue = RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     // A panic must not unwind through MuJoCo's frames.
     let _ = catch_unwind(AssertUnwindSafe(|| match rescue.take() {
         Some(rescue) => rescue(&said),
         None => {
-            let text = format!("error: MuJoCo cannot continue: {said}\n");
+            let text = format!("error: {said}\n");
             let _ = std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes());
         }
     }));

@@ -20,7 +20,7 @@ mod variation;
 mod viewer;
 
 pub use compilation::{Compilation, Cone};
-pub use fatal::before_fatal_error;
+pub use fatal::{before_fatal_error, stepping};
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};

@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::load;
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{self, Locked, Report, RunFolder};
-use crate::{env, sim};
+use crate::sim;
 
 /// The state that a training begins with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -187,8 +187,7 @@ impl Saver {
         let best = self.best.clone().filter(|_| !self.best_is_saved);
         let options = self.options.clone();
         sim::before_fatal_error(move |said| {
-            let whose = env::stepping().map_or(String::new(), |number| format!("environment {number}: "));
-            run::say(&format!("error: {whose}MuJoCo cannot continue: {said}"));
+            run::say(&format!("error: {said}"));
             let replaced = || anyhow!("{} has been replaced", folder.path().display());
             let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
             if !begun {

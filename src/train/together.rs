@@ -29,7 +29,7 @@ pub(super) struct Next {
 
 /// Trains as a rank that computes, and leaves reporting and saving to the first.
 pub(super) fn follow(requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result<ExitCode> {
-    sim::before_fatal_error(|said| run::say(&format!("error: MuJoCo cannot continue: {said}")));
+    sim::before_fatal_error(|said| run::say(&format!("error: {said}")));
     let mut session = Session::follow(ranks)?;
     requests.wait_for_end();
     // The state that the first rank's saver begins with.

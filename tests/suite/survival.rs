@@ -344,6 +344,18 @@ fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
 }
 
 #[test]
+fn a_fatal_error_of_mujoco_in_an_evaluation_names_the_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("small.xml"), SCENE.replace("memory=\"2M\"", "memory=\"80K\"")).unwrap();
+    let args = ["play", "--policy", "random", "--episodes", "64", "--set", "env.model=small.xml"];
+    let output = program(folder.path(), &args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    let (_, error) = said.split_once("error: episode ").expect(&said);
+    assert!(error.contains(": MuJoCo cannot continue: "), "{said}");
+}
+
+#[test]
 fn a_fatal_error_of_mujoco_names_the_environment_and_the_iteration_before_is_saved() {
     let folder = tempfile::tempdir().unwrap();
     // Enough memory for the first contacts, but not for all later ones.
@@ -354,7 +366,8 @@ fn a_fatal_error_of_mujoco_names_the_environment_and_the_iteration_before_is_sav
     let output = program(folder.path(), &args);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("error: environment ") && said.contains("MuJoCo cannot continue"), "{said}");
+    let named = ["error: environment ", "error: episode "].iter().any(|start| said.contains(start));
+    assert!(named && said.contains("MuJoCo cannot continue"), "{said}");
     assert!(said.contains("saved the state after") && said.contains("train --resume run --set env.model="), "{said}");
     let made = iterations(folder.path());
     assert!(made > 0 && said.contains(&format!("after {made} iterations")), "{made}: {said}");
