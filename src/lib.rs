@@ -25,7 +25,7 @@
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate |
 //! | [`pace`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks |
-//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, rng, schedule |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, rng, schedule, sim |
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
 //! | [`load`] | checkpoints and policies from untrusted files | config, env, ppo, run |
 //! | [`dump`] | the steps that led to a diverged state, as JSON | config, env |
