@@ -29,7 +29,7 @@ const SCORES: [(&str, &str, &str); 7] = [
 ];
 
 /// All other quantities: name, title, description.
-const OTHERS: [(&str, &str, &str); 35] = [
+const OTHERS: [(&str, &str, &str); 36] = [
     ("reward/rotation", "reward: rotation", "The task's reward for a small rotation error, mean per step."),
     (
         "reward/distance",
@@ -43,6 +43,11 @@ const OTHERS: [(&str, &str, &str); 35] = [
         "training/progress",
         "training reward: progress",
         "What training pays for turning towards the goal, mean per step.",
+    ),
+    (
+        "training/approach",
+        "training reward: approach",
+        "What training pays for coming nearer to the goal by a factor, mean per step.",
     ),
     ("training/within", "training reward: within", "What training pays within the tolerance, mean per step."),
     ("training/drop", "training reward: drop", "What a drop costs in training, mean per step."),

@@ -15,8 +15,8 @@ use crate::run;
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
 
-/// Values of settings that older policy files lack; they may differ from today's defaults.
-const BEFORE: &str = "[ppo]\nsymmetry = \"none\"";
+/// Values of settings that older policies and runs lack; they may differ from today's defaults.
+const BEFORE: &str = "[training]\napproach_reward = 0.0\n[ppo]\nsymmetry = \"none\"";
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -82,12 +82,14 @@ impl Config {
         layered(user.map(|source| source.path.as_path()), &tables, overrides)
     }
 
-    /// Parses a complete configuration that a run has written, overlaid with `overrides`.
+    /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
+    /// the values that change nothing.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
-        Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
+        let table = Source { path: path.into(), text: text.into() }.table()?;
+        layered(Some(path), &[before(), table], overrides)
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
@@ -153,10 +155,13 @@ impl PolicyConfig {
         if let Some(Value::Table(ppo)) = table.get_mut("ppo") {
             ppo.retain(|key, _| OF_NETS.contains(&key));
         }
-        let before = BEFORE.parse().expect("the built-in configuration is TOML");
-        let Config { env, ppo, .. } = layered(Some(path), &[before, table], overrides)?;
+        let Config { env, ppo, .. } = layered(Some(path), &[before(), table], overrides)?;
         Ok(Self { env, net: ppo.net() })
     }
+}
+
+fn before() -> Table {
+    BEFORE.parse().expect("the built-in configuration is TOML")
 }
 
 /// Reads the user's configuration file, if one was given.
@@ -229,39 +234,25 @@ mod tests {
         assert_eq!(config, again);
     }
 
-    #[test]
-    fn a_file_may_set_part_of_a_ramp() {
-        let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
-        let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
-        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
+    fn file(text: &str) -> Source {
+        Source { path: "x.toml".into(), text: text.into() }
     }
 
     #[test]
-    fn the_other_files_that_come_with_the_program_say_what_differs() {
-        let published = include_str!("../../configs/isaac-lab.toml");
-        let going_on = include_str!("../../configs/repose-continue.toml");
-        let [published, going_on] =
-            [published, going_on].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
-        let EnvConfig { reach_goal_bonus, max_consecutive_successes, .. } = published.env;
-        assert_eq!((published.env.max_episode_steps(), published.env.substeps()), (600, 2));
-        assert_eq!((reach_goal_bonus, max_consecutive_successes), (250.0, 1));
-        assert_eq!((published.training.task_reward, published.training.hold_reward), (Ramp::constant(1.0), 0.0));
-        assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
-        assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
-        assert_eq!(going_on.training.goal_lifetime, 300);
-        let all = include_str!("../../configs/randomization-all.toml");
-        let source = include_str!("../../configs/randomization-source.toml");
-        let [all, source] = [all, source].map(|text| Config::from_text(Path::new("x.toml"), text, &[]).unwrap());
-        let varied = |config: &Config| -> Vec<String> {
-            let nothing = |value: &Value| ["0.0", "[1.0, 1.0]", "[0, 0]", "{}"].contains(&value.to_string().trim());
-            let keys = Table::try_from(&config.randomization).unwrap();
-            keys.into_iter().filter(|(_, value)| !nothing(value)).map(|(key, _)| key).collect()
-        };
-        assert_eq!(varied(&all).len(), 16, "everything is on");
-        assert_eq!(varied(&source), ["share", "each", "friction", "cube_mass", "cube_com", "push_steps"]);
-        let share = |config: &Config| (config.randomization.share, config.randomization.each);
-        assert_eq!([share(&all), share(&source)], [(Ramp::constant(1.0), 1.0); 2]);
-        assert!(!published.randomization.happens() && !going_on.randomization.happens());
+    fn a_run_that_is_older_than_a_setting_goes_on_as_if_it_did_not_exist() {
+        let text = Config::resolve(None, &[]).unwrap().to_text();
+        let older: String =
+            text.lines().filter(|line| !line.contains("approach_reward")).map(|line| format!("{line}\n")).collect();
+        let rewards = [&text, &older]
+            .map(|text| Config::from_text(Path::new("config.toml"), text, &[]).unwrap().training.approach_reward);
+        assert_eq!(rewards, [60.0, 0.0]);
+    }
+
+    #[test]
+    fn a_file_may_set_part_of_a_ramp() {
+        let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
+        let config = Config::resolve(Some(&file(text)), &[]).unwrap();
+        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
     }
 
     #[test]
@@ -295,7 +286,6 @@ mod tests {
 
     #[test]
     fn a_table_by_group_is_set_whole_or_one_group_at_a_time() {
-        let file = |text: &str| Source { path: "x.toml".into(), text: text.into() };
         let noise = |text: &str, sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
             let noise = Config::resolve(Some(&file(text)), &sets).unwrap().env.noise;

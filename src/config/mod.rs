@@ -5,6 +5,7 @@
 //! that uses a setting.
 //!
 //! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
+//! If its default changes what is learnt, `layers` also says what it is for the runs that lack it.
 
 mod layers;
 mod overlay;
@@ -24,3 +25,39 @@ pub use settings::{
     RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig, VARIED,
 };
 pub use used::expect_used;
+
+#[cfg(test)]
+mod tests {
+    use toml::{Table, Value};
+
+    use super::*;
+
+    fn shipped(text: &str) -> Config {
+        Config::resolve(Some(&Source { path: "x.toml".into(), text: text.into() }), &[]).unwrap()
+    }
+
+    #[test]
+    fn the_other_files_that_come_with_the_program_say_what_differs() {
+        let published = shipped(include_str!("../../configs/isaac-lab.toml"));
+        let going_on = shipped(include_str!("../../configs/repose-continue.toml"));
+        let EnvConfig { reach_goal_bonus, max_consecutive_successes, .. } = published.env;
+        assert_eq!((published.env.max_episode_steps(), published.env.substeps()), (600, 2));
+        assert_eq!((reach_goal_bonus, max_consecutive_successes), (250.0, 1));
+        assert_eq!((published.training.task_reward, published.training.hold_reward), (Ramp::constant(1.0), 0.0));
+        assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
+        assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
+        assert_eq!(going_on.training.goal_lifetime, 300);
+        let all = shipped(include_str!("../../configs/randomization-all.toml"));
+        let source = shipped(include_str!("../../configs/randomization-source.toml"));
+        let varied = |config: &Config| -> Vec<String> {
+            let nothing = |value: &Value| ["0.0", "[1.0, 1.0]", "[0, 0]", "{}"].contains(&value.to_string().trim());
+            let keys = Table::try_from(&config.randomization).unwrap();
+            keys.into_iter().filter(|(_, value)| !nothing(value)).map(|(key, _)| key).collect()
+        };
+        assert_eq!(varied(&all).len(), 16, "everything is on");
+        assert_eq!(varied(&source), ["share", "each", "friction", "cube_mass", "cube_com", "push_steps"]);
+        let share = |config: &Config| (config.randomization.share, config.randomization.each);
+        assert_eq!([share(&all), share(&source)], [(Ramp::constant(1.0), 1.0); 2]);
+        assert!(!published.randomization.happens() && !going_on.randomization.happens());
+    }
+}

@@ -121,6 +121,7 @@ pub enum SuccessHold {
 pub struct TrainingConfig {
     pub task_reward: Ramp,
     pub progress_reward: f64,
+    pub approach_reward: f64,
     pub hold_reward: f64,
     pub drop_reward: Ramp,
     pub tolerance: Ramp,

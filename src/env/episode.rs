@@ -96,7 +96,7 @@ impl Recent {
     }
 
     /// Returns the mean of each shaping term over the steps, by name.
-    pub fn shaping_named(&self) -> [(&'static str, f64); 3] {
+    pub fn shaping_named(&self) -> [(&'static str, f64); 4] {
         self.shaping.named().map(|(name, sum)| (name, sum / self.steps as f64))
     }
 }
@@ -115,19 +115,20 @@ impl Recent {
     pub fn total(own: impl Iterator<Item = Self>, division: &Division) -> Self {
         let row = |recent: Self| {
             let RewardTerms { rotation, distance, action, bonus, fall } = recent.reward;
-            let Shaping { progress, within, drop } = recent.shaping;
+            let Shaping { progress, approach, within, drop } = recent.shaping;
             let [steps, diverged] = [recent.steps, recent.diverged].map(|count| count as f64);
-            vec![steps, diverged, rotation, distance, action, bonus, fall, progress, within, drop]
+            vec![steps, diverged, rotation, distance, action, bonus, fall, progress, approach, within, drop]
         };
         let total = division.total(own.map(row));
-        let [steps, diverged, rotation, distance, action, bonus, fall, progress, within, drop] = total[..] else {
+        let [steps, diverged, rotation, distance, action, bonus, fall, progress, approach, within, drop] = total[..]
+        else {
             unreachable!("one sum for each number of a row")
         };
         Self {
             steps: steps as u64,
             diverged: diverged as u64,
             reward: RewardTerms { rotation, distance, action, bonus, fall },
-            shaping: Shaping { progress, within, drop },
+            shaping: Shaping { progress, approach, within, drop },
         }
     }
 }

@@ -4,6 +4,9 @@ use std::ops::AddAssign;
 
 use crate::config::{Config, EnvConfig};
 
+/// Rotation error, rad, below which coming nearer is hardly paid more than in proportion.
+const NEAR: f64 = 0.1;
+
 /// The task as trained at a given step: when a goal is reached, how long goals stay, and what is rewarded.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lesson {
@@ -22,6 +25,8 @@ pub struct Lesson {
     pub task_reward: f64,
     /// Reward per rad by which the rotation error shrinks; negative where the error grows.
     progress_reward: f64,
+    /// Reward for each factor e by which the rotation error plus [`NEAR`] shrinks; negative where it grows.
+    approach_reward: f64,
     /// Reward for every step within the tolerance.
     hold_reward: f64,
     /// Reward for the step in which the cube is dropped.
@@ -33,6 +38,8 @@ pub struct Lesson {
 pub struct Shaping {
     /// The reward for turning towards the goal.
     pub progress: f64,
+    /// The reward for coming nearer to it by a factor.
+    pub approach: f64,
     /// The reward for being within the tolerance.
     pub within: f64,
     /// The reward for dropping the cube.
@@ -50,6 +57,7 @@ impl Lesson {
             randomized: 0.0,
             task_reward: 1.0,
             progress_reward: 0.0,
+            approach_reward: 0.0,
             hold_reward: 0.0,
             drop_reward: 0.0,
         }
@@ -67,6 +75,7 @@ impl Lesson {
             randomized: config.randomization.share.by_equal_steps(env_steps),
             task_reward: training.task_reward.by_equal_steps(env_steps),
             progress_reward: training.progress_reward,
+            approach_reward: training.approach_reward,
             hold_reward: training.hold_reward,
             drop_reward: training.drop_reward.by_equal_steps(env_steps),
         }
@@ -79,10 +88,13 @@ impl Lesson {
         [("tolerance", tolerance), ("hold", f64::from(hold)), rewards[0], rewards[1], ("randomized", randomized)]
     }
 
-    /// Returns the shaping of a step that turned the cube `progress` rad towards the goal.
-    pub(super) fn shaping(&self, progress: f64, within: bool, dropped: bool) -> Shaping {
+    /// Returns the shaping of a step that changed the rotation error from `before` to `after`, rad. What is paid for turning and
+    /// approaching is a difference of potentials, so no way of going back and forth earns anything (Ng, Harada and Russell,
+    /// "Policy invariance under reward transformations", 1999).
+    pub(super) fn shaping(&self, before: f64, after: f64, within: bool, dropped: bool) -> Shaping {
         Shaping {
-            progress: self.progress_reward * progress,
+            progress: self.progress_reward * (before - after),
+            approach: self.approach_reward * ((before + NEAR) / (after + NEAR)).ln(),
             within: if within { self.hold_reward } else { 0.0 },
             drop: if dropped { self.drop_reward } else { 0.0 },
         }
@@ -96,14 +108,16 @@ impl Lesson {
 
 impl Shaping {
     /// Returns the terms by name.
-    pub fn named(&self) -> [(&'static str, f64); 3] {
-        [("progress", self.progress), ("within", self.within), ("drop", self.drop)]
+    pub fn named(&self) -> [(&'static str, f64); 4] {
+        let Self { progress, approach, within, drop } = *self;
+        [("progress", progress), ("approach", approach), ("within", within), ("drop", drop)]
     }
 }
 
 impl AddAssign for Shaping {
     fn add_assign(&mut self, other: Self) {
         self.progress += other.progress;
+        self.approach += other.approach;
         self.within += other.within;
         self.drop += other.drop;
     }
@@ -122,7 +136,7 @@ mod tests {
     #[test]
     fn the_task_itself_pays_its_own_reward_alone() {
         let task = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
-        assert_eq!(task.total(1.25, task.shaping(3.0, true, true)), 1.25);
+        assert_eq!(task.total(1.25, task.shaping(3.0, 0.0, true, true)), 1.25);
         assert_eq!((task.tolerance, task.hold, task.goals_end), (0.1, 50, false));
     }
 
@@ -143,17 +157,29 @@ mod tests {
 
     #[test]
     fn training_pays_for_progress_holding_and_drops_besides_the_weighted_task() {
-        let sets = ["training.task_reward=0.5", "training.progress_reward=10", "training.hold_reward=2"];
+        let sets = ["training.progress_reward=10", "training.approach_reward=0", "training.hold_reward=2"];
+        let sets = [&sets[..], &["training.task_reward=0.5"]].concat();
         let lesson = at(0, &[&sets[..], &["training.drop_reward=-3"]].concat());
-        let shaping = lesson.shaping(-0.2, true, false);
-        assert_eq!(shaping, Shaping { progress: -2.0, within: 2.0, drop: 0.0 });
-        assert_eq!(lesson.total(4.0, shaping), 2.0);
-        assert_eq!(lesson.shaping(0.1, false, true), Shaping { progress: 1.0, within: 0.0, drop: -3.0 });
+        let shaping = lesson.shaping(0.0, 0.25, true, false);
+        assert_eq!(shaping, Shaping { progress: -2.5, approach: 0.0, within: 2.0, drop: 0.0 });
+        assert_eq!(lesson.total(4.0, shaping), 1.5);
+        let dropped = Shaping { progress: 2.5, approach: 0.0, within: 0.0, drop: -3.0 };
+        assert_eq!(lesson.shaping(0.25, 0.0, false, true), dropped);
         let sets = ["training.drop_reward={from=1,to=-3,steps=100}"];
-        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).shaping(0.0, false, true).drop);
+        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).shaping(0.0, 0.0, false, true).drop);
         assert_eq!(drops, [1.0, -1.0, -3.0, -3.0]);
         let sets = ["training.task_reward={from=1,to=0,steps=100}"];
         let weights = [0, 50, 100, 500].map(|steps| at(steps, &sets).total(1.0, Shaping::default()));
         assert_eq!(weights, [1.0, 0.5, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn the_same_turn_is_paid_more_near_the_goal_and_back_and_forth_earns_nothing() {
+        let lesson = at(0, &["training.approach_reward=20"]);
+        let paid = |before, after| lesson.shaping(before, after, false, false).approach;
+        let factor_e = std::f64::consts::E * (0.3 + NEAR) - NEAR;
+        assert!((paid(factor_e, 0.3) - 20.0).abs() < 1e-9, "{}", paid(factor_e, 0.3));
+        assert!(paid(0.4, 0.2) > 5.0 * paid(2.4, 2.2));
+        assert!((paid(1.0, 0.3) + paid(0.3, 2.0) + paid(2.0, 1.0)).abs() < 1e-9);
     }
 }

@@ -336,7 +336,7 @@ impl Env for Repose {
             self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
             let within = rot_dist <= self.lesson.tolerance;
             reached = self.hold(within);
-            shaping = self.lesson.shaping(rot_dist_before - rot_dist, within, self.episode.dropped);
+            shaping = self.lesson.shaping(rot_dist_before, rot_dist, within, self.episode.dropped);
             self.recent.shaping += shaping;
         }
 

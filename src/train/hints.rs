@@ -45,7 +45,7 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     let weight = training.task_reward.to;
     for ((key, value), (_, usual)) in scales(config).into_iter().zip(scales(default)) {
         if value != usual && weight < LITTLE {
-            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight} at the end"));
+            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight}"));
         }
     }
     let models = scene.saturating_mul(config.env.num_envs);

@@ -141,7 +141,7 @@ mod tests {
         };
         let iteration = Iteration { lesson, update, steps: 60, collect_s: 13.0, update_s: 17.0 };
         let reward = RewardTerms { rotation: 20.0, distance: 21.0, action: 22.0, bonus: 23.0, fall: 24.0 };
-        let shaping = Shaping { progress: 25.0, within: 26.0, drop: 27.0 };
+        let shaping = Shaping { progress: 25.0, approach: 31.0, within: 26.0, drop: 27.0 };
         let recent = Recent { steps: 1, reward, shaping, diverged: 28 };
         let episode = |reward, length, goals| EpisodeStats {
             length,
@@ -157,7 +157,7 @@ mod tests {
         let evaluation = Score::of(&[episode(RewardTerms::default(), 1000, 5), episode(reward, 50, 0)]);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
             episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
-            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/within 26, training/drop 27, \
+            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, \
             training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, \
             training/randomized 0, eval/goals 2.5, eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, loss/policy 1, loss/value 2, policy/entropy 4, \
             policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \

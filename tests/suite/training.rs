@@ -16,7 +16,15 @@ const GOAL_ORIENTATION: usize = 64;
 
 /// Returns the lesson of the task itself with these settings applied over it.
 fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
-    let task = ["task_reward=1", "progress_reward=0", "hold_reward=0", "drop_reward=0", "tolerance=0.1", "hold=50"];
+    let task = [
+        "task_reward=1",
+        "progress_reward=0",
+        "approach_reward=0",
+        "hold_reward=0",
+        "drop_reward=0",
+        "tolerance=0.1",
+        "hold=50",
+    ];
     let task = task.map(|setting| format!("training.{setting}"));
     let mut all: Vec<&str> = task.iter().map(String::as_str).collect();
     all.extend(["training.goal_lifetime=0"]);
@@ -93,7 +101,7 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let (mut shaped, _) = started(&task);
     // A tolerance so wide that, if the task used it, every step would pay the bonus.
     let wide = ["training.tolerance=3.2"];
-    let paid = ["training.task_reward=0.5", "training.progress_reward=100"];
+    let paid = ["training.task_reward=0.5", "training.progress_reward=100", "training.approach_reward=0"];
     shaped.set_lesson(lesson(0, &[&wide[..], &paid].concat()));
     for _ in 0..20 {
         let before = shaped.rot_dist();
