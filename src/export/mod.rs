@@ -67,6 +67,7 @@ fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
         facts.push(("env_steps", progress.env_steps.to_string()));
     }
     facts.extend(progress.best.map(|best| ("goals_per_episode", best.goals.to_string())));
+    facts.extend(loaded.checkpoint.provenance.clone().map(|text| ("provenance", text)));
     facts
 }
 

@@ -22,6 +22,9 @@ const FORMAT_0_1: &str = "shadow-repose checkpoint 2";
 /// The most bytes of a configuration that are read; ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
+/// The text that tells how a published policy was made; `scripts/provenance.py` writes it.
+const PROVENANCE: &str = "provenance";
+
 /// The name of the adapted learning rate.
 const LEARNING_RATE: &str = "learning_rate";
 
@@ -90,6 +93,8 @@ pub struct Checkpoint {
     pub config: String,
     /// The progress of the run.
     pub progress: Progress,
+    /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes.
+    pub provenance: Option<String>,
     /// Whether version 0.1.0 wrote it.
     pub is_of_0_1: bool,
     content: Content,
@@ -107,16 +112,14 @@ impl Checkpoint {
         let is_of_0_1 = format == FORMAT_0_1;
         ensure!(format == FORMAT || is_of_0_1, "its format is `{format}`; this program reads `{FORMAT}`");
         let config = text("config")?;
-        ensure!(
-            config.len() <= LONGEST_CONFIG,
-            "its configuration has {} bytes; at most {LONGEST_CONFIG} are allowed",
-            config.len()
-        );
+        let long = config.len();
+        ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
+        let provenance = content.texts.remove(PROVENANCE);
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata has an unknown `{key}`");
         }
-        Ok(Self { config, progress, is_of_0_1, content })
+        Ok(Self { config, progress, provenance, is_of_0_1, content })
     }
 
     /// Returns the bytes of a file.
@@ -130,6 +133,7 @@ impl Checkpoint {
         {
             content.texts.insert(key.into(), text.into());
         }
+        content.texts.extend(self.provenance.clone().map(|text| (PROVENANCE.into(), text)));
         content.to_bytes()
     }
 
@@ -140,7 +144,8 @@ impl Checkpoint {
         let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
         let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
-        Self { config, progress, is_of_0_1: self.is_of_0_1, content: Content { arrays, ..Content::default() } }
+        let (provenance, content) = (self.provenance.clone(), Content { arrays, ..Content::default() });
+        Self { config, progress, provenance, content, ..*self }
     }
 
     /// Adds an array.
@@ -262,7 +267,7 @@ impl Ppo {
     /// progress of the run. All ranks call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
-        let mut checkpoint = Checkpoint { config, progress, is_of_0_1: false, content };
+        let mut checkpoint = Checkpoint { config, progress, provenance: None, is_of_0_1: false, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
         let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.division.shared(moment, &self.slices));
@@ -379,10 +384,11 @@ mod tests {
     #[test]
     fn a_policy_alone_plays_and_cannot_be_trained_on() {
         let from = learnt(Backend::Fused, 1);
-        let alone = saved(&from).policy_alone();
+        let alone = Checkpoint { provenance: Some("{}".into()), ..saved(&from) }.policy_alone();
         let bytes = alone.to_bytes().unwrap();
         assert!(bytes.len() < saved(&from).to_bytes().unwrap().len() * 2 / 3);
         let read = Checkpoint::parse(&bytes).unwrap();
+        assert_eq!(read.provenance.as_deref(), Some("{}"));
         let policy = Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &read).unwrap();
         assert_eq!(policy.normalizer, from.policy.normalizer);
         assert_eq!(policy.parameters, from.policy.parameters);
