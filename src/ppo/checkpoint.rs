@@ -5,11 +5,10 @@
 //! Reading is strict: the arrays must be exactly those that the configuration describes, with the same shapes.
 
 use anyhow::{Context, Result, bail, ensure};
-use serde::{Deserialize, Serialize};
 
 use super::format::{Array, Content};
 use super::parameters::{Layout, View};
-use super::{Normalizer, Policy, Ppo};
+use super::{Normalizer, Policy, Ppo, Progress};
 use crate::config::NetConfig;
 use crate::spaces::Spaces;
 
@@ -27,64 +26,6 @@ const PROVENANCE: &str = "provenance";
 
 /// The name of the adapted learning rate.
 const LEARNING_RATE: &str = "learning_rate";
-
-/// The progress of a run.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Progress {
-    /// The number of finished iterations.
-    pub iteration: u64,
-    /// Control steps over all environments.
-    pub env_steps: u64,
-    /// The best evaluation so far.
-    pub best: Option<Evaluation>,
-    /// The checkpoint that it was forked from, if any.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fork: Option<Fork>,
-}
-
-/// The scores that evaluations are compared by; in a file, an array of both.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(from = "[f64; 2]", into = "[f64; 2]")]
-pub struct Evaluation {
-    /// Goals per episode.
-    pub goals: f64,
-    /// Rotation error, rad.
-    pub rot_dist: f64,
-}
-
-impl Evaluation {
-    /// Returns whether it is better than the best so far: more goals, or the same number with a smaller error.
-    pub fn beats(self, best: Option<Self>) -> bool {
-        let rank = |it: Self| (it.goals, -it.rot_dist);
-        // If every episode diverged at once, there is no rotation error to compare.
-        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| rank(self) > rank(best))
-    }
-}
-
-impl From<[f64; 2]> for Evaluation {
-    fn from([goals, rot_dist]: [f64; 2]) -> Self {
-        Self { goals, rot_dist }
-    }
-}
-
-impl From<Evaluation> for [f64; 2] {
-    fn from(Evaluation { goals, rot_dist }: Evaluation) -> Self {
-        [goals, rot_dist]
-    }
-}
-
-/// The checkpoint of another run that a run was forked from.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Fork {
-    /// The path of its file at that time, for display only.
-    pub from: String,
-    /// The iterations that the other run had finished.
-    pub iteration: u64,
-    /// The control steps that the other run had taken.
-    pub env_steps: u64,
-}
 
 /// A checkpoint, or a policy alone, independent of a learner.
 #[derive(Clone, Debug)]
@@ -323,7 +264,7 @@ impl Ppo {
 mod tests {
     use super::*;
     use crate::config::{Backend, Config, PpoConfig, Symmetry};
-    use crate::ppo::Rollout;
+    use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Division;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
@@ -436,16 +377,5 @@ mod tests {
         let mut ppo = learner(&[8]);
         ppo.policy.normalizer.mean[0] = f64::NAN;
         assert!(saved(&ppo).to_bytes().unwrap_err().to_string().contains("normalizer.mean"));
-    }
-
-    #[test]
-    fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
-        let beats = |one: [f64; 2], best: Option<[f64; 2]>| Evaluation::from(one).beats(best.map(Evaluation::from));
-        assert!(beats([0.0, 2.0], None));
-        assert!(beats([1.0, 2.0], Some([0.5, 0.1])));
-        assert!(!beats([0.5, 0.1], Some([1.0, 2.0])));
-        assert!(beats([1.0, 1.9], Some([1.0, 2.0])));
-        assert!(!beats([1.0, 2.0], Some([1.0, 2.0])));
-        assert!(!beats([0.0, f64::NAN], None));
     }
 }

@@ -20,6 +20,7 @@ mod normalizer;
 mod parameters;
 mod perception;
 mod policy;
+mod progress;
 mod rollout;
 
 use std::f64::consts::{E, TAU};
@@ -31,7 +32,7 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 pub use acting::Acting;
-pub use checkpoint::{Checkpoint, Evaluation, Fork, Progress};
+pub use checkpoint::Checkpoint;
 pub use format::{Array, Damaged, sealed};
 pub use gae::{Discount, gae};
 pub use kernels::Workspace;
@@ -40,6 +41,7 @@ pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
 pub use perception::Perception;
 pub use policy::{ActorParts, FrozenPolicy, LayerParts, Policy};
+pub use progress::{Evaluation, Fork, Progress};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{Backend, PpoConfig};

@@ -1,0 +1,77 @@
+//! The progress of a run, as checkpoints tell it: what is finished, what was best, and where it was forked from.
+
+use serde::{Deserialize, Serialize};
+
+/// The progress of a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// The number of finished iterations.
+    pub iteration: u64,
+    /// Control steps over all environments.
+    pub env_steps: u64,
+    /// The best evaluation so far.
+    pub best: Option<Evaluation>,
+    /// The checkpoint that it was forked from, if any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fork: Option<Fork>,
+}
+
+/// The scores that evaluations are compared by; in a file, an array of both.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(from = "[f64; 2]", into = "[f64; 2]")]
+pub struct Evaluation {
+    /// Goals per episode.
+    pub goals: f64,
+    /// Rotation error, rad.
+    pub rot_dist: f64,
+}
+
+impl Evaluation {
+    /// Returns whether it is better than the best so far: more goals, or the same number with a smaller error.
+    pub fn beats(self, best: Option<Self>) -> bool {
+        let rank = |it: Self| (it.goals, -it.rot_dist);
+        // If every episode diverged at once, there is no rotation error to compare.
+        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| rank(self) > rank(best))
+    }
+}
+
+impl From<[f64; 2]> for Evaluation {
+    fn from([goals, rot_dist]: [f64; 2]) -> Self {
+        Self { goals, rot_dist }
+    }
+}
+
+impl From<Evaluation> for [f64; 2] {
+    fn from(Evaluation { goals, rot_dist }: Evaluation) -> Self {
+        [goals, rot_dist]
+    }
+}
+
+/// The checkpoint of another run that a run was forked from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fork {
+    /// The path of its file at that time, for display only.
+    pub from: String,
+    /// The iterations that the other run had finished.
+    pub iteration: u64,
+    /// The control steps that the other run had taken.
+    pub env_steps: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
+        let beats = |one: [f64; 2], best: Option<[f64; 2]>| Evaluation::from(one).beats(best.map(Evaluation::from));
+        assert!(beats([0.0, 2.0], None));
+        assert!(beats([1.0, 2.0], Some([0.5, 0.1])));
+        assert!(!beats([0.5, 0.1], Some([1.0, 2.0])));
+        assert!(beats([1.0, 1.9], Some([1.0, 2.0])));
+        assert!(!beats([1.0, 2.0], Some([1.0, 2.0])));
+        assert!(!beats([0.0, f64::NAN], None));
+    }
+}
