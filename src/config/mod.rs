@@ -39,14 +39,10 @@ mod tests {
     #[test]
     fn the_other_files_that_come_with_the_program_say_what_differs() {
         let published = shipped(include_str!("../../configs/isaac-lab.toml"));
-        let going_on = shipped(include_str!("../../configs/repose-continue.toml"));
         let EnvConfig { reach_goal_bonus, max_consecutive_successes, .. } = published.env;
         assert_eq!((published.env.max_episode_steps(), published.env.substeps()), (600, 2));
         assert_eq!((reach_goal_bonus, max_consecutive_successes), (250.0, 1));
         assert_eq!((published.training.task_reward, published.training.hold_reward), (Ramp::constant(1.0), 0.0));
-        assert_eq!((going_on.training.tolerance, going_on.training.hold), (Ramp::constant(0.07), Ramp::constant(50.0)));
-        assert_eq!((going_on.ppo.std, going_on.ppo.value_clip()), (Ramp::constant(0.2), f64::INFINITY));
-        assert_eq!(going_on.training.goal_lifetime, 300);
         let all = shipped(include_str!("../../configs/randomization-all.toml"));
         let source = shipped(include_str!("../../configs/randomization-source.toml"));
         let varied = |config: &Config| -> Vec<String> {
@@ -58,6 +54,25 @@ mod tests {
         assert_eq!(varied(&source), ["share", "each", "friction", "cube_mass", "cube_com", "push_steps"]);
         let share = |config: &Config| (config.randomization.share, config.randomization.each);
         assert_eq!([share(&all), share(&source)], [(Ramp::constant(1.0), 1.0); 2]);
-        assert!(!published.randomization.happens() && !going_on.randomization.happens());
+        assert!(!published.randomization.happens());
+    }
+
+    #[test]
+    fn continuing_is_the_default_with_its_ramps_at_their_ends() {
+        let default = Config::resolve(None, &[]).unwrap();
+        let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
+        let ended = |ramp: Ramp| Ramp::constant(ramp.to);
+        let (training, ppo) = (default.training, default.ppo);
+        let (drop_reward, tolerance, hold) = (training.drop_reward, training.tolerance, training.hold);
+        let [drop_reward, tolerance, hold] = [drop_reward, tolerance, hold].map(ended);
+        assert_eq!(continuing.training, TrainingConfig { drop_reward, tolerance, hold, ..training });
+        let share = ended(default.randomization.share);
+        assert_eq!(continuing.randomization, RandomizationConfig { share, ..default.randomization });
+        let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
+        let [horizon, std, desired_kl] = [ppo.horizon, ppo.std, ppo.desired_kl].map(ended);
+        let learning_rate = continuing.ppo.learning_rate;
+        let expected = PpoConfig { horizon, std, desired_kl, minibatches, learning_rate, ..ppo };
+        assert_eq!(continuing.ppo, expected, "only the first learning rate is its own");
+        assert_eq!(continuing.env, default.env);
     }
 }

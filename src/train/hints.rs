@@ -99,7 +99,7 @@ mod tests {
         assert!(of(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
         assert!(of(&["env.num_envs=8192", "run.total_steps=30_000_000"]).is_empty(), "it ends before");
         let [line] = &of(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
-        assert!(line.ends_with("nothing is randomised in 100000000 steps"), "{line}");
+        assert!(line.ends_with("nothing is randomised in 175000000 steps"), "{line}");
     }
 
     #[test]

@@ -154,23 +154,29 @@ fn every_setting_and_option_that_the_documents_name_exists() {
 #[test]
 fn goals_by_time_are_those_of_the_tables() {
     let results = read("docs/RESULTS.md");
-    for seed in 0..3 {
-        let table = read(&format!("docs/metrics/seed-{seed}/metrics.csv"));
+    let by_time = results.split("## By time").nth(1).unwrap();
+    let cells = |start: &str| -> Vec<String> {
+        let row = by_time.lines().find_map(|line| line.strip_prefix(start)).unwrap();
+        row.trim_matches(['|', ' ']).split('|').map(|cell| cell.trim().to_owned()).collect()
+    };
+    let steps: Vec<f64> = cells("| steps |").iter().map(|cell| cell.trim_end_matches(" M").parse().unwrap()).collect();
+    let seeds = by_time.lines().filter(|line| line.starts_with("| goals, seed ")).count();
+    assert!(seeds >= 2);
+    for seed in (0..3).filter(|seed| by_time.contains(&format!("| goals, seed {seed} |"))) {
+        let table = read(&format!("docs/metrics/default-{seed}/metrics.csv"));
         let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<&str>>());
         let header = lines.next().unwrap();
-        let column = |name: &str| header.iter().position(|column| *column == name).unwrap();
-        let [collect, update, goals] = ["time/collect_s", "time/update_s", "eval/goals"].map(column);
-        let (mut seconds, mut evaluations) = (0.0, Vec::new());
-        for row in lines {
-            seconds += [collect, update].map(|i| row[i].parse::<f64>().unwrap()).iter().sum::<f64>();
-            evaluations.extend(row[goals].parse::<f64>().ok().map(|goals| (seconds / 60.0, goals)));
-        }
-        let nearest = |minutes: f64| {
-            let distance = |of: &(f64, f64)| (of.0 - minutes).abs();
-            evaluations.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().1
+        let [env_steps, goals] =
+            ["env_steps", "eval/goals"].map(|name| header.iter().position(|column| *column == name).unwrap());
+        let evaluations: Vec<(f64, f64)> = lines
+            .filter_map(|row| Some((row[env_steps].parse::<f64>().unwrap() / 1e6, row[goals].parse().ok()?)))
+            .collect();
+        let nearest = |at: f64| {
+            let distance = |of: &(f64, f64)| (of.0 - at).abs();
+            evaluations.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().1
         };
-        let cells: Vec<String> = [15.0, 30.0, 60.0, 120.0].map(|at| format!("{:.2}", nearest(at))).into();
-        let row = results.lines().find(|line| line.starts_with(&format!("| seed {seed}"))).unwrap();
-        assert!(row.ends_with(&format!("| {} |", cells.join(" | "))), "{row}: {cells:?}");
+        let row = cells(&format!("| goals, seed {seed} |"));
+        let expected: Vec<String> = steps[..row.len()].iter().map(|at| format!("{:.1}", nearest(*at))).collect();
+        assert_eq!(row, expected, "seed {seed}");
     }
 }

@@ -11,7 +11,7 @@ use crate::support::{program, succeeded, task};
 fn how_long_goals_take_is_what_the_trace_shows() {
     let place = tempfile::tempdir().unwrap();
     let mut args = vec!["play", "--ckpt", "builtin", "--episodes", "12", "--json", "--trace", "trace.jsonl"];
-    let task_settings = ["env.max_episode_seconds=1.6", "env.max_consecutive_successes=5", "env.fall_dist=0.085"];
+    let task_settings = ["env.max_episode_seconds=1.6", "env.max_consecutive_successes=5", "env.fall_dist=0.105"];
     task_settings.iter().for_each(|set| args.extend(["--set", set]));
     let score: Value = serde_json::from_slice(&succeeded(program(place.path(), &args)).stdout).unwrap();
     let text = fs::read_to_string(place.path().join("trace.jsonl")).unwrap();
