@@ -150,7 +150,7 @@ fn every_setting_and_option_that_the_documents_name_exists() {
     }
 }
 
-/// The goals of the evaluations that are nearest to these minutes of collecting and learning.
+/// The goals of the evaluations that are nearest to these steps.
 #[test]
 fn goals_by_time_are_those_of_the_tables() {
     let results = read("docs/RESULTS.md");
