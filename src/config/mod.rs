@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn continuing_is_the_default_with_its_ramps_at_their_ends() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends() {
         let default = Config::resolve(None, &[]).unwrap();
         let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
@@ -74,5 +74,8 @@ mod tests {
         let expected = PpoConfig { horizon, std, desired_kl, minibatches, learning_rate, ..ppo };
         assert_eq!(continuing.ppo, expected, "only the first learning rate is its own");
         assert_eq!(continuing.env, default.env);
+        let robust = shipped(include_str!("../../configs/repose-robust.toml"));
+        assert_eq!(robust.ppo, continuing.ppo);
+        assert_eq!(robust.training, TrainingConfig { drop_reward: robust.training.drop_reward, ..continuing.training });
     }
 }
