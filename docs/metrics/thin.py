@@ -12,6 +12,8 @@ MEANS = ["episode/goals", "episode/in_tolerance", "episode/drop_rate", "episode/
 MEANS += ["policy/std", "eval/goals", "eval/drop_rate", "eval/rot_dist"]
 # Only a training with randomised episodes has these.
 RANDOMIZED = ["randomized/goals", "randomized/drop_rate", "randomized/rot_dist"]
+# Only a training by the task's own reward is measured by its return.
+RETURNS = ["episode/return", "eval/return"]
 SUMS = ["time/collect_s", "time/update_s"]
 STEPS = 400_000
 
@@ -34,6 +36,7 @@ def main(run, table):
     with open(table, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         columns = MEANS + [column for column in RANDOMIZED if column in rows[0]]
+        columns += RETURNS if float(rows[0].get("training/task_reward") or 0) == 1 else []
         writer.writerow(["env_steps", *columns, *SUMS])
         # The last group has too few iterations for a mean.
         for group in groups[:-1]:
