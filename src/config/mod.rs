@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_less_smoothing_and_less_noise() {
         let default = Config::resolve(None, &[]).unwrap();
         let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
@@ -69,13 +69,16 @@ mod tests {
         let share = ended(default.randomization.share);
         assert_eq!(continuing.randomization, RandomizationConfig { share, ..default.randomization });
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
-        let [horizon, std, desired_kl] = [ppo.horizon, ppo.std, ppo.desired_kl].map(ended);
-        let learning_rate = continuing.ppo.learning_rate;
-        let expected = PpoConfig { horizon, std, desired_kl, minibatches, learning_rate, ..ppo };
-        assert_eq!(continuing.ppo, expected, "only the first learning rate is its own");
-        assert_eq!(continuing.env, default.env);
+        let [horizon, desired_kl] = [ppo.horizon, ppo.desired_kl].map(ended);
+        let PpoConfig { std, away_std, learning_rate, .. } = continuing.ppo;
+        assert!(std.from == std.to && std.to < ppo.std.to && away_std < ppo.away_std);
+        let expected = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate, ..ppo };
+        assert_eq!(continuing.ppo, expected, "only noise and the first learning rate are its own");
+        let act_moving_average = continuing.env.act_moving_average;
+        assert!(act_moving_average > default.env.act_moving_average);
+        assert_eq!(continuing.env, EnvConfig { act_moving_average, ..default.env });
         let robust = shipped(include_str!("../../configs/repose-robust.toml"));
-        assert_eq!(robust.ppo, continuing.ppo);
+        assert_eq!((&robust.env, &robust.ppo), (&continuing.env, &continuing.ppo));
         assert_eq!(robust.training, TrainingConfig { drop_reward: robust.training.drop_reward, ..continuing.training });
     }
 }
