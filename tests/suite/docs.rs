@@ -150,37 +150,44 @@ fn every_setting_and_option_that_the_documents_name_exists() {
     }
 }
 
-/// The goals of the evaluations that are nearest to these steps.
+/// The goals of the evaluations that are nearest to these steps, by both commands of the built-in policy.
 #[test]
 fn goals_by_time_are_those_of_the_tables() {
     let results = read("docs/RESULTS.md");
-    let by_time = results.split("## By time").nth(1).unwrap();
-    let cells = |start: &str| -> Vec<String> {
-        let row = by_time.lines().find_map(|line| line.strip_prefix(start)).unwrap();
-        row.trim_matches(['|', ' ']).split('|').map(|cell| cell.trim().to_owned()).collect()
-    };
-    let steps: Vec<f64> = cells("| steps |").iter().map(|cell| cell.trim_end_matches(" M").parse().unwrap()).collect();
-    let minutes = steps.iter().map(|at| (at * 1e6 / 21_500.0 / 60.0).round());
-    let shown: Vec<f64> = cells("| minutes |").iter().map(|cell| cell.parse().unwrap()).collect();
-    assert!(minutes.zip(&shown).all(|(expected, shown)| (expected - shown).abs() <= 1.0), "{shown:?}");
-    for seed in 0..3 {
-        let table = read(&format!("docs/metrics/default-{seed}/metrics.csv"));
-        let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<&str>>());
-        let header = lines.next().unwrap();
-        let [env_steps, goals] =
-            ["env_steps", "eval/goals"].map(|name| header.iter().position(|column| *column == name).unwrap());
-        let evaluations: Vec<(f64, f64)> = lines
-            .filter_map(|row| Some((row[env_steps].parse::<f64>().unwrap() / 1e6, row[goals].parse().ok()?)))
-            .collect();
-        let nearest = |at: f64| {
-            let distance = |of: &(f64, f64)| (of.0 - at).abs();
-            evaluations.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().1
+    let tables = [("## By time", "default", 0..3, 21_500.0), ("\nThe second command,", "continue", 0..1, 19_900.0)];
+    for (title, runs, seeds, steps_per_s) in tables {
+        let by_time = results.split(title).nth(1).unwrap();
+        let cells = |start: &str| -> Vec<String> {
+            let row = by_time.lines().find_map(|line| line.strip_prefix(start)).unwrap();
+            row.trim_matches(['|', ' ']).split('|').map(|cell| cell.trim().to_owned()).collect()
         };
-        let row = cells(&format!("| goals, seed {seed} |"));
-        // A cell is left out only where the run had ended.
-        let last = evaluations.last().unwrap().0;
-        let expected = steps.iter().filter(|at| **at < last + 1.0).map(|at| format!("{:.1}", nearest(*at)));
-        let expected: Vec<String> = expected.collect();
-        assert_eq!(row, expected, "seed {seed}");
+        let steps: Vec<f64> =
+            cells("| steps |").iter().map(|cell| cell.trim_end_matches(" M").parse().unwrap()).collect();
+        let minutes = steps.iter().map(|at| (at * 1e6 / steps_per_s / 60.0).round());
+        let shown: Vec<f64> = cells("| minutes |").iter().map(|cell| cell.parse().unwrap()).collect();
+        assert!(minutes.zip(&shown).all(|(expected, shown)| (expected - shown).abs() <= 1.0), "{title}: {shown:?}");
+        for seed in seeds {
+            let evaluations = evaluations(&format!("docs/metrics/{runs}-{seed}/metrics.csv"));
+            let nearest = |at: f64| {
+                let distance = |of: &(f64, f64)| (of.0 - at).abs();
+                evaluations.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().1
+            };
+            let row = cells(&format!("| goals, seed {seed} |"));
+            // A cell is left out only where the run had ended.
+            let last = evaluations.last().unwrap().0;
+            let expected = steps.iter().filter(|at| **at < last + 1.0).map(|at| format!("{:.1}", nearest(*at)));
+            let expected: Vec<String> = expected.collect();
+            assert_eq!(row, expected, "{title}: seed {seed}");
+        }
     }
+}
+
+/// Returns the evaluations in a table of a training: millions of steps, and goals per episode.
+fn evaluations(path: &str) -> Vec<(f64, f64)> {
+    let table = read(path);
+    let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<&str>>());
+    let header = lines.next().unwrap();
+    let [env_steps, goals] =
+        ["env_steps", "eval/goals"].map(|name| header.iter().position(|column| *column == name).unwrap());
+    lines.filter_map(|row| Some((row[env_steps].parse::<f64>().unwrap() / 1e6, row[goals].parse().ok()?))).collect()
 }
