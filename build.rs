@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-#[path = "src/run/pip.rs"]
+#[path = "src/os/pip.rs"]
 mod pip;
 
 const VERSION: &str = "3.17.0";
@@ -22,7 +22,7 @@ const WHEELS: [(&str, &str, &str); 2] = [
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    println!("cargo::rerun-if-changed=src/run/pip.rs");
+    println!("cargo::rerun-if-changed=src/os/pip.rs");
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     println!("cargo::rerun-if-env-changed=MUJOCO_STATIC_LINK_DIR");
     println!("cargo::rerun-if-env-changed=SHADOW_REPOSE_PACKAGE");

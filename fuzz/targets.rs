@@ -7,10 +7,11 @@ use std::sync::{Arc, OnceLock};
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::{Config, Override, Ramp, Source};
-use shadow_repose::env::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::load;
+use shadow_repose::os::StatusLine;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
-use shadow_repose::run::{self, Report, StatusLine};
+use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
+use shadow_repose::run::{self, Report};
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
 /// Returns whether the input is accepted, and whether it is accepted once its checksum, if any, has been corrected.

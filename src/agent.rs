@@ -11,9 +11,10 @@ use anyhow::{Context, Result, ensure};
 
 use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
-use crate::env::{Env, EnvPool, EnvState, Lesson, Randomization, Repose, Resumable, Task};
+use crate::env::{Env, EnvPool, EnvState, Resumable};
 use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
 use crate::ranks::Division;
+use crate::repose::{Lesson, Randomization, Repose, Task};
 
 // The names under which a checkpoint stores the states of the environments.
 const NUMBERS: &str = "envs.numbers";

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use crate::config::EnvConfig;
-use crate::env::Diverged;
+use crate::repose::Diverged;
 
 /// Returns one object: `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step, `ctrl` the controls
 /// of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes, `randomization`

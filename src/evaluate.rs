@@ -13,9 +13,10 @@ use anyhow::{Result, anyhow};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use crate::env::{ACTION_SIZE, End, Env, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
+use crate::env::{End, Env};
 use crate::ppo::{FrozenPolicy, Workspace};
 use crate::ranks::Division;
+use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
 use crate::sim::stepping;
@@ -303,9 +304,9 @@ impl Player {
 mod tests {
     use super::*;
     use crate::config::{Config, Symmetry};
-    use crate::env::SPACES;
     use crate::ppo::Ppo;
     use crate::ranks::Division;
+    use crate::repose::SPACES;
 
     #[test]
     fn a_policy_with_the_symmetry_of_the_cube_acts_alike_however_the_cube_is_turned_onto_itself() {

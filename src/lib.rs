@@ -12,29 +12,32 @@
 //!
 //! | module | what it is | imports |
 //! |---|---|---|
-//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, play, plot, ranks, run, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, env, evaluate, load, ppo, quantities, ranks, run, schedule, see, sim |
-//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, env, evaluate, load, pace, robustness, run, see, sim, trace |
-//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, env, evaluate, load, run |
-//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, run, see, sim |
-//! | [`mod@export`] | a policy as an ONNX file | cli, config, env, load, ppo, run, spaces |
-//! | [`mod@plot`] | learning curves of runs | cli, quantities, run |
-//! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, load, ppo, ranks, rng, run, schedule, sim, spaces |
-//! | [`manual`] | shell completions and a manual page | cli, run |
-//! | [`see`] | rendering of the task: window, film, picture | cli, config, env, evaluate, run, sim |
-//! | [`trace`] | episodes as JSON lines | config, env, evaluate |
+//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, evaluate, load, os, ppo, quantities, ranks, repose, run, schedule, see, sim |
+//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, load, os, pace, repose, robustness, see, sim, trace |
+//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
+//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, see, sim |
+//! | [`mod@export`] | a policy as an ONNX file | cli, config, load, os, ppo, repose, spaces |
+//! | [`mod@plot`] | learning curves of runs | cli, draw, os, quantities, run |
+//! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, schedule, sim, spaces |
+//! | [`manual`] | shell completions and a manual page | cli, os |
+//! | [`see`] | rendering of the task: window, film, picture | cli, config, draw, env, evaluate, os, repose, run, sim |
+//! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
 //! | [`pace`] | statistics of the time to reach a goal | config, env, evaluate |
-//! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks |
-//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, rng, schedule, sim |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks, repose |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, repose, rng, schedule, sim |
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
-//! | [`load`] | checkpoints and policies from untrusted files | config, env, ppo, run |
-//! | [`dump`] | the steps that led to a diverged state, as JSON | config, env |
+//! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
+//! | [`dump`] | the steps that led to a diverged state, as JSON | config, repose |
 //! | [`cli`] | the structure of the command line | config, sim |
-//! | [`mod@env`] | the task: observation (one table), reward, changes for training; many environments in blocks | config, quat, ranks, rng, schedule, sim, spaces |
+//! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, ranks, rng, sim, spaces |
+//! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, quat, ranks, rng, spaces |
 //! | [`sim`] | the only interface to MuJoCo | quat, schedule |
-//! | [`config`] | all settings, their defaults and rules | run |
-//! | [`run`] | the outside world: run folder, files, logs, terminal, signals | - |
+//! | [`config`] | all settings, their defaults and rules | os |
+//! | [`run`] | the folder of a run and its logs | os |
+//! | [`draw`] | charts, films and pictures as files | os |
+//! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |
 //! | [`quantities`] | what a training logs: names, meanings, units | - |
 //! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | - |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
@@ -78,12 +81,14 @@ pub mod bench;
 pub mod cli;
 pub mod collect;
 pub mod config;
+pub mod draw;
 pub mod dump;
 pub mod env;
 pub mod evaluate;
 pub mod export;
 pub mod load;
 pub mod manual;
+pub mod os;
 pub mod pace;
 pub mod play;
 pub mod plot;
@@ -91,6 +96,7 @@ pub mod ppo;
 pub mod quantities;
 pub mod quat;
 pub mod ranks;
+pub mod repose;
 pub mod rng;
 pub mod robustness;
 pub mod run;

@@ -9,8 +9,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Error, Result, bail, ensure};
 
 use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
-use crate::env::SPACES;
+use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy};
+use crate::repose::SPACES;
 use crate::run;
 
 /// The key of the only setting that is a path.
@@ -135,7 +136,7 @@ impl Loaded {
             (Some(place), _) => Origin::of(place)?,
             (None, Some(newest)) => Origin::of(&newest)?,
             (None, None) => {
-                run::say("there is no run here: taking the built-in policy");
+                os::say("there is no run here: taking the built-in policy");
                 Origin::BuiltIn(&BUILTIN[0])
             }
         };
@@ -163,7 +164,7 @@ impl Loaded {
 /// # Errors
 /// Fails if the file cannot be read, is damaged, or is not one of this program.
 pub fn read(path: &Path) -> Result<Checkpoint> {
-    Checkpoint::parse(&run::read_bytes(path)?).with_context(|| cannot_use(path))
+    Checkpoint::parse(&os::read_bytes(path)?).with_context(|| cannot_use(path))
 }
 
 /// Returns the first of these files (newest first) that is not damaged, and prints a warning for each one before it. A file that
@@ -175,7 +176,7 @@ pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
-            Err(error) if is_damage(&error) => run::say(&format!("warning: {error:#}\n  Trying the one before.")),
+            Err(error) if is_damage(&error) => os::say(&format!("warning: {error:#}\n  Trying the one before.")),
             result => return Ok((path.clone(), result?)),
         }
     }
@@ -248,7 +249,7 @@ fn expect_trainable(checkpoint: &Checkpoint) -> Result<()> {
 /// Checks that a scene other than the built-in one was named by the user.
 fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
     if let Some(model) = env.model_file().filter(|_| !named) {
-        let set = run::quoted(&format!("{MODEL}={}", model.display()));
+        let set = os::quoted(&format!("{MODEL}={}", model.display()));
         bail!("it uses a custom scene, and no path in a file is followed: add --set {set} to use that scene");
     }
     Ok(())

@@ -4,10 +4,10 @@ use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use shadow_repose::cli::{self, Command};
+use shadow_repose::os::Requests;
 use shadow_repose::ranks::Launched;
-use shadow_repose::run::Requests;
 use shadow_repose::train::train;
-use shadow_repose::{bench, export, manual, play, plot, ranks, run, view};
+use shadow_repose::{bench, export, manual, os, play, plot, ranks, view};
 
 fn main() -> ExitCode {
     let command = match cli::parse() {
@@ -33,7 +33,7 @@ fn main() -> ExitCode {
         Err(error) => match error.downcast::<clap::Error>() {
             Ok(answer) => tell(&answer),
             Err(error) => {
-                run::say(&format!("error: {error:#}"));
+                os::say(&format!("error: {error:#}"));
                 ExitCode::FAILURE
             }
         },
@@ -43,7 +43,7 @@ fn main() -> ExitCode {
 /// Refuses to run one command in each of several processes. One of them says so.
 fn refuse(launched: Launched) -> ExitCode {
     if launched.rank == 0 {
-        run::say(&format!("error: only `train` runs on several ranks; {} processes were started", launched.size));
+        os::say(&format!("error: only `train` runs on several ranks; {} processes were started", launched.size));
     }
     ExitCode::FAILURE
 }
@@ -55,7 +55,7 @@ fn tell(answer: &clap::Error) -> ExitCode {
     }
     match answer.print() {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            run::say(&format!("error: cannot write to stdout: {error}"));
+            os::say(&format!("error: cannot write to stdout: {error}"));
             ExitCode::FAILURE
         }
         _ => ExitCode::from(answer.exit_code() as u8),

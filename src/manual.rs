@@ -3,7 +3,7 @@
 use anyhow::Result;
 
 use crate::cli::{CompletionsArgs, Shell, command};
-use crate::run;
+use crate::os;
 
 /// Prints completions for a shell.
 ///
@@ -17,7 +17,7 @@ pub fn completions(args: &CompletionsArgs) -> Result<()> {
     };
     let mut text = Vec::new();
     clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
-    run::print(&String::from_utf8(text)?)
+    os::print(&String::from_utf8(text)?)
 }
 
 /// Prints a manual page of all commands.
@@ -42,5 +42,5 @@ pub fn man() -> Result<()> {
         let section = String::from_utf8(section)?.replace(".SH ", ".SS ");
         page += &format!(".SH \"SHADOW-REPOSE {}\"\n{section}", command.get_name().to_uppercase());
     }
-    run::print(&page)
+    os::print(&page)
 }

@@ -11,12 +11,12 @@ use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used};
-use crate::env::{Score, Task};
 use crate::evaluate::{Actor, Episodes, Moment, evaluate};
 use crate::load::Loaded;
+use crate::os::{self, Requests};
 use crate::pace::Pace;
+use crate::repose::{Score, Task};
 use crate::robustness::robustness;
-use crate::run::{self, Requests};
 use crate::see::{Film, HAS_WINDOWS, Window, task_to_see};
 use crate::sim::Quality;
 use crate::trace::Trace;
@@ -43,12 +43,12 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Some(loaded) => loaded.config.clone(),
         None => Config::resolve(None, &args.set)?.env,
     };
-    run::start_threads(args.threads)?;
+    os::start_threads(args.threads)?;
     if args.robustness {
         requests.wait_for_end();
     }
     if let (Some(loaded), false) = (&loaded, args.json) {
-        run::say(&format!("playing {}", loaded.name));
+        os::say(&format!("playing {}", loaded.name));
     }
     if let (Some(loaded), true) = (&loaded, args.robustness) {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
@@ -68,7 +68,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     };
     let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
     // Opened before playing, so that a path that cannot be written to does not cost the score.
-    let output = args.trace.as_deref().map(run::OutputFile::create).transpose()?;
+    let output = args.trace.as_deref().map(os::OutputFile::create).transpose()?;
     let mut trace = output.as_ref().map(|_| Trace::new(config, checkpoint.as_deref()));
     let mut pace = Pace::new(config);
     if let (Some(output), Some(video)) = (&output, &args.video) {
@@ -90,19 +90,19 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     let Some(played) = played else {
         output
             .into_iter()
-            .for_each(|output| run::say(&format!("{}: interrupted, not written", output.path().display())));
+            .for_each(|output| os::say(&format!("{}: interrupted, not written", output.path().display())));
         return Ok(requests.exit_code());
     };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;
     }
-    played.divergence().into_iter().for_each(|warning| run::say(&format!("warning: {warning}")));
+    played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if args.json {
-        run::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)))?;
+        os::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)))?;
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(checkpoint) = &checkpoint {
-        run::print(&format!("checkpoint {checkpoint}\n"))?;
+        os::print(&format!("checkpoint {checkpoint}\n"))?;
     }
     let mut columns = vec![(actor.name(), played)];
     if loaded.is_some() && args.video.is_none() {
@@ -111,7 +111,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
             score(&Actor::Zero, &mut |_| {})?.context("these episodes cannot be interrupted")?,
         ));
     }
-    run::print(&table(&columns))?;
+    os::print(&table(&columns))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -123,7 +123,7 @@ fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
 
 fn wants_window(args: &PlayArgs) -> bool {
     let otherwise = args.robustness || args.headless || args.json || args.trace.is_some() || args.video.is_some();
-    args.window || !otherwise && HAS_WINDOWS && run::has_display()
+    args.window || !otherwise && HAS_WINDOWS && os::has_display()
 }
 
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
@@ -142,12 +142,12 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
     };
     let window = match Window::open(&task, names, first) {
         Err(error) if !args.window => {
-            run::say(&format!("note: {error:#}\n  Continuing as with --headless."));
+            os::say(&format!("note: {error:#}\n  Continuing as with --headless."));
             return Ok(false);
         }
         window => window?,
     };
-    run::say(&window.play(&task, &actors, episodes(args, u64::MAX))?);
+    os::say(&window.play(&task, &actors, episodes(args, u64::MAX))?);
     Ok(true)
 }
 
@@ -178,7 +178,7 @@ fn film(
             Err(error) => return Err(film.abandon().unwrap_or(error)),
         }
     }
-    run::say(&format!("{}: {}", path.display(), film.finish()?));
+    os::say(&format!("{}: {}", path.display(), film.finish()?));
     Ok((played.len() == all.count).then(|| Score::of(&played)))
 }
 
@@ -196,7 +196,7 @@ fn score(
     interrupted: &AtomicBool,
     observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
-    let progress = run::Bar::new(episodes.count as u64, "episodes", actor.name());
+    let progress = os::Bar::new(episodes.count as u64, "episodes", actor.name());
     let played = evaluate(task, actor, episodes, interrupted, &mut |moment| {
         observe(&moment);
         if moment.step.is_some_and(|(_, end)| end.is_some()) {
@@ -274,7 +274,7 @@ fn figures(score: &Score) -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::env::EpisodeStats;
+    use crate::repose::EpisodeStats;
 
     #[test]
     fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {

@@ -6,8 +6,10 @@ use std::path::Path;
 use anyhow::{Result, bail, ensure};
 
 use crate::cli::{Along, PlotArgs};
+use crate::draw::{self, Chart, Curve, Picture, Subplot};
+use crate::os::{self, OutputFile, similar};
 use crate::quantities::quantity;
-use crate::run::{self, Chart, Curve, MetricsTable, OutputFile, Picture, Subplot, similar};
+use crate::run::{self, MetricsTable};
 
 /// The metrics that are drawn by default: the headline, and what explains it.
 const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];
@@ -45,7 +47,7 @@ struct Run {
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let output = OutputFile::create(&args.out)?;
-    run::picture_format(&output)?;
+    draw::picture_format(&output)?;
     let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
     let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
     let instead = if args.metric.is_empty() { &INSTEAD[..] } else { &[] };
@@ -88,7 +90,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         runs.iter().map(|run| run.name.clone()).collect()
     };
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
-    run::say(&format!("{}: {} runs", args.out.display(), runs.len()));
+    os::say(&format!("{}: {} runs", args.out.display(), runs.len()));
     Ok(())
 }
 
@@ -106,7 +108,7 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
         match rows {
             Ok(table) => tables.push((place, table)),
             Err(error) if tables.is_empty() && i + 1 == args.runs.len() => return Err(error),
-            Err(error) => run::say(&format!("warning: {error:#}; skipped")),
+            Err(error) => os::say(&format!("warning: {error:#}; skipped")),
         }
     }
     // A window is as many steps for all runs, so that a table with fewer rows, as in docs/metrics, is not smoothed more.
@@ -145,7 +147,7 @@ fn expect_columns(runs: &[Run], metrics: &[&str]) -> Result<()> {
             }
         }
         if !lacking.is_empty() {
-            run::say(&format!("warning: no column {name} in {}", lacking.join(", ")));
+            os::say(&format!("warning: no column {name} in {}", lacking.join(", ")));
         }
     }
     Ok(())

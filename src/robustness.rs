@@ -9,10 +9,11 @@ use serde_json::{Map, Value, json};
 
 use crate::cli::PlayArgs;
 use crate::config::{EnvConfig, Override};
-use crate::env::{Score, Task};
+use crate::draw::{self, BarChart, HeatMap, Picture};
 use crate::evaluate::{Actor, Episodes, evaluate};
 use crate::load::Loaded;
-use crate::run::{self, Bar, BarChart, HeatMap, OutputFile, Picture, Requests};
+use crate::os::{self, Bar, OutputFile, Requests};
+use crate::repose::{Score, Task};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
 const CHANGES: [(&str, &str, &[&str]); 8] = [
@@ -60,7 +61,7 @@ struct Row {
 /// Fails if a setting does not fit the policy's task, if an episode panics, or if the picture cannot be written.
 pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
-    output.as_ref().map(run::picture_format).transpose()?;
+    output.as_ref().map(draw::picture_format).transpose()?;
     let config = |condition: &Condition| {
         let sets = [&args.set[..], &condition.sets].concat();
         loaded.config_with(&sets).with_context(|| format!("row `{}`", condition.name))
@@ -82,7 +83,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
             break;
         };
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
-            run::say(&format!("warning: {}: {warning}", condition.name));
+            os::say(&format!("warning: {}: {warning}", condition.name));
         }
         let nominal = rows.first().map_or(score.goals, |nominal| nominal.score.goals);
         // Of nothing, no share is kept.
@@ -92,12 +93,12 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     drop(bar);
     let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
     if args.json {
-        run::print(&format!("{}\n", as_json(&rows, count, args.seed, &loaded.origin.to_string())))?;
+        os::print(&format!("{}\n", as_json(&rows, count, args.seed, &loaded.origin.to_string())))?;
     } else {
-        run::print(&table(&rows, count, args.seed, &loaded.origin.to_string()))?;
+        os::print(&table(&rows, count, args.seed, &loaded.origin.to_string()))?;
     }
     match output {
-        Some(output) if interrupted => run::say(&format!("{}: interrupted, not written", output.path().display())),
+        Some(output) if interrupted => os::say(&format!("{}: interrupted, not written", output.path().display())),
         Some(output) => picture(&rows, count, &loaded.origin.to_string()).write(output)?,
         None => {}
     }
@@ -196,7 +197,7 @@ fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
         let nominal = rows[0].score.goals;
         let note = format!("{:.2} goals, {:.0} % drops", row.score.goals, 100.0 * row.score.drop_rate);
         let interval = row.score.goals_ci95.map(|goals| goals / nominal);
-        run::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
+        draw::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
     });
     let kept = |friction: &str, mass: &str| {
         let cell = rows.iter().find(|row| row.condition.cell.is_some_and(|[f, m]| [f, m] == [friction, mass]));
@@ -215,7 +216,7 @@ fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::env::EpisodeStats;
+    use crate::repose::EpisodeStats;
 
     fn row(condition: Condition, goals: u32, kept: f64) -> Row {
         let config = Config::resolve(None, &condition.sets).unwrap().env;

@@ -3,8 +3,9 @@
 use serde_json::{Map, Value, json};
 
 use crate::config::EnvConfig;
-use crate::env::{ACTUATORS, End, Env, FINGERTIPS, Group, JOINTS, OBSERVATION};
+use crate::env::{End, Env};
 use crate::evaluate::Moment;
+use crate::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION};
 
 /// The number of records at which writing stops; episodes are written whole and in order.
 const ENOUGH: usize = 2000;

@@ -5,7 +5,7 @@ use anyhow::Result;
 use crate::cli::{Motion, ViewArgs, usage_error};
 use crate::config::{Config, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
-use crate::run;
+use crate::os;
 use crate::see::{Window, screenshot, task_to_see};
 use crate::sim::Quality;
 
@@ -19,7 +19,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if args.shot.size.is_some() && args.screenshot.is_none() {
         return Err(usage_error("view", "--size applies only to a picture (--screenshot)").into());
     }
-    args.screenshot.as_deref().map_or(Ok(()), run::expect_folder)?;
+    args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
     let actors = [Actor::Zero, Actor::Random, Actor::Wave];
@@ -31,10 +31,10 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let episodes = Episodes { seed: args.seed, purpose: "score", first: 0, count: usize::MAX };
     if let Some(path) = &args.screenshot {
         let [width, height] = screenshot(path, &task, &actors[first], episodes, args.at)?;
-        run::say(&format!("{}: {width}x{height}", path.display()));
+        os::say(&format!("{}: {width}x{height}", path.display()));
         return Ok(());
     }
     let window = Window::open(&task, vec!["zero", "random", "wave"], first)?;
-    run::say(&window.play(&task, &actors, episodes)?);
+    os::say(&window.play(&task, &actors, episodes)?);
     Ok(())
 }

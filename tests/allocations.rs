@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
-use shadow_repose::env::{OBSERVATION_SIZE, Task};
+use shadow_repose::repose::{OBSERVATION_SIZE, Task};
 
 struct Watching;
 

@@ -11,10 +11,11 @@ use rand::RngExt;
 use rand::seq::SliceRandom;
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
-use shadow_repose::env::Task;
+use shadow_repose::os::{Status, StatusLine};
 use shadow_repose::ppo::{Array, Checkpoint};
+use shadow_repose::repose::Task;
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Figures, Report, Status, StatusLine};
+use shadow_repose::run::{Figures, Report};
 
 #[path = "../fuzz/targets.rs"]
 mod targets;

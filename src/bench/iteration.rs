@@ -13,10 +13,11 @@ use super::measure::{NEVER, median};
 use super::replay::{BarePool, RecordingEnv};
 use crate::agent::Agent;
 use crate::config::Config;
-use crate::env::{Env, Lesson, Randomization, Task};
+use crate::env::Env;
 use crate::load::Origin;
 use crate::ppo::{Ppo, Rollout};
 use crate::ranks::Division;
+use crate::repose::{Lesson, Randomization, Task};
 use crate::schedule::in_rounds;
 
 /// The control steps before measuring: from the catch of the cube until most hands turn it.

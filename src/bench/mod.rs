@@ -16,11 +16,13 @@ use serde_json::json;
 use crate::agent::Agent;
 use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
-use crate::env::{ACTION_SIZE, End, Env, EnvPool, Lesson, OBSERVATION_SIZE, Randomization, StepBuffers, Task};
+use crate::draw::{self, BarChart, HeatMap, NamedBar, Picture};
+use crate::env::{End, Env, EnvPool, StepBuffers};
 use crate::load::Origin;
+use crate::os::{self, OutputFile};
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
+use crate::repose::{ACTION_SIZE, Lesson, OBSERVATION_SIZE, Randomization, Task};
 use crate::rng;
-use crate::run::{self, BarChart, HeatMap, NamedBar, OutputFile, Picture};
 use crate::schedule::in_rounds;
 use iteration::{PARTS, seconds_of_parts};
 use measure::{NEVER, median};
@@ -55,10 +57,10 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
     }
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
-    output.as_ref().map(run::picture_format).transpose()?;
+    output.as_ref().map(draw::picture_format).transpose()?;
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
-    run::start_threads(config.run.threads)?;
+    os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
     let asked = |part: Part| args.only.is_none_or(|only| only == part);
     let mut figures = Vec::new();
@@ -103,9 +105,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         figures.insert("threads".into(), json!(rayon::current_num_threads()));
         figures.insert("hidden".into(), json!(config.ppo.hidden));
         figures.insert("num_envs".into(), json!(config.env.num_envs));
-        run::print(&format!("{}\n", serde_json::Value::Object(figures)))
+        os::print(&format!("{}\n", serde_json::Value::Object(figures)))
     } else {
-        run::print(&lines)
+        os::print(&lines)
     }
 }
 

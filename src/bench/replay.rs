@@ -6,7 +6,8 @@ use std::time::Instant;
 use anyhow::{Result, ensure};
 use rayon::prelude::*;
 
-use crate::env::{ACTION_SIZE, Draw, Env, EnvPool, EpisodeStats, Lesson, Randomization, Repose, Task, Transition};
+use crate::env::{Env, EnvPool, Transition};
+use crate::repose::{ACTION_SIZE, Draw, EpisodeStats, Lesson, Randomization, Repose, Task};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
 use crate::sim::{BareSimulation, FreeJoint, Scene, SimulationState};

@@ -1,5 +1,6 @@
 //! The layers of a configuration: the defaults, overlaid with the user's file, overlaid with single settings.
 
+use crate::os;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow, bail};
@@ -10,7 +11,6 @@ use super::BASE;
 use super::overlay::{overlay, table_of, with_the_others};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
-use crate::run;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
@@ -169,7 +169,7 @@ fn before() -> Table {
 /// # Errors
 /// Fails if the file cannot be read.
 pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
-    let read = |path: &Path| Ok(Source { path: path.to_owned(), text: run::read_text(path)? });
+    let read = |path: &Path| Ok(Source { path: path.to_owned(), text: os::read_text(path)? });
     path.map(read).transpose()
 }
 

@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use super::ramp::Ramp;
 use super::{BASE, removed};
-use crate::run::similar;
+use crate::os::similar;
 
 /// Returns the table with this one value. Text that is not a TOML value becomes a string, as does any text for a string key.
 pub(super) fn table_of(key: &str, text: &str, base: &Table) -> Table {

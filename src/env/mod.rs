@@ -1,33 +1,12 @@
-//! Environments that an agent acts in, and pools that step many of them at once.
+//! Environments that an agent acts in, and pools that step many of them at once. Nothing here knows the hand.
 //!
-//! This module knows physics, not learning: actions come in and observations go out as `f32` slices.
+//! Actions come in and observations go out as `f32` slices.
 
-mod conditions;
-mod episode;
-mod hand;
-mod lesson;
-mod observation;
 mod pool;
-mod randomization;
-mod repose;
-mod reward;
-mod sensing;
-mod servos;
 mod state;
-mod tail;
-mod task;
 
-pub use episode::{EpisodeStats, Recent, Score, divergence};
-pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
-pub use lesson::{Lesson, Shaping};
-pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use pool::{EnvBlock, EnvPool, StepBuffers};
-pub use randomization::{Draw, Randomization};
-pub use repose::{Diverged, Repose, StepDetails};
-pub use reward::RewardTerms;
 pub use state::{EnvState, SavedEnv};
-pub use tail::Tail;
-pub use task::Task;
 
 use anyhow::Result;
 

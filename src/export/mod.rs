@@ -9,9 +9,9 @@ use toml::{Table, Value};
 
 use crate::cli::ExportArgs;
 use crate::config::{EnvConfig, expect_used};
-use crate::env::{ACTUATORS, Hand, OBSERVATION, Task};
 use crate::load::Loaded;
-use crate::run;
+use crate::os;
+use crate::repose::{ACTUATORS, Hand, OBSERVATION, Task};
 use graph::policy_graph;
 use onnx::Model;
 
@@ -26,10 +26,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
-    let output = run::OutputFile::create(&args.out)?;
+    let output = os::OutputFile::create(&args.out)?;
     let bytes = model(&loaded, &task).to_bytes();
     output.finish(&bytes)?;
-    run::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
+    os::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
     Ok(())
 }
 

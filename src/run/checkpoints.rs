@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-use super::file::same_file;
-use super::output::{name_also, sync_folder, unused_name, write_whole};
+use crate::os::same_file;
+use crate::os::{name_also, sync_folder, unused_name, write_whole};
 
 const LATEST: &str = "latest.safetensors";
 const BEST: &str = "best.safetensors";

@@ -11,10 +11,10 @@ use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
 use tensorboard_proto::summary::Summary;
 use tensorboard_rs::record_writer::RecordWriter;
 
-use super::file::expect_named;
-use super::output::{make_own, sync_folder};
 use super::records::length_up_to;
 use super::summary::{Figures, Summaries, Tag};
+use crate::os::expect_named;
+use crate::os::{make_own, sync_folder};
 
 /// The prefix and the suffix of the names of event files.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];

@@ -9,9 +9,9 @@ use std::time::SystemTime;
 use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::Checkpoints;
-use super::file::{read_text, same_file};
-use super::lock::{LOCK, Locked};
-use super::output::{OUR_PARTIAL, PARTIAL, is_abandoned, sync_folder, write_whole};
+use crate::os::{LOCK, Locked};
+use crate::os::{OUR_PARTIAL, PARTIAL, is_abandoned, sync_folder, write_whole};
+use crate::os::{read_text, same_file};
 
 /// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";

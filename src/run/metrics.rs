@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-use super::file::expect_named;
 use super::folder::METRICS;
-use super::output::{make_own, sync_folder, unused_name};
+use crate::os::expect_named;
+use crate::os::{make_own, sync_folder, unused_name};
 
 /// The most bytes of a row. This program writes none that is longer, and the rest of a longer one is not a row either.
 pub(super) const LONGEST_ROW: u64 = 1 << 20;

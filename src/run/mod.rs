@@ -1,158 +1,19 @@
-//! The I/O of a run: its folder, its logs, the terminal, signals. Independent of environments and learning.
+//! The folder of a run and what is logged into it: checkpoints, metrics, TensorBoard events.
 
-mod bar_chart;
-mod chart;
 mod checkpoints;
 mod events;
-mod file;
-#[cfg(feature = "video")]
-mod film;
 mod folder;
 mod histogram;
-mod interrupt;
-mod lock;
-mod machine;
-mod meshes;
 mod metrics;
-mod output;
-mod pip;
-#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
-mod processor;
-mod progress;
 mod records;
 mod report;
-mod similar;
 mod summary;
 mod table;
 
-pub use bar_chart::{BarChart, HeatMap, NamedBar};
-pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
 pub use checkpoints::Checkpoints;
 pub use events::SETTINGS;
-pub use file::{read_bytes, read_text, same_file};
-#[cfg(feature = "video")]
-pub use film::{Clip, FilmFormat, FilmWriter, write_png};
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use histogram::Histogram;
-pub use interrupt::{Requests, exit_code};
-pub use lock::Locked;
-pub use machine::{Machine, program_checksum};
-pub use meshes::hand_meshes;
-pub use output::{OutputFile, expect_folder, write_whole};
-pub use progress::{Bar, Status, StatusLine};
 pub use report::Report;
-pub use similar::similar;
 pub use summary::{Animation, Figures, Tag};
 pub use table::{MetricsTable, read_metrics};
-
-use std::io::{ErrorKind, Write};
-use std::path::Path;
-use std::sync::OnceLock;
-
-use anyhow::{Context, Result, anyhow, ensure};
-
-/// Prints text to stdout. A closed pipe is not an error.
-///
-/// # Errors
-/// Fails if stdout cannot be written to, e.g. on a full disk.
-pub fn print(text: &str) -> Result<()> {
-    let mut stdout = std::io::stdout();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to stdout"),
-        _ => Ok(()),
-    }
-}
-
-/// What each line of [`say`] begins with.
-static SPEAKER: OnceLock<String> = OnceLock::new();
-
-/// From now on, lines to stderr begin with this name: there are several processes, and they print to the same place.
-pub fn speak_as(name: &str) {
-    let _ = SPEAKER.set(format!("{name}: "));
-}
-
-/// Prints a line to stderr. Control characters are escaped, since the line may quote an untrusted file.
-pub fn say(line: &str) {
-    let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
-    for c in line.chars() {
-        match c {
-            '\n' | '\t' => harmless.push(c),
-            c if c.is_control() => harmless.extend(c.escape_default()),
-            c => harmless.push(c),
-        }
-    }
-    let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
-}
-
-/// Returns a text as a single shell word, quoted if necessary.
-pub fn quoted(text: &str) -> String {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
-    if !text.is_empty() && text.chars().all(plain) {
-        text.to_owned()
-    } else {
-        format!("'{}'", text.replace('\'', "'\\''"))
-    }
-}
-
-/// Returns a path as a single shell word, even if it is not valid UTF-8.
-pub fn quoted_path(path: &Path) -> String {
-    path.to_str().map_or_else(
-        || {
-            let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
-            // The only one of these escapes that means something else in a shell.
-            format!("$'{}'", escaped.replace("\\\"", "\""))
-        },
-        quoted,
-    )
-}
-
-/// Returns how the user has called this program, for commands that are printed: by cargo, by a path, or by its name.
-pub fn called_as() -> String {
-    let exe = std::env::current_exe().unwrap_or_default();
-    if std::env::var_os("CARGO_PKG_NAME").is_some_and(|name| name == env!("CARGO_PKG_NAME")) {
-        let is_release = exe.components().any(|part| part.as_os_str() == "release");
-        return format!("cargo run {}--", if is_release { "--release " } else { "" });
-    }
-    std::env::args_os().next().map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
-}
-
-/// Whether there is a display on which a window could open.
-pub fn has_display() -> bool {
-    ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
-}
-
-/// The most worker threads per core; more would only take turns.
-const MOST_THREADS: usize = 16;
-
-/// Starts rayon's global pool, which the whole program uses, with this number of worker threads (0: one per core).
-///
-/// # Errors
-/// Fails if the number is too large, if the system refuses the threads, or on a second call.
-pub fn start_threads(threads: usize) -> Result<()> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let most = MOST_THREADS * cores;
-    ensure!(
-        threads <= most,
-        "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core; set --threads"
-    );
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-    // The text of this error already contains that of its source.
-    pool.build_global().map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
-}
-
-#[cfg(test)]
-mod tests {
-    use std::os::unix::ffi::OsStrExt;
-
-    use super::*;
-
-    #[test]
-    fn words_with_a_meaning_for_a_shell_are_quoted() {
-        assert_eq!(quoted("runs/a-1"), "runs/a-1");
-        assert_eq!(quoted("my run"), "'my run'");
-        assert_eq!(quoted("$(it's)"), "'$(it'\\''s)'");
-        assert_eq!(quoted_path(Path::new("my run")), "'my run'");
-        let odd = std::ffi::OsStr::from_bytes(b"a \xff'\"\\");
-        assert_eq!(quoted_path(Path::new(odd)), r#"$'a \xff\'"\\'"#);
-    }
-}

@@ -12,8 +12,8 @@ use anyhow::Result;
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
-use super::progress::{Status, StatusLine};
 use super::summary::{Figures, Tag};
+use crate::os::{Status, StatusLine};
 
 /// The columns before the tags.
 const FIXED: [&str; 2] = ["iteration", "env_steps"];

@@ -9,9 +9,12 @@ use anyhow::{Result, ensure};
 
 use crate::cli::Shot;
 use crate::config::EnvConfig;
-use crate::env::{Env, Repose, Task};
+use crate::draw::{self, Clip, FilmFormat, FilmWriter};
+use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player, evaluate};
-use crate::run::{self, Animation, Bar, Clip, FilmFormat, FilmWriter, OutputFile};
+use crate::os::{Bar, OutputFile};
+use crate::repose::{Repose, Task};
+use crate::run::Animation;
 use crate::sim::{Quality, Renderer};
 
 use super::task_to_see;
@@ -168,6 +171,6 @@ pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episod
     }
     let size = renderer.size();
     let picture = renderer.draw(player.env().simulation())?;
-    run::write_png(output, size, picture)?;
+    draw::write_png(output, size, picture)?;
     Ok(size)
 }

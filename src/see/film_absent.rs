@@ -7,8 +7,8 @@ use std::sync::atomic::AtomicBool;
 use anyhow::{Result, bail};
 
 use crate::config::EnvConfig;
-use crate::env::Task;
 use crate::evaluate::{Actor, Episodes, Moment};
+use crate::repose::Task;
 use crate::run::Animation;
 
 const ABSENT: &str = "this build cannot make films or pictures: it was built without the feature `video`";

@@ -6,8 +6,8 @@ use anyhow::Result;
 
 use crate::cli::Shot;
 use crate::config::EnvConfig;
-use crate::env::Task;
-use crate::run;
+use crate::os;
+use crate::repose::Task;
 use crate::sim::{Look, Quality, mesh_files};
 
 /// Loads the task for display as `shot` requests. If the meshes are not available, prints a note and shows the primitives.
@@ -19,8 +19,8 @@ pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Qua
     let meshes = if shot.plain || own_scene {
         Vec::new()
     } else {
-        run::hand_meshes(&mesh_files()).unwrap_or_else(|error| {
-            run::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
+        os::hand_meshes(&mesh_files()).unwrap_or_else(|error| {
+            os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
             Vec::new()
         })
     };
@@ -30,7 +30,7 @@ pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Qua
         if look.meshes.is_empty() {
             return Err(error);
         }
-        run::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
+        os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
         look.meshes.clear();
         Task::new_to_see(config, &look)
     })

@@ -7,9 +7,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use crate::env::{ACTION_SIZE, Env, Repose, RewardTerms, Task};
+use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
-use crate::run;
+use crate::os;
+use crate::repose::{ACTION_SIZE, Repose, RewardTerms, Task};
 use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
 /// Whether this build has windows.
@@ -38,7 +39,7 @@ impl Window {
     /// Fails if there is no display or a library is missing; the message names the packages that provide it.
     pub fn open(task: &Task, actors: Vec<&'static str>, first: usize) -> Result<Self> {
         let viewer = Viewer::open(task.scene(), "shadow-repose", actors, first)?;
-        run::say(KEYS);
+        os::say(KEYS);
         Ok(Self { viewer })
     }
 

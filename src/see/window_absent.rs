@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use anyhow::{Result, bail};
 
-use crate::env::Task;
 use crate::evaluate::{Actor, Episodes};
+use crate::repose::Task;
 
 /// Whether this build has windows.
 pub const HAS_WINDOWS: bool = false;

@@ -7,8 +7,9 @@ use anyhow::{Error, anyhow};
 
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes};
+use crate::os;
 use crate::ppo::Policy;
-use crate::run::{self, Animation, Report};
+use crate::run::{Animation, Report};
 use crate::schedule::panic_message;
 use crate::see::EpisodeFilms;
 
@@ -26,7 +27,7 @@ impl Films {
         if every > 0 {
             match EpisodeFilms::new(&config.env) {
                 Ok(episodes) => films.episodes = Some(episodes),
-                Err(error) => run::say(&format!("warning: {}", absent(&error))),
+                Err(error) => os::say(&format!("warning: {}", absent(&error))),
             }
         }
         films

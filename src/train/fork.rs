@@ -9,9 +9,9 @@ use super::session::SCENE;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, user_file};
-use crate::env::{SPACES, Task};
 use crate::load::{self, MODEL, Origin};
 use crate::ppo::{Checkpoint, Fork};
+use crate::repose::{SPACES, Task};
 use crate::run::RunFolder;
 
 impl Plan {

@@ -1,10 +1,10 @@
 //! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
 
 use crate::agent::Iteration;
-use crate::env::{EpisodeStats, Lesson, Recent, Score};
 use crate::ppo::{Policy, Rollout, RolloutBlock, UpdateStats};
 use crate::quantities::quantity;
 use crate::ranks::Traffic;
+use crate::repose::{EpisodeStats, Lesson, Recent, Score};
 use crate::run::{self, Histogram, Tag};
 
 /// The scores of the episodes that ended in an iteration.
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
     use crate::agent::Agent;
     use crate::config::Config;
-    use crate::env::{RewardTerms, Shaping, Task};
+    use crate::repose::{RewardTerms, Shaping, Task};
 
     #[test]
     fn everything_that_is_logged_is_described() {

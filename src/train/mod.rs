@@ -21,11 +21,12 @@ use anyhow::{Context, Error, Result};
 use crate::agent::Iteration;
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::env::{EpisodeStats, Lesson, Recent, Repose, Score, divergence};
 use crate::evaluate::{Actor, Episodes, evaluate_together};
+use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::Evaluation;
 use crate::ranks::{self, Ranks, Traffic};
-use crate::run::{self, Figures, Report, Requests, Status, StatusLine};
+use crate::repose::{EpisodeStats, Lesson, Recent, Repose, Score, divergence};
+use crate::run::{Figures, Report};
 use hints::hints;
 use log::{Ended, FILM, described, histograms, row, tags};
 use saver::Saver;
@@ -52,7 +53,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
         return lead(args, requests, ranks);
     }
     if ranks.rank() > 0 {
-        run::speak_as(&format!("rank {}", ranks.rank()));
+        os::speak_as(&format!("rank {}", ranks.rank()));
     }
     let work = || if ranks.rank() == 0 { lead(args, requests, ranks) } else { follow(requests, ranks) };
     // To leave the ranks means to wait for the others, who may be waiting for this one.
@@ -62,7 +63,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
             // What all ranks meet at once, such as a loss that is not finite, is told by the first.
             std::thread::sleep(PATIENCE);
         }
-        run::say(&format!("error: {error:#}"));
+        os::say(&format!("error: {error:#}"));
         ranks.abort()
     })
 }
@@ -72,14 +73,14 @@ fn lead(args: &TrainArgs, requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result
     let (mut session, mut saver) = Session::lead(args, ranks)?;
     let place = saver.folder().path().display().to_string();
     if session.finished() {
-        run::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.steps_made()));
+        os::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.steps_made()));
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(limit) = args.stop_after {
         requests.stop_after(limit)?;
     }
     requests.wait_for_end();
-    run::say(&format!("run folder: {place}"));
+    os::say(&format!("run folder: {place}"));
     if !args.quiet {
         say_hints(&session)?;
     }
@@ -135,22 +136,22 @@ fn run_to_end(session: &mut Session, mut saver: Saver, report: &mut Report, requ
     }
     saver.save_at_last(report)?;
     session.count_divergence();
-    run::say(&format!("finished: {}; {}", saver.steps_made(), saver.folder().path().display()));
+    os::say(&format!("finished: {}; {}", saver.steps_made(), saver.folder().path().display()));
     Ok(ExitCode::SUCCESS)
 }
 
 /// Prints notes about settings that are rarely intended.
 fn say_hints(session: &Session) -> Result<()> {
     let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-    hints.iter().for_each(|hint| run::say(&format!("note: {hint}")));
+    hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
     Ok(())
 }
 
 /// Prints how to look at a run that has finished.
 fn say_what_next(run: &Path) {
-    let (program, run_word) = (run::called_as(), run::quoted_path(run));
-    let all = run::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
-    run::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
+    let (program, run_word) = (os::called_as(), os::quoted_path(run));
+    let all = os::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
+    os::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
 }
 
 /// What an iteration has made, on all ranks together where it says nothing else. It is whole on the first rank only.
@@ -278,7 +279,7 @@ impl Session {
     /// Prints the total number of diverged steps at the end, if there was a warning.
     fn count_divergence(&self) {
         if self.warned {
-            run::say(&format!("warning: {} steps of this session diverged", self.diverged));
+            os::say(&format!("warning: {} steps of this session diverged", self.diverged));
         }
     }
 }
@@ -311,10 +312,10 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
 fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, stopped: &str) -> Result<ExitCode> {
     saver.save_at_last(report)?;
     if saver.has_begun() {
-        run::say(&format!("{stopped} after {}; resume with", saver.steps_made()));
-        run::say(&format!("  {}", saver.how_to_resume()));
+        os::say(&format!("{stopped} after {}; resume with", saver.steps_made()));
+        os::say(&format!("  {}", saver.how_to_resume()));
     } else {
-        run::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
+        os::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
     }
     Ok(code)
 }
@@ -322,9 +323,9 @@ fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, stopped: &str) ->
 /// Saves the state at the end of the last complete iteration after a failure, and returns the error.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
     match saver.save_at_last(report) {
-        Ok(()) if saver.has_begun() => run::say(&format!("saved the state after {}", saver.steps_made())),
-        Ok(()) => run::say("the run folder was not changed"),
-        Err(error) => run::say(&format!("error: {error:#}")),
+        Ok(()) if saver.has_begun() => os::say(&format!("saved the state after {}", saver.steps_made())),
+        Ok(()) => os::say("the run folder was not changed"),
+        Err(error) => os::say(&format!("error: {error:#}")),
     }
     error
 }
@@ -364,7 +365,7 @@ mod tests {
         let latest = saver.folder().checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");
-        let saved = run::read_bytes(&latest).unwrap();
+        let saved = os::read_bytes(&latest).unwrap();
         assert_eq!(Checkpoint::parse(&saved).unwrap().progress.iteration, 1);
     }
 

@@ -10,11 +10,12 @@ use super::saver::{Begin, best_so_far};
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, NetConfig, Override, PolicyConfig, user_file};
-use crate::env::SPACES;
 use crate::load::{self, MODEL, Origin};
+use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation};
 use crate::ranks::Ranks;
-use crate::run::{self, Locked, RunFolder};
+use crate::repose::SPACES;
+use crate::run::{self, RunFolder};
 
 /// What a training begins with, the same on all ranks.
 pub(super) struct Plan {
@@ -113,7 +114,7 @@ impl Plan {
         expect_config(&folder, &config)?;
         settle_model(&mut config)?;
         if config.run.shards == 0 {
-            run::say(&format!(
+            os::say(&format!(
                 "note: {} was made before trainings had shards: the resumed run is not the same bit for bit",
                 path.display()
             ));
@@ -121,7 +122,7 @@ impl Plan {
         // The best is the one in the folder. It may have been saved after the checkpoint that is resumed, and a worse one must
         // not replace it.
         let best = best_so_far(&folder, checkpoint.progress.best);
-        let begin = if run::same_file(&path, &newest[0]) { Begin::FromNewest } else { Begin::FromOlder };
+        let begin = if os::same_file(&path, &newest[0]) { Begin::FromNewest } else { Begin::FromOlder };
         let plan = Self { start: Start::State(checkpoint), context, ..Self::new(config, args) };
         Ok((plan, Existing { folder, lock, begin, best }))
     }

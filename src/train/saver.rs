@@ -6,8 +6,9 @@ use std::sync::Arc;
 use anyhow::{Error, Result, anyhow};
 
 use crate::load;
+use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
-use crate::run::{self, Locked, Report, RunFolder};
+use crate::run::{Report, RunFolder};
 use crate::sim;
 
 /// The state that a training begins with.
@@ -187,19 +188,19 @@ impl Saver {
         let best = self.best.clone().filter(|_| !self.best_is_saved);
         let options = self.options.clone();
         sim::before_fatal_error(move |said| {
-            run::say(&format!("error: {said}"));
+            os::say(&format!("error: {said}"));
             let replaced = || anyhow!("{} has been replaced", folder.path().display());
             let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
             if !begun {
-                return run::say("the run folder was not changed");
+                return os::say("the run folder was not changed");
             }
             match held.and_then(|()| write(&folder, best.as_deref(), &end, keep)) {
                 Ok(()) => {
                     let iteration = end.progress.iteration;
                     let command = how_to_resume(folder.path(), &options);
-                    run::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
+                    os::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
                 }
-                Err(error) => run::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &end, &options))),
+                Err(error) => os::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &end, &options))),
             }
         });
     }
@@ -218,7 +219,7 @@ fn write(folder: &RunFolder, best: Option<&Checkpoint>, end: &Checkpoint, keep: 
     let checkpoints = folder.checkpoints();
     match best {
         Some(best) => {
-            run::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
+            os::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
             checkpoints.write_best(&best.to_bytes()?)?;
         }
         None => keep_policy(folder, end)?,
@@ -242,7 +243,7 @@ fn keep_policy(folder: &RunFolder, end: &Checkpoint) -> Result<()> {
             latest
         }
     };
-    run::write_whole(&folder.policy(), &policy.to_bytes()?)
+    os::write_whole(&folder.policy(), &policy.to_bytes()?)
 }
 
 /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
@@ -270,7 +271,7 @@ fn elsewhere(reason: Error, best: Option<&Checkpoint>, end: &Checkpoint, options
 
 /// Returns the command that resumes the run in this folder with the same options.
 fn how_to_resume(run: &Path, options: &str) -> String {
-    format!("{} train --resume {}{options}", run::called_as(), run::quoted_path(run))
+    format!("{} train --resume {}{options}", os::called_as(), os::quoted_path(run))
 }
 
 /// Returns the versions of the program and its parts, as written into a run folder.

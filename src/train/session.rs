@@ -10,11 +10,12 @@ use super::saver::{Begin, Saver};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::env::{Repose, Task};
 use crate::load::MODEL;
+use crate::os::{self, Locked};
 use crate::ppo::{Array, Checkpoint, Evaluation};
 use crate::ranks::{Division, Ranks};
-use crate::run::{self, Locked, RunFolder};
+use crate::repose::{Repose, Task};
+use crate::run::RunFolder;
 
 /// The name under which a checkpoint stores the fingerprint of its environments' scene.
 pub(super) const SCENE: &str = "scene";
@@ -59,7 +60,7 @@ impl Session {
         plan.send(&**ranks)?;
         let mut session = Self::set_up(plan, ranks.clone())?;
         if let Some(warning) = session.expect_alike()? {
-            run::say(&format!("warning: {warning}"));
+            os::say(&format!("warning: {warning}"));
         }
         // A new folder is created last, so that a training that cannot be set up leaves none behind.
         let (folder, lock, begin) = match existing {
@@ -86,7 +87,7 @@ impl Session {
     }
 
     fn set_up(plan: Plan, ranks: Arc<dyn Ranks>) -> Result<Self> {
-        run::start_threads(plan.config.run.threads)?;
+        os::start_threads(plan.config.run.threads)?;
         Self::of(plan, ranks)
     }
 
@@ -135,7 +136,7 @@ impl Session {
             Start::State(mut checkpoint) => {
                 let restored = agent.restore(&mut checkpoint).and_then(|()| checkpoint.take_counters(SCENE));
                 if restored? != [self.scene] && first {
-                    run::say(
+                    os::say(
                         "warning: the scene is not the one of the checkpoint: the resumed run is a different training",
                     );
                 }
@@ -164,7 +165,7 @@ impl Session {
 
     /// Returns the saver of this training for `folder`.
     pub(super) fn saver(&self, folder: RunFolder, lock: Locked, args: &TrainArgs, begin: Begin) -> Saver {
-        let model = self.config.env.model_file().map(|model| run::quoted(&format!("{MODEL}={}", model.display())));
+        let model = self.config.env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
         let model = model.map_or(String::new(), |set| format!(" --set {set}"));
         let options = format!("{model}{}", if args.dump_diverged { " --dump-diverged" } else { "" });
         Saver::new((folder, lock), args.keep, options, self.checkpoint(), begin)

@@ -10,8 +10,9 @@ use anyhow::{Error, Result, anyhow, bail, ensure};
 
 use super::session::Session;
 use crate::dump;
+use crate::os::{self, Machine, Requests};
 use crate::ranks::{self, Ranks};
-use crate::run::{self, Machine, Report, Requests, RunFolder};
+use crate::run::{Report, RunFolder};
 use crate::schedule::panic_message;
 use crate::sim;
 
@@ -29,7 +30,7 @@ pub(super) struct Next {
 
 /// Trains as a rank that computes, and leaves reporting and saving to the first.
 pub(super) fn follow(requests: &Requests, ranks: &Arc<dyn Ranks>) -> Result<ExitCode> {
-    sim::before_fatal_error(|said| run::say(&format!("error: {said}")));
+    sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
     let mut session = Session::follow(ranks)?;
     requests.wait_for_end();
     // The state that the first rank's saver begins with.
@@ -66,7 +67,7 @@ impl Session {
         let [low, high] = [self.scene & u64::from(u32::MAX), self.scene >> 32].map(|half| half as f64);
         let name = f64::from(crc32fast::hash(machine.name.as_bytes()));
         let [allowed, processors] = [machine.allowed, machine.processors].map(|count| count as f64);
-        let program = if alone { 0.0 } else { f64::from(run::program_checksum()) };
+        let program = if alone { 0.0 } else { f64::from(os::program_checksum()) };
         let own = [program, low, high, name, allowed, processors];
         let all = self.agent.division.gather(own.to_vec());
         let rows: Vec<&[f64]> = all.chunks(own.len()).collect();
@@ -110,7 +111,7 @@ impl Session {
             );
         }
         let most = |i: usize| rows.iter().map(|row| row[i]).fold(0.0, f64::max);
-        let stop = (most(0) > 0.0).then(|| run::exit_code(most(3) as i32));
+        let stop = (most(0) > 0.0).then(|| os::exit_code(most(3) as i32));
         Ok(Next { save: most(1) > 0.0, stop, by_file: asked_to_stop, improved: most(2) > 0.0 })
     }
 

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shadow_repose::env::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION};
+use shadow_repose::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

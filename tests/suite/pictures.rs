@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 
 use openh264::decoder::Decoder;
 use openh264::formats::YUVSource;
-use shadow_repose::env::{ACTION_SIZE, Env, Repose, Task};
+use shadow_repose::env::Env;
+use shadow_repose::repose::{ACTION_SIZE, Repose, Task};
 use shadow_repose::sim::{Camera, Look, Quality, mesh_files};
 use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
 use shiguredo_mp4::boxes::SampleEntry;

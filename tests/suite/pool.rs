@@ -1,7 +1,8 @@
 //! Pools of many environments.
 
 use rand::RngExt;
-use shadow_repose::env::{ACTION_SIZE, End, EnvBlock, EnvPool, OBSERVATION_SIZE, Repose, StepBuffers};
+use shadow_repose::env::{End, EnvBlock, EnvPool, StepBuffers};
+use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, Repose};
 use shadow_repose::rng;
 use shadow_repose::schedule::in_rounds;
 

@@ -8,11 +8,10 @@ use std::sync::atomic::AtomicBool;
 
 use serde_json::Value;
 use shadow_repose::config::{Config, Ramp};
-use shadow_repose::env::{
-    Draw, Env, EnvState, Lesson, OBSERVATION_SIZE, Randomization, Repose, Resumable, Score, Task,
-};
+use shadow_repose::env::{Env, EnvState, Resumable};
 use shadow_repose::evaluate::{Actor, Episodes, evaluate};
 use shadow_repose::load::Loaded;
+use shadow_repose::repose::{Draw, Lesson, OBSERVATION_SIZE, Randomization, Repose, Score, Task};
 use shadow_repose::rng;
 
 use crate::support::{

@@ -6,10 +6,11 @@ use std::sync::{Arc, Barrier, Mutex};
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
-use shadow_repose::env::{Env, EpisodeStats, Lesson, Repose, SPACES, Task};
+use shadow_repose::env::Env;
 use shadow_repose::evaluate::{Actor, Episodes, evaluate, evaluate_together};
 use shadow_repose::ppo::{Checkpoint, Ppo};
 use shadow_repose::ranks::{Division, Ranks};
+use shadow_repose::repose::{EpisodeStats, Lesson, Repose, SPACES, Task};
 
 use crate::point_mass::{divided, settings};
 use crate::support::config;

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use shadow_repose::env::{Env, Hand, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::env::Env;
+use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, Task};
 use shadow_repose::sim::{BareSimulation, Compilation, Physics, Scene, Simulation};
 
 use crate::support::{SCENE, env_config, started, task};

@@ -6,7 +6,8 @@ use std::process::{Command, Output};
 use std::sync::Arc;
 
 use shadow_repose::config::{Config, EnvConfig, Override};
-use shadow_repose::env::{Env, OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::env::Env;
+use shadow_repose::repose::{OBSERVATION_SIZE, Repose, Task};
 use shadow_repose::rng;
 
 /// The built-in scene as text.

@@ -4,8 +4,9 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
-use shadow_repose::env::{End, Env, Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
+use shadow_repose::env::{End, Env};
 use shadow_repose::quat::{self, Quat};
+use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
 use shadow_repose::rng;
 use shadow_repose::sim::{Pose, Velocity};
 

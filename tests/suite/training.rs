@@ -4,9 +4,10 @@ use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Symmetry;
-use shadow_repose::env::{End, Env, EnvPool, Lesson, OBSERVATION_SIZE, Repose, SPACES, StepBuffers};
+use shadow_repose::env::{End, Env, EnvPool, StepBuffers};
 use shadow_repose::ppo::Perception;
 use shadow_repose::quat::{self, Quat};
+use shadow_repose::repose::{Lesson, OBSERVATION_SIZE, Repose, SPACES};
 use shadow_repose::rng;
 
 use crate::support::{config, started, task};

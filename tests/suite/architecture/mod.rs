@@ -14,22 +14,22 @@ use syn::visit::{self, Visit};
 const LONGEST_FILE: usize = 450;
 const LONGEST_FUNCTION: usize = 60;
 
-/// Words that may appear in one folder of src/ only.
-const FENCES: [(&str, &str); 14] = [
-    ("mpi::", "ranks"),
-    ("mujoco_rs", "sim"),
-    ("candle_", "ppo/candle"),
-    ("safetensors::", "ppo"),
-    ("std::fs", "run"),
-    ("println!", "run"),
-    ("indicatif", "run"),
-    ("tensorboard_", "run"),
-    ("signal_hook", "run"),
-    ("egui::", "sim"),
-    ("openh264", "run"),
-    ("shiguredo_mp4", "run"),
-    ("png::", "run"),
-    ("plotters", "run"),
+/// Words that may appear in these folders of src/ only.
+const FENCES: [(&str, &[&str]); 14] = [
+    ("mpi::", &["ranks"]),
+    ("mujoco_rs", &["sim"]),
+    ("candle_", &["ppo/candle"]),
+    ("safetensors::", &["ppo"]),
+    ("std::fs", &["os", "run"]),
+    ("println!", &["os"]),
+    ("indicatif", &["os"]),
+    ("tensorboard_", &["run"]),
+    ("signal_hook", &["os"]),
+    ("egui::", &["sim"]),
+    ("openh264", &["draw"]),
+    ("shiguredo_mp4", &["draw"]),
+    ("png::", &["draw"]),
+    ("plotters", &["draw"]),
 ];
 
 /// The files that may contain unsafe code; each allows it with a reason.
@@ -37,7 +37,7 @@ const UNSAFE: [&str; 6] = [
     "ppo/kernels/amx.rs",
     "ppo/kernels/avx512.rs",
     "ppo/kernels/product.rs",
-    "run/processor.rs",
+    "os/processor.rs",
     "sim/fatal.rs",
     "sim/variation.rs",
 ];
@@ -68,9 +68,9 @@ fn outside_worlds_are_fenced() {
     for file in files {
         let text = fs::read_to_string(&file).unwrap();
         let inside = file.strip_prefix(src()).unwrap();
-        for (word, folder) in FENCES {
-            let allowed = inside.starts_with(folder) || !text.contains(word);
-            assert!(allowed, "{} names {word}, which belongs in src/{folder}", inside.display());
+        for (word, folders) in FENCES {
+            let allowed = folders.iter().any(|folder| inside.starts_with(folder)) || !text.contains(word);
+            assert!(allowed, "{} names {word}, which belongs in {folders:?}", inside.display());
         }
         let allowed = UNSAFE.iter().any(|name| inside == Path::new(name)) || !text.contains("unsafe_code");
         assert!(allowed, "{} must not allow unsafe code", inside.display());

@@ -7,7 +7,7 @@ use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::OutputFile;
+use crate::os::OutputFile;
 
 /// Curves of one quantity.
 pub struct Subplot {
@@ -93,7 +93,7 @@ pub trait Picture {
             Format::Png => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
                 self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
-                super::write_png(output, self.size(), &rgb)
+                super::film::write_png(output, self.size(), &rgb)
             }
         }
     }
@@ -310,7 +310,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
         chart.write(OutputFile::create(&path).unwrap()).unwrap();
-        std::fs::read_to_string(path).unwrap()
+        crate::os::read_text(path).unwrap()
     }
 
     #[test]

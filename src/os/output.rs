@@ -18,10 +18,10 @@ use super::file::read_bytes;
 use super::quoted_path;
 
 /// The extension of a file that is not complete yet.
-pub(super) const PARTIAL: &str = "partial";
+pub const PARTIAL: &str = "partial";
 
 /// The prefix of its name, followed by the process id.
-pub(super) const OUR_PARTIAL: &str = ".shadow-repose-";
+pub const OUR_PARTIAL: &str = ".shadow-repose-";
 
 /// The most consecutive symbolic links that are followed.
 const MOST_LINKS: usize = 40;
@@ -31,26 +31,26 @@ static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
 /// A file or folder that is removed when this is dropped or when a signal ends the program, unless it has been renamed by then.
 #[derive(Debug)]
-pub(super) struct Unfinished {
+pub struct Unfinished {
     path: PathBuf,
 }
 
 impl Unfinished {
     /// Registers a path where something is about to be created.
-    pub(super) fn new(path: PathBuf) -> Self {
+    pub fn new(path: PathBuf) -> Self {
         UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
         Self { path }
     }
 
     /// Registers a unique name in the same folder as the final `path`.
-    pub(super) fn beside(path: &Path) -> Self {
+    pub fn beside(path: &Path) -> Self {
         // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
         Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.{PARTIAL}", std::process::id())))
     }
 
     /// Returns its path.
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         &self.path
     }
 }
@@ -76,7 +76,7 @@ fn remove(path: &Path) {
 }
 
 /// Whether a name is that of an unfinished file whose process has ended.
-pub(super) fn is_abandoned(name: &str) -> bool {
+pub fn is_abandoned(name: &str) -> bool {
     let rest = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
     rest.is_some_and(|(process, _)| !Path::new("/proc").join(process).exists())
 }
@@ -188,7 +188,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
 ///
 /// # Errors
 /// Fails if the second name cannot be created.
-pub(super) fn name_also(path: &Path, name: &Path) -> Result<()> {
+pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     let unfinished = Unfinished::beside(name);
     if fs::hard_link(path, unfinished.path()).is_err() {
         return write_whole(name, &read_bytes(path)?);
@@ -201,7 +201,7 @@ pub(super) fn name_also(path: &Path, name: &Path) -> Result<()> {
 ///
 /// # Errors
 /// Fails if the folder cannot be read, or if the disk fails.
-pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
+pub fn sync_folder(path: &Path) -> io::Result<()> {
     match File::open(folder_of(path))?.sync_all() {
         // Some network file systems cannot sync folders, and do not need to.
         Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
@@ -210,7 +210,7 @@ pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
 }
 
 /// Returns `path`, or a numbered variant of it, that does not exist yet.
-pub(super) fn unused_name(path: &Path) -> PathBuf {
+pub fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
     let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
@@ -222,7 +222,7 @@ pub(super) fn unused_name(path: &Path) -> PathBuf {
 ///
 /// # Errors
 /// Fails if the file cannot be written.
-pub(super) fn make_own(path: &Path) -> io::Result<()> {
+pub fn make_own(path: &Path) -> io::Result<()> {
     if fs::metadata(path).is_ok_and(|facts| facts.nlink() > 1) {
         let copy = Unfinished::beside(path);
         fs::copy(path, copy.path())?;

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 
-use crate::run::OutputFile;
+use crate::os::OutputFile;
 
 /// The parameters of a film file.
 #[derive(Clone, Copy, Debug)]

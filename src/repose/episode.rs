@@ -2,7 +2,8 @@
 
 use anyhow::{Result, ensure};
 
-use super::{EnvState, RewardTerms, SavedEnv, Shaping};
+use super::{RewardTerms, Shaping};
+use crate::env::{EnvState, SavedEnv};
 use crate::ranks::Division;
 
 /// The sums over one episode.

@@ -13,11 +13,9 @@ use super::randomization::{Draw, Randomization};
 use super::servos::{Servos, Targets};
 use super::tail::{Recorder, Tail};
 use super::task::Task;
-use super::{
-    ACTION_SIZE, End, Env, EnvState, EpisodeStats, Lesson, Recent, Resumable, RewardTerms, SavedEnv, Shaping,
-    Transition,
-};
+use super::{ACTION_SIZE, EpisodeStats, Lesson, Recent, RewardTerms, Shaping};
 use crate::config::{EnvConfig, SuccessHold};
+use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
 use crate::sim::{Physics, Pose, Simulation, Velocity};

@@ -45,7 +45,7 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// Fails if it does not.
-pub(super) fn expect_named(path: &Path, file: &File) -> Result<()> {
+pub fn expect_named(path: &Path, file: &File) -> Result<()> {
     let context = || format!("cannot find {}", path.display());
     let [named, held] = [fs::metadata(path).with_context(context)?, file.metadata().with_context(context)?];
     let same = (named.dev(), named.ino()) == (held.dev(), held.ino());

@@ -16,7 +16,7 @@ pub struct Lesson {
     pub hold: u32,
     /// Probability that the goal is replaced after a step in which it was not reached.
     pub redirect_chance: f64,
-    /// Whether reaching a goal ends it with [`super::End::Redirected`], so that its value is the same as if it stayed. No value
+    /// Whether reaching a goal ends it with [`crate::env::End::Redirected`], so that its value is the same as if it stayed. No value
     /// then depends on the hold so far, which is not observed. In the task itself the next goal follows immediately.
     pub goals_end: bool,
     /// Probability that an episode that begins is randomised, where the environment can do that.

@@ -11,7 +11,7 @@ use super::file::expect_named;
 use super::output::Unfinished;
 
 /// The name of the lock file.
-pub(super) const LOCK: &str = "run.lock";
+pub const LOCK: &str = "run.lock";
 
 /// The lock on a run folder. The system releases it when the program ends, however it ends.
 #[derive(Debug)]

@@ -8,7 +8,7 @@ use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
 use super::format::{FilmEncoder, FilmFormat};
-use crate::run::OutputFile;
+use crate::os::OutputFile;
 
 /// The number of colours in the palette; the index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;

@@ -17,7 +17,7 @@ use self::caption::Captions;
 use self::format::FilmEncoder;
 use self::gif::GifFilm;
 use self::mp4::Mp4Film;
-use super::OutputFile;
+use crate::os::OutputFile;
 
 pub use self::format::FilmFormat;
 

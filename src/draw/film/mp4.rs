@@ -17,7 +17,7 @@ use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::mux::{Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size};
 
 use super::format::{FilmEncoder, FilmFormat};
-use crate::run::OutputFile;
+use crate::os::OutputFile;
 
 /// Seconds between key frames, which are the frames that a player can seek to.
 const KEY_FRAME_EVERY: u32 = 2;

@@ -1,0 +1,11 @@
+//! Charts, films and pictures as files.
+
+mod bar_chart;
+mod chart;
+#[cfg(feature = "video")]
+mod film;
+
+pub use bar_chart::{BarChart, HeatMap, NamedBar};
+pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
+#[cfg(feature = "video")]
+pub use film::{Clip, FilmFormat, FilmWriter, write_png};

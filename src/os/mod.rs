@@ -1,0 +1,29 @@
+//! The system around the program: files, the terminal, signals, locks, threads, and pip.
+
+mod file;
+mod interrupt;
+mod lock;
+mod machine;
+mod meshes;
+mod output;
+mod pip;
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+mod processor;
+mod progress;
+mod similar;
+mod terminal;
+mod threads;
+
+pub use file::{expect_named, read_bytes, read_text, same_file};
+pub use interrupt::{Requests, exit_code};
+pub use lock::{LOCK, Locked};
+pub use machine::{Machine, program_checksum};
+pub use meshes::hand_meshes;
+pub use output::{
+    OUR_PARTIAL, OutputFile, PARTIAL, Unfinished, expect_folder, is_abandoned, make_own, name_also, sync_folder,
+    unused_name, write_whole,
+};
+pub use progress::{Bar, Status, StatusLine};
+pub use similar::similar;
+pub use terminal::{called_as, has_display, print, quoted, quoted_path, say, speak_as};
+pub use threads::start_threads;

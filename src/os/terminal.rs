@@ -1,0 +1,94 @@
+//! What the program says: on stdout, on stderr, and as commands for a shell.
+
+use std::io::{ErrorKind, Write};
+use std::path::Path;
+use std::sync::OnceLock;
+
+use anyhow::{Context, Result};
+
+/// Prints text to stdout. A closed pipe is not an error.
+///
+/// # Errors
+/// Fails if stdout cannot be written to, e.g. on a full disk.
+pub fn print(text: &str) -> Result<()> {
+    let mut stdout = std::io::stdout();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to stdout"),
+        _ => Ok(()),
+    }
+}
+
+/// What each line of [`say`] begins with.
+static SPEAKER: OnceLock<String> = OnceLock::new();
+
+/// From now on, lines to stderr begin with this name: there are several processes, and they print to the same place.
+pub fn speak_as(name: &str) {
+    let _ = SPEAKER.set(format!("{name}: "));
+}
+
+/// Prints a line to stderr. Control characters are escaped, since the line may quote an untrusted file.
+pub fn say(line: &str) {
+    let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
+    for c in line.chars() {
+        match c {
+            '\n' | '\t' => harmless.push(c),
+            c if c.is_control() => harmless.extend(c.escape_default()),
+            c => harmless.push(c),
+        }
+    }
+    let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
+}
+
+/// Returns a text as a single shell word, quoted if necessary.
+pub fn quoted(text: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
+    if !text.is_empty() && text.chars().all(plain) {
+        text.to_owned()
+    } else {
+        format!("'{}'", text.replace('\'', "'\\''"))
+    }
+}
+
+/// Returns a path as a single shell word, even if it is not valid UTF-8.
+pub fn quoted_path(path: &Path) -> String {
+    path.to_str().map_or_else(
+        || {
+            let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
+            // The only one of these escapes that means something else in a shell.
+            format!("$'{}'", escaped.replace("\\\"", "\""))
+        },
+        quoted,
+    )
+}
+
+/// Returns how the user has called this program, for commands that are printed: by cargo, by a path, or by its name.
+pub fn called_as() -> String {
+    let exe = std::env::current_exe().unwrap_or_default();
+    if std::env::var_os("CARGO_PKG_NAME").is_some_and(|name| name == env!("CARGO_PKG_NAME")) {
+        let is_release = exe.components().any(|part| part.as_os_str() == "release");
+        return format!("cargo run {}--", if is_release { "--release " } else { "" });
+    }
+    std::env::args_os().next().map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
+}
+
+/// Whether there is a display on which a window could open.
+pub fn has_display() -> bool {
+    ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::ffi::OsStrExt;
+
+    use super::*;
+
+    #[test]
+    fn words_with_a_meaning_for_a_shell_are_quoted() {
+        assert_eq!(quoted("runs/a-1"), "runs/a-1");
+        assert_eq!(quoted("my run"), "'my run'");
+        assert_eq!(quoted("$(it's)"), "'$(it'\\''s)'");
+        assert_eq!(quoted_path(Path::new("my run")), "'my run'");
+        let odd = std::ffi::OsStr::from_bytes(b"a \xff'\"\\");
+        assert_eq!(quoted_path(Path::new(odd)), r#"$'a \xff\'"\\'"#);
+    }
+}
