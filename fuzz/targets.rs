@@ -10,6 +10,7 @@ use shadow_repose::config::{Config, Override, Ramp, Source};
 use shadow_repose::load;
 use shadow_repose::os::StatusLine;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
 use shadow_repose::run::{self, Report};
 use tensorboard_rs::masked_crc32c::masked_crc32c;
@@ -56,7 +57,7 @@ pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
         config.ppo.horizon = Ramp::constant(3.0);
         (config.env.num_envs, config.ppo.minibatches, config.ppo.epochs) = (1, 1, 1);
         config.run.shards = 1;
-        let mut agent = Agent::of_task(task, &config)?;
+        let mut agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
         agent.restore(&mut checkpoint)?;
         checkpoint.take_counters("scene")?;
         checkpoint.finish()?;

@@ -13,7 +13,7 @@ use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
 use crate::env::{Env, EnvPool, EnvState, Resumable};
 use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
-use crate::ranks::Division;
+use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
 
 // The names under which a checkpoint stores the states of the environments.
@@ -37,12 +37,12 @@ pub struct Agent<E: Env> {
     pub env_steps: u64,
     /// The point at which it was forked from another training, if it was.
     pub fork: Option<Fork>,
-    /// The shards, of which this agent computes those of its rank.
-    pub division: Division,
+    /// What deals environments and samples to this process, and adds up with others.
+    pub exchange: Exchange,
 }
 
 /// The record of an iteration.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Iteration<L> {
     /// The lesson that was trained in it.
     pub lesson: L,
@@ -69,30 +69,24 @@ impl<L> Iteration<L> {
 }
 
 impl Agent<Repose> {
-    /// Creates the agent of a training with these settings, at the start of its first episodes.
+    /// Creates the agent of a training with these settings, at the start of its first episodes. It has the environments that
+    /// `exchange` deals to it.
     ///
     /// # Errors
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
-    pub fn of_task(task: &Arc<Task>, config: &Config) -> Result<Self> {
-        Self::divided(task, config, Division::alone(config.shards()))
-    }
-
-    /// The same for the shards that `division` assigns to this rank.
-    ///
-    /// # Errors
-    /// Fails as [`Agent::of_task`] does.
-    pub fn divided(task: &Arc<Task>, config: &Config, division: Division) -> Result<Self> {
+    pub fn for_task(task: &Arc<Task>, config: &Config, exchange: Exchange) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let envs = config.env.num_envs / division.shards() * division.own().len();
-        let envs = (0..envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
-        let of_run = config.clone();
-        Self::new(envs, &config.ppo, config.run.seed, division, move |env_steps| Lesson::at(env_steps, &of_run))
+        let envs =
+            exchange.own(config.env.num_envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
+        let settings = config.clone();
+        let lessons = move |env_steps| Lesson::at(env_steps, &settings);
+        Self::new(envs, &config.ppo, config.run.seed, exchange, lessons)
     }
 }
 
 impl<E: Env> Agent<E> {
-    /// Creates a learner and starts the first episodes of `envs`, the environments of this rank's shards. All randomness follows
-    /// from `seed`.
+    /// Creates a learner and starts the first episodes of `envs`, those that `exchange` deals to this process. All randomness
+    /// follows from `seed`.
     ///
     /// # Errors
     /// Fails if this machine does not support the precision, or if the observations do not have the symmetry.
@@ -100,11 +94,12 @@ impl<E: Env> Agent<E> {
         envs: Vec<E>,
         config: &PpoConfig,
         seed: u64,
-        division: Division,
+        exchange: Exchange,
         lessons: impl Fn(u64) -> E::Lesson + Send + 'static,
     ) -> Result<Self> {
-        let mut pool = EnvPool::of_shards(seed, envs, &division);
-        let ppo = Ppo::new(config, E::SPACES, seed, division.clone())?;
+        let blocks = exchange.blocks(envs.len());
+        let mut pool = EnvPool::in_blocks(seed, envs, blocks);
+        let ppo = Ppo::new(config, E::SPACES, seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
         let scratch = Scratch::new(&pool, &ppo);
         pool.set_lesson(lessons(0));
@@ -118,7 +113,7 @@ impl<E: Env> Agent<E> {
             iteration: 0,
             env_steps: 0,
             fork: None,
-            division,
+            exchange,
         })
     }
 
@@ -133,8 +128,7 @@ impl<E: Env> Agent<E> {
         let collected = Instant::now();
         let Some(update) = self.ppo.update(&mut self.rollout, self.iteration + 1, stop)? else { return Ok(None) };
         self.rollout.carry_over();
-        let steps = self.rollout.samples() / self.division.own().len() * self.division.shards();
-        let steps = steps as u64;
+        let steps = self.exchange.of_all(self.rollout.samples()) as u64;
         (self.iteration, self.env_steps) = (self.iteration + 1, self.env_steps + steps);
         let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
@@ -156,13 +150,13 @@ impl<E: Env> Agent<E> {
 
 impl<E: Resumable> Agent<E> {
     /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation. All
-    /// ranks call it together; on others than the first, it lacks the environments and is of no use.
+    /// processes of a training call it together.
     pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
         let progress = Progress { iteration, env_steps, best, fork };
         let mut checkpoint = self.ppo.checkpoint(config, progress);
-        let EnvState { numbers, counters } = self.pool.save().gathered(&self.division);
-        let rows = self.pool.count() * self.division.shards() / self.division.own().len();
+        let EnvState { numbers, counters } = EnvState::joined(self.exchange.all_gather(self.pool.save()));
+        let rows = self.exchange.of_all(self.pool.count());
         checkpoint.insert(NUMBERS, Array::F64(vec![rows, numbers.len() / rows], numbers));
         checkpoint.insert(COUNTERS, Array::U64(vec![rows, counters.len() / rows], counters));
         checkpoint

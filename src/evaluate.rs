@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::env::{End, Env};
 use crate::ppo::{FrozenPolicy, Workspace};
-use crate::ranks::Division;
+use crate::ranks::Exchange;
 use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
@@ -96,10 +96,11 @@ pub fn evaluate(
     interrupted: &AtomicBool,
     observer: &mut dyn FnMut(Moment) -> Result<()>,
 ) -> Result<Option<Vec<EpisodeStats>>> {
-    play(task, actor, episodes, 0..LANES, interrupted, observer)
+    let played = play(task, actor, episodes, 0..LANES, interrupted, observer)?;
+    Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
 }
 
-/// Plays the episodes, shared out among the ranks, and returns all of them to the first rank, in order. Returns `None` if
+/// Plays the episodes, those that `exchange` deals to this process, and returns all of them, in order. Returns `None` if
 /// `interrupted` was set meanwhile.
 ///
 /// # Errors
@@ -108,21 +109,18 @@ pub fn evaluate_together(
     task: &Arc<Task>,
     actor: &Actor,
     episodes: Episodes,
-    division: &Division,
+    exchange: &Exchange,
     interrupted: &AtomicBool,
 ) -> Result<Option<Vec<EpisodeStats>>> {
-    let lanes = LANES.min(episodes.count);
-    let own = play(task, actor, episodes, division.part_of(lanes), interrupted, &mut |_| Ok(()))?;
-    let Some(own) = own else { return Ok(None) };
-    let all = EpisodeStats::gathered(own, division);
-    let numbers = division.parts_of(lanes).into_iter().flat_map(|lanes| episodes.on(lanes));
-    let mut numbered: Vec<(usize, EpisodeStats)> = numbers.zip(all).collect();
-    numbered.sort_unstable_by_key(|(number, _)| *number);
-    Ok(Some(numbered.into_iter().map(|(_, episode)| episode).collect()))
+    let own = exchange.own(LANES.min(episodes.count));
+    let Some(own) = play(task, actor, episodes, own, interrupted, &mut |_| Ok(()))? else { return Ok(None) };
+    let mut all = exchange.all_gather(own).concat();
+    all.sort_unstable_by_key(|(number, _)| *number);
+    Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
 }
 
-/// Plays those of the episodes that run on some of the lanes. The other lanes are idle, so that each episode sees batches of the
-/// same shape, and the same row of them, whoever plays it.
+/// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
+/// episode's result does not depend on which process plays it.
 fn play(
     task: &Arc<Task>,
     actor: &Actor,
@@ -130,7 +128,7 @@ fn play(
     own: Range<usize>,
     interrupted: &AtomicBool,
     observer: &mut dyn FnMut(Moment) -> Result<()>,
-) -> Result<Option<Vec<EpisodeStats>>> {
+) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
     let own = own.start.min(episodes.count)..own.end.min(episodes.count);
     let mut lanes: Vec<Lane> = own.clone().map(|_| Lane::new(task)).collect();
     let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
@@ -139,7 +137,7 @@ fn play(
     let mut results = Vec::with_capacity(episodes.count);
     for first in episodes.groups() {
         let started = own.len().min((episodes.end() - first).saturating_sub(own.start));
-        // The number of the first episode of this rank.
+        // The number of the first episode of these lanes.
         let first = first + own.start;
         let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start);
         let starting = lanes[..started].par_iter_mut().zip(rows).enumerate();
@@ -175,7 +173,7 @@ fn play(
                 lane.running = ends[i].is_none();
             }
         }
-        results.extend(lanes[..started].iter().map(|lane| lane.env.episode()));
+        results.extend((first..).zip(lanes[..started].iter().map(|lane| lane.env.episode())));
     }
     Ok(Some(results))
 }
@@ -188,12 +186,6 @@ impl Episodes {
     /// Returns the first episode of each group that runs together.
     fn groups(&self) -> impl Iterator<Item = usize> + use<> {
         (self.first..self.end()).step_by(LANES)
-    }
-
-    /// Returns the numbers of the episodes that run on these lanes, in the order in which they are played.
-    fn on(&self, lanes: Range<usize>) -> impl Iterator<Item = usize> + use<> {
-        let end = self.end();
-        self.groups().flat_map(move |first| (first + lanes.start..first + lanes.end).take_while(move |&it| it < end))
     }
 }
 
@@ -233,9 +225,9 @@ impl Actor<'_> {
             match self {
                 Actor::Mean(_) => {}
                 Actor::Stochastic(policy) => {
-                    for (action, std) in row.iter_mut().zip(policy.std()) {
+                    for action in row {
                         let drawn: f32 = StandardNormal.sample(&mut lane.noise);
-                        *action += std * drawn;
+                        *action += policy.std() * drawn;
                     }
                 }
                 Actor::Zero => row.fill(0.0),
@@ -305,7 +297,7 @@ mod tests {
     use super::*;
     use crate::config::{Config, Symmetry};
     use crate::ppo::Ppo;
-    use crate::ranks::Division;
+    use crate::ranks::Exchange;
     use crate::repose::SPACES;
 
     #[test]
@@ -314,7 +306,7 @@ mod tests {
             let mut config = Config::resolve(None, &[]).unwrap();
             config.ppo.symmetry = symmetry;
             let task = Task::new(&config.env).unwrap();
-            let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
+            let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.

@@ -28,7 +28,6 @@
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, repose, rng, schedule, sim |
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
-//! | [`dump`] | the steps that led to a diverged state, as JSON | config, repose |
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, ranks, rng, sim, spaces |
 //! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
@@ -82,7 +81,6 @@ pub mod cli;
 pub mod collect;
 pub mod config;
 pub mod draw;
-pub mod dump;
 pub mod env;
 pub mod evaluate;
 pub mod export;

@@ -5,7 +5,6 @@ use std::process::ExitCode;
 
 use shadow_repose::cli::{self, Command};
 use shadow_repose::os::Requests;
-use shadow_repose::ranks::Launched;
 use shadow_repose::train::train;
 use shadow_repose::{bench, export, manual, os, play, plot, ranks, view};
 
@@ -15,10 +14,8 @@ fn main() -> ExitCode {
         Err(answer) => return tell(&answer),
     };
     let trains = matches!(command, Command::Train(_));
-    if let Some(launched) = ranks::launched().filter(|_| !trains) {
-        return refuse(launched);
-    }
-    let result = Requests::listen(trains).and_then(|requests| match command {
+    let allowed = if trains { Ok(()) } else { ranks::expect_one() };
+    let result = allowed.and_then(|()| Requests::listen(trains)).and_then(|requests| match command {
         Command::Train(args) => train(&args, &requests),
         Command::Play(args) => play::play(&args, &requests),
         Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
@@ -33,24 +30,18 @@ fn main() -> ExitCode {
         Err(error) => match error.downcast::<clap::Error>() {
             Ok(answer) => tell(&answer),
             Err(error) => {
-                os::say(&format!("error: {error:#}"));
+                if trains || ranks::is_spokesman() {
+                    os::say(&format!("error: {error:#}"));
+                }
                 ExitCode::FAILURE
             }
         },
     }
 }
 
-/// Refuses to run one command in each of several processes. One of them says so.
-fn refuse(launched: Launched) -> ExitCode {
-    if launched.rank == 0 {
-        os::say(&format!("error: only `train` runs on several ranks; {} processes were started", launched.size));
-    }
-    ExitCode::FAILURE
-}
-
-/// Prints the help, the version or a usage error, and returns the exit code. One of several processes says it.
+/// Prints the help, the version or a usage error, and returns the exit code. Of several processes, one says it.
 fn tell(answer: &clap::Error) -> ExitCode {
-    if ranks::launched().is_some_and(|launched| launched.rank > 0) {
+    if !ranks::is_spokesman() {
         return ExitCode::from(answer.exit_code() as u8);
     }
     match answer.print() {

@@ -1,6 +1,8 @@
 //! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
+use crate::repose::{Description, Lesson, OfTask, OfTraining, TermList};
+
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Quantity {
@@ -28,34 +30,13 @@ const SCORES: [(&str, &str, &str); 7] = [
     ("steps_per_goal", "steps per goal", "Control steps per goal reached."),
 ];
 
-/// All other quantities: name, title, description.
-const OTHERS: [(&str, &str, &str); 36] = [
-    ("reward/rotation", "reward: rotation", "The task's reward for a small rotation error, mean per step."),
+/// What is logged besides scores and rewards: name, title, description.
+const OTHERS: [(&str, &str, &str); 22] = [
     (
-        "reward/distance",
-        "reward: distance",
-        "The task's penalty for the cube's distance from its place, mean per step.",
+        "training/turned",
+        "turned towards the goal (rad/100 steps)",
+        "Rotation towards the goal in 100 steps, rad; no weight changes it.",
     ),
-    ("reward/action", "reward: action", "The task's penalty for large actions, mean per step."),
-    ("reward/bonus", "reward: bonus", "The task's bonus within the tolerance, mean per step."),
-    ("reward/fall", "reward: fall", "The task's penalty for a drop, mean per step."),
-    (
-        "training/progress",
-        "training reward: progress",
-        "What training pays for turning towards the goal, mean per step.",
-    ),
-    (
-        "training/approach",
-        "training reward: approach",
-        "What training pays for coming nearer to the goal by a factor, mean per step.",
-    ),
-    ("training/within", "training reward: within", "What training pays within the tolerance, mean per step."),
-    ("training/drop", "training reward: drop", "What a drop costs in training, mean per step."),
-    ("training/tolerance", "tolerance in training (rad)", "The rotation error up to which a goal counts in training."),
-    ("training/hold", "hold in training (steps)", "The steps within the tolerance that reach a goal in training."),
-    ("training/task_reward", "weight of the task's reward", "The weight of the task's reward in training."),
-    ("training/drop_reward", "reward of a drop", "What training adds to the reward of a step that drops the cube."),
-    ("training/randomized", "share of episodes", "Probability that an episode that begins is randomised."),
     ("loss/policy", "policy loss", "The clipped surrogate, negated, mean over the minibatches."),
     ("loss/value", "value loss", "The squared error of the values, mean over the minibatches."),
     ("policy/entropy", "entropy (nats)", "Entropy of the action distribution."),
@@ -65,7 +46,7 @@ const OTHERS: [(&str, &str, &str); 36] = [
     (
         "policy/std",
         "standard deviation of actions",
-        "Mean standard deviation of the actions; 1 is half an actuator's range.",
+        "Standard deviation of the actions; 1 is half an actuator's range.",
     ),
     ("policy/excess", "excess of mean actions", "Squared distance of the mean actions from [-1, 1]."),
     ("value/explained_variance", "explained variance", "1: the values explain the returns, 0: not at all."),
@@ -77,24 +58,23 @@ const OTHERS: [(&str, &str, &str); 36] = [
     (
         "time/exchange_s",
         "exchange (s)",
-        "Seconds of collecting and learning in which the first of several ranks talked to the others or waited for them.",
+        "Seconds of collecting and learning in which the first of several processes exchanged data with the others or waited.",
     ),
     (
         "time/exchange_bytes",
         "exchange (bytes)",
-        "Bytes that the first of several ranks sent to the others while collecting and learning.",
+        "Bytes that the first of several processes sent to the others while collecting and learning.",
     ),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
-    ("histogram/std", "standard deviations", "Standard deviations of the 20 actions; 1 is half an actuator's range."),
     (
         "histogram/actions",
         "actions",
-        "Actions of the iteration as drawn, before they are clipped to [-1, 1]; of several ranks: those of the first.",
+        "Actions of the iteration as drawn, before they are clipped to [-1, 1]; of several processes: those of the first.",
     ),
     (
         "histogram/advantages",
         "advantages",
-        "Advantages of the iteration, with mean 0 and standard deviation 1; of several ranks: those of the first.",
+        "Advantages of the iteration, with mean 0 and standard deviation 1; of several processes: those of the first.",
     ),
     ("eval/film", "film", "The first evaluation episode with mean actions, at the speed of the simulation."),
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
@@ -105,6 +85,22 @@ pub fn quantity(name: &str) -> Option<Quantity> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {
         return Some(Quantity { title: (*title).to_owned(), description: (*description).to_owned() });
+    }
+    if let Some((group, name)) = name.split_once('/') {
+        let term = |list: Vec<Description>| list.into_iter().find(|term| term.name == name);
+        let mean = |term: Description| format!("{}, mean per step.", term.text.trim_end_matches('.'));
+        let (title, description) = match group {
+            "reward" => (format!("reward: {name}"), term(OfTask::descriptions().collect()).map(mean)),
+            "training" => {
+                let paid = term(OfTraining::descriptions().collect()).map(mean);
+                let of_lesson = term(Lesson::descriptions().collect()).map(|value| value.text.to_owned());
+                (format!("training: {name}"), paid.or(of_lesson))
+            }
+            _ => (String::new(), None),
+        };
+        if let Some(description) = description {
+            return Some(Quantity { title, description });
+        }
     }
     GROUPS.iter().find_map(|(group, of, episodes)| {
         let figure = name.strip_prefix(group)?;

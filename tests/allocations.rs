@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{OBSERVATION_SIZE, Task};
 
 struct Watching;
@@ -37,7 +38,8 @@ static ALLOCATOR: Watching = Watching;
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
-    let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
+    let mut agent =
+        Agent::for_task(&Task::new(&config.env).unwrap(), &config, Exchange::alone(config.shards())).unwrap();
     let mut iterate = || {
         LARGEST.store(0, Ordering::Relaxed);
         agent.iterate(&NEVER).unwrap().expect("nothing stops it");

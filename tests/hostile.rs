@@ -13,9 +13,10 @@ use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
 use shadow_repose::os::{Status, StatusLine};
 use shadow_repose::ppo::{Array, Checkpoint};
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::Task;
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Figures, Report};
+use shadow_repose::run::{Media, Report};
 
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -35,7 +36,8 @@ fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
     let task = Task::new(&config.env).unwrap();
-    let mut checkpoint = Agent::of_task(&task, &config).unwrap().checkpoint(&config.to_text(), None);
+    let mut checkpoint =
+        Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap().checkpoint(&config.to_text(), None);
     checkpoint.insert("scene", Array::U64(vec![1], vec![task.scene().fingerprint().unwrap()]));
     checkpoint
 }
@@ -150,7 +152,7 @@ fn growth(rows: u64) -> i64 {
         report.iteration(
             row,
             &values,
-            &Figures::default(),
+            &Media::default(),
             &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN, evaluation: f64::NAN },
         );
         if row % 500 == 0 {

@@ -16,7 +16,7 @@ use crate::config::Config;
 use crate::env::Env;
 use crate::load::Origin;
 use crate::ppo::{Ppo, Rollout};
-use crate::ranks::Division;
+use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
 use crate::schedule::in_rounds;
 
@@ -57,10 +57,10 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origi
     let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
     // The lesson at the end of a training.
     let at_end = Lesson::at(config.run.total_steps, config);
-    let division = || Division::alone(config.shards());
-    let mut agent = Agent::new(envs, &acting, config.run.seed, division(), move |_| at_end)?;
+    let exchange = || Exchange::alone(config.shards());
+    let mut agent = Agent::new(envs, &acting, config.run.seed, exchange(), move |_| at_end)?;
     agent.ppo.begin_with(&checkpoint)?;
-    let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, division())?;
+    let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, exchange())?;
     let mut bare = BarePool::new(task, randomization.as_ref(), config.env.num_envs);
     let mut seen = learner.rollout(&agent.pool.block_sizes());
     let mut found: [Vec<f64>; 4] = Default::default();

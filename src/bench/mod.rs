@@ -21,6 +21,7 @@ use crate::env::{End, Env, EnvPool, StepBuffers};
 use crate::load::Origin;
 use crate::os::{self, OutputFile};
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
+use crate::ranks::Exchange;
 use crate::repose::{ACTION_SIZE, Lesson, OBSERVATION_SIZE, Randomization, Task};
 use crate::rng;
 use crate::schedule::in_rounds;
@@ -215,7 +216,7 @@ fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> 
 
 /// Returns the samples per second and GFLOP/s of gradient steps, and the GFLOP/s of their matrix products alone.
 fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
-    let mut agent = Agent::of_task(task, config)?;
+    let mut agent = Agent::for_task(task, config, Exchange::alone(config.shards()))?;
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
     let size = config.samples_per_minibatch();
@@ -229,7 +230,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
 /// Returns the env steps per second of whole iterations of a training with these settings, without the first one if there are
 /// more.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
-    let mut agent = Agent::of_task(task, config)?;
+    let mut agent = Agent::for_task(task, config, Exchange::alone(config.shards()))?;
     let begun = Instant::now();
     let mut rates = Vec::new();
     for _ in 0..=END_TO_END_ITERATIONS {

@@ -133,7 +133,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("bars.svg");
         BarChart { title: "title".into(), bars, map }.write(OutputFile::create(&path).unwrap()).unwrap();
-        let svg = crate::os::read_text(path).unwrap();
+        let svg = crate::os::read_text(&path).unwrap();
         let colour = format!("fill=\"#{:02X}{:02X}{:02X}\"", BAR.0, BAR.1, BAR.2);
         let width =
             |line: &str| line.split("width=\"").nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();

@@ -310,7 +310,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
         chart.write(OutputFile::create(&path).unwrap()).unwrap();
-        crate::os::read_text(path).unwrap()
+        crate::os::read_text(&path).unwrap()
     }
 
     #[test]

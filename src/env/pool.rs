@@ -9,28 +9,26 @@ use anyhow::{Context, Result, bail, ensure};
 use rayon::prelude::*;
 
 use super::{End, Env, EnvState, Resumable, Transition};
-use crate::ranks::Division;
+use crate::ranks::{Blocks, Exchange};
 use crate::rng;
-use crate::schedule::{block_sizes, panic_message};
+use crate::schedule::panic_message;
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
 /// N environments that start their next episode automatically.
 pub struct EnvPool<E: Env> {
     blocks: Vec<EnvBlock<E>>,
-    /// The number of this rank's shards.
-    shards: usize,
 }
 
 /// A part of a pool that is stepped by one thread at a time.
 pub struct EnvBlock<E: Env> {
     slots: Vec<Slot<E>>,
     seed: u64,
-    /// The number of this block among the blocks of all ranks.
+    /// The number of this block among the blocks of all processes.
     number: usize,
-    /// The number of its first environment among those of all ranks.
+    /// The number of its first environment among those of all processes.
     first: usize,
-    /// The number of environments of all ranks, by which the episode numbers of one environment increase.
+    /// The number of environments of all processes, by which the episode numbers of one environment increase.
     stride: u64,
     finished: Vec<E::Episode>,
 }
@@ -57,25 +55,20 @@ pub struct StepBuffers<'a> {
 impl<E: Env> EnvPool<E> {
     /// Creates a pool of at least one environment, all of one kind, whose episodes are drawn from `seed`.
     pub fn new(seed: u64, envs: Vec<E>) -> Self {
-        Self::of_shards(seed, envs, &Division::alone(1))
+        let blocks = Exchange::alone(1).blocks(envs.len());
+        Self::in_blocks(seed, envs, blocks)
     }
 
-    /// Creates a pool of the environments of this rank's shards, equally many per shard; no block spans two shards.
-    pub fn of_shards(seed: u64, envs: Vec<E>, division: &Division) -> Self {
-        let (shards, own) = (division.shards(), division.own());
-        let in_shard = envs.len() / own.len();
-        assert_eq!(in_shard * own.len(), envs.len(), "environments do not divide evenly into {} shards", own.len());
-        let sizes = block_sizes(in_shard, in_shard * shards);
-        let mut first = own.start * in_shard;
+    /// Creates a pool of environments in these blocks, which other processes may continue.
+    pub fn in_blocks(seed: u64, envs: Vec<E>, blocks: Blocks) -> Self {
+        let (mut first, stride) = (blocks.first_env, blocks.envs as u64);
         let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
-        let block = |(i, &size): (usize, &usize)| {
+        let block = |(number, size)| {
             let slots = slots.by_ref().take(size).collect();
             first += size;
-            let (number, stride) = (own.start * sizes.len() + i, (in_shard * shards) as u64);
             EnvBlock { slots, seed, number, first: first - size, stride, finished: Vec::new() }
         };
-        let of_all_shards = own.clone().flat_map(|_| &sizes);
-        Self { blocks: of_all_shards.enumerate().map(block).collect(), shards: own.len() }
+        Self { blocks: (blocks.first_block..).zip(blocks.sizes).map(block).collect() }
     }
 
     /// Returns the number of environments.
@@ -119,15 +112,7 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// Returns the environments of each shard, in order.
-    pub fn shards_mut(&mut self) -> impl Iterator<Item = impl Iterator<Item = &mut E>> {
-        let in_shard = self.blocks.len() / self.shards;
-        self.blocks
-            .chunks_mut(in_shard)
-            .map(|blocks| blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env))
-    }
-
-    /// Returns the number of the first environment among those of all ranks.
+    /// Returns the number of the first environment among those of all processes.
     pub fn first(&self) -> usize {
         self.blocks[0].first
     }
@@ -149,14 +134,14 @@ impl<E: Resumable> EnvPool<E> {
         state
     }
 
-    /// Resumes, bit for bit, from the states of the environments of all ranks, and writes the `observations` `[n, O]` of each
+    /// Resumes, bit for bit, from the states of the environments of all processes, and writes the `observations` `[n, O]` of each
     /// block to act on next.
     ///
     /// # Errors
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let (size, of_all_ranks) = (E::SPACES.observation_size, self.blocks[0].stride as usize);
-        let mut rows = state.rows(of_all_ranks)?.skip(self.first());
+        let (size, of_all) = (E::SPACES.observation_size, self.blocks[0].stride as usize);
+        let mut rows = state.rows(of_all)?.skip(self.first());
         let first = self.first();
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         for (i, (slot, row)) in
@@ -178,7 +163,7 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// Returns the number of this block among the blocks of all ranks.
+    /// Returns the number of this block among the blocks of all processes.
     pub fn number(&self) -> usize {
         self.number
     }

@@ -4,11 +4,10 @@
 //! in it has a type that can be checked.
 
 use anyhow::{Context, Result, ensure};
-
-use crate::ranks::Division;
+use serde::{Deserialize, Serialize};
 
 /// The states of N environments, in order.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EnvState {
     /// The doubles, `[N, K]`.
     pub numbers: Vec<f64>,
@@ -23,18 +22,15 @@ pub struct SavedEnv<'a> {
 }
 
 impl EnvState {
-    /// Returns the states of the environments of all ranks to the first rank, in their order.
-    pub fn gathered(self, division: &Division) -> Self {
-        if division.is_alone() {
-            return self;
+    /// Returns the states of these environments, one part after another.
+    pub fn joined(parts: Vec<Self>) -> Self {
+        let mut parts = parts.into_iter();
+        let mut all = parts.next().unwrap_or_default();
+        for Self { numbers, counters } in parts {
+            all.numbers.extend(numbers);
+            all.counters.extend(counters);
         }
-        let numbers = self.numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
-        let counters = self.counters.iter().flat_map(|x| x.to_le_bytes()).collect();
-        let [numbers, counters] = [numbers, counters].map(|own| division.gather_at_first(own).concat());
-        Self {
-            numbers: numbers.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
-            counters: counters.as_chunks().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect(),
-        }
+        all
     }
 
     /// Returns the rows of each of `count` environments.
@@ -65,11 +61,6 @@ impl<'a> SavedEnv<'a> {
     /// Returns how many numbers are left.
     pub fn numbers_left(&self) -> usize {
         self.numbers.len()
-    }
-
-    /// Returns how many counters are left.
-    pub fn counters_left(&self) -> usize {
-        self.counters.len()
     }
 
     /// Reads all numbers except the last `kept`.

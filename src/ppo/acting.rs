@@ -1,5 +1,7 @@
 //! Acting during a rollout: draws actions from the current policy and bootstraps rewards with its values.
 
+use std::iter::repeat_n;
+
 use rand_distr::{Distribution, StandardNormal};
 
 use super::kernels::Workspace;
@@ -26,14 +28,14 @@ impl Acting<'_> {
         let (actions, means) = (&mut block.actions[acted.clone()], &mut block.means[acted]);
         self.policy.mean_actions_and_values(observations, means, &mut block.values[one.clone()], work);
         let std = self.policy.std();
-        let constant: f32 = std.iter().map(|s| s.ln() + 0.5 * std::f32::consts::TAU.ln()).sum();
+        let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
         let rows = rows.zip(observations.chunks_exact(observation_size));
         let figures = block.noise_scales[one.clone()].iter_mut().zip(&mut block.log_probs[one]);
         for (((actions, means), observation), (scale, log_prob)) in rows.zip(figures) {
             *scale = self.noise_scale(observation);
             let mut squares = 0.0;
-            for ((action, mean), std) in actions.iter_mut().zip(means).zip(std) {
+            for (action, mean) in actions.iter_mut().zip(means) {
                 let drawn: f32 = StandardNormal.sample(noise);
                 *action = mean + *scale * std * drawn;
                 squares += ((*action - mean) / (*scale * std)).powi(2);

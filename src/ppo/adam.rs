@@ -70,18 +70,13 @@ impl Adam {
     }
 }
 
-/// Returns the chunks of each group of parameters, whose squares are added up apart.
+/// Returns the chunks of each range of parameters, whose squares are added up apart.
 pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Vec<Range<usize>>> {
     let chunks = |group: &Range<usize>| {
         let firsts = group.clone().step_by(NORM_CHUNK);
         firsts.map(|first| first..group.end.min(first + NORM_CHUNK)).collect()
     };
     groups.iter().map(chunks).collect()
-}
-
-/// Returns the sum of the squares of a gradient in each of these chunks.
-pub(super) fn squares(gradient: &[f32], chunks: &[Range<usize>]) -> Vec<f64> {
-    chunks.par_iter().map(|chunk| sum_of_squares(&gradient[chunk.clone()])).collect()
 }
 
 /// Returns the Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
@@ -92,7 +87,7 @@ pub(super) fn norm(squares: &[f64], chunks: &[Vec<Range<usize>>]) -> f64 {
 }
 
 /// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
-fn sum_of_squares(x: &[f32]) -> f64 {
+pub(super) fn sum_of_squares(x: &[f32]) -> f64 {
     let mut lanes = [0.0f32; 32];
     Arch::new().dispatch(
         #[inline(always)]
@@ -112,7 +107,8 @@ mod tests {
 
     fn norm_of(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
         let chunks = norm_chunks(groups);
-        norm(&squares(gradient, &chunks.concat()), &chunks)
+        let squares: Vec<f64> = chunks.concat().into_par_iter().map(|chunk| sum_of_squares(&gradient[chunk])).collect();
+        norm(&squares, &chunks)
     }
 
     /// The expected values are those of this program (PyTorch):

@@ -1,12 +1,17 @@
 //! The interface for computing gradients, implemented by our own kernels and by candle's tensors, their reference.
 
+use std::ops::AddAssign;
+
 use anyhow::Result;
+use serde::{Deserialize, Serialize};
 
 use super::{Policy, Rollout};
+use crate::config::PpoConfig;
+use crate::ranks::Minibatch;
 
-/// Sums over the samples of one shard in a minibatch.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct ShardSums {
+/// Sums over samples of the losses and of what tells how far the policy has moved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct LossSums {
     /// The clipped surrogate.
     pub surrogate: f64,
     /// The clipped squared error of the values.
@@ -17,30 +22,40 @@ pub(super) struct ShardSums {
     pub kl: f64,
     /// Samples whose ratio was clipped.
     pub clipped: f64,
-    /// The largest |ratio - 1|.
+    /// The largest |ratio - 1|, which is not a sum.
     pub ratio_error: f64,
 }
 
-/// The samples that one step learns from.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Minibatch<'a> {
-    /// The samples of this rank, shard after shard, the same number from each.
-    pub samples: &'a [u32],
-    /// The number of shards of this rank.
-    pub own_shards: usize,
-    /// The number of shards of all ranks.
-    pub shards: usize,
+impl AddAssign for LossSums {
+    fn add_assign(&mut self, other: Self) {
+        let Self { surrogate, value_error, excess, kl, clipped, ratio_error } = other;
+        self.surrogate += surrogate;
+        self.value_error += value_error;
+        self.excess += excess;
+        self.kl += kl;
+        self.clipped += clipped;
+        self.ratio_error = self.ratio_error.max(ratio_error);
+    }
 }
 
-impl Minibatch<'_> {
-    /// Returns the number of samples of each shard.
-    pub(super) fn in_shard(&self) -> usize {
-        self.samples.len() / self.own_shards
+impl LossSums {
+    /// Returns the means, given sums over `count` samples.
+    pub(super) fn means(self, count: usize) -> Self {
+        let n = count as f64;
+        let Self { surrogate, value_error, excess, kl, clipped, ratio_error } = self;
+        Self {
+            surrogate: surrogate / n,
+            value_error: value_error / n,
+            excess: excess / n,
+            kl: kl / n,
+            clipped: clipped / n,
+            ratio_error,
+        }
     }
 
-    /// Returns the number of samples of all ranks.
-    pub(super) fn count(&self) -> usize {
-        self.in_shard() * self.shards
+    /// Returns the loss that is minimised.
+    pub(super) fn total(&self, config: &PpoConfig) -> f64 {
+        -self.surrogate + config.value_coef * self.value_error + config.bounds_coef * self.excess
     }
 }
 
@@ -50,7 +65,7 @@ pub(super) trait GradientBackend: Send {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout);
 
     /// Writes the gradient of the losses of this minibatch with respect to the parameters of the policy, in their
-    /// order: this rank's contribution, added over its shards as a tree. Returns the sums of each of its shards.
+    /// order, added over the groups as a tree. Returns the sums of each group.
     ///
     /// # Errors
     /// Fails if the underlying library fails.
@@ -58,7 +73,7 @@ pub(super) trait GradientBackend: Send {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        minibatch: Minibatch,
+        minibatch: &Minibatch,
         out: &mut [f32],
-    ) -> Result<Vec<ShardSums>>;
+    ) -> Result<Vec<LossSums>>;
 }

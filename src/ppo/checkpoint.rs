@@ -24,6 +24,9 @@ const LONGEST_CONFIG: usize = 1 << 16;
 /// The text that tells how a published policy was made; `scripts/provenance.py` writes it.
 const PROVENANCE: &str = "provenance";
 
+/// The name of the logarithms of the standard deviations, one for each action: all are equal.
+const LOG_STD: &str = "log_std";
+
 /// The name of the adapted learning rate.
 const LEARNING_RATE: &str = "learning_rate";
 
@@ -81,7 +84,7 @@ impl Checkpoint {
     /// Returns only the parts that playing needs: what is shared does not tell paths of the machine on which it was made.
     pub fn policy_alone(&self) -> Self {
         let needed =
-            |name: &str| ["actor.", "critic.", "normalizer.", "log_std"].iter().any(|part| name.starts_with(part));
+            |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
         let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
         let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
@@ -152,7 +155,8 @@ impl Checkpoint {
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
         let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
-        layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))
+        layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
+        self.expect(LOG_STD, &[spaces.action_size])
     }
 
     fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
@@ -165,6 +169,10 @@ impl Checkpoint {
         self.expect_policy(net, &spaces)?;
         let views = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size).views();
         let parameters = self.take_floats("", &views)?;
+        let log_std = match self.take(LOG_STD)? {
+            Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
+            _ => bail!("tensor `{LOG_STD}` must hold the same F32 value for each action"),
+        };
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
         let [mean, variance] = ["mean", "variance"].map(|of| self.take_vector(&format!("normalizer.{of}"), size));
@@ -175,7 +183,7 @@ impl Checkpoint {
         ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
-        Policy::new(net, spaces, parameters, normalizer)
+        Policy::new(net, spaces, parameters, log_std, normalizer)
     }
 
     /// Checks that every array was removed.
@@ -205,13 +213,13 @@ impl Policy {
 
 impl Ppo {
     /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
-    /// progress of the run. All ranks call it together.
+    /// progress of the run. All processes of a training call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
         let mut checkpoint = Checkpoint { config, progress, provenance: None, is_of_0_1: false, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
-        let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.division.shared(moment, &self.slices));
+        let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
         let kinds = [("", &self.policy.parameters[..]), ("adam.mean.", &mean), ("adam.square.", &square)];
         for View { name, shape, range } in self.policy.layout.views() {
             for (prefix, numbers) in kinds {
@@ -219,6 +227,8 @@ impl Ppo {
                 checkpoint.insert(&format!("{prefix}{name}"), array);
             }
         }
+        let log_std = vec![self.policy.log_std; self.policy.spaces.action_size];
+        checkpoint.insert(LOG_STD, Array::F32(vec![log_std.len()], log_std));
         checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
         checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate.rate]));
         let normalizer = &self.policy.normalizer;
@@ -265,7 +275,7 @@ mod tests {
     use super::*;
     use crate::config::{Backend, Config, PpoConfig, Symmetry};
     use crate::ppo::{Evaluation, Rollout};
-    use crate::ranks::Division;
+    use crate::ranks::Exchange;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
@@ -276,7 +286,7 @@ mod tests {
     }
 
     fn learner(hidden: &[usize]) -> Ppo {
-        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0, Division::alone(1)).unwrap()
+        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0, Exchange::alone(1)).unwrap()
     }
 
     fn progress() -> Progress {
@@ -294,13 +304,13 @@ mod tests {
 
     /// Returns a learner that has taken one optimizer step.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
-        let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Division::alone(1)).unwrap();
-        ppo.policy.see(&[vec![&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]]], &ppo.division);
+        let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Exchange::alone(1)).unwrap();
+        ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);
         ppo.learning_rate.rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
-        ppo.minibatch_step(&rollout, &samples, true).unwrap();
+        ppo.minibatch_step(&rollout, &Exchange::alone(1).minibatch(&samples), true).unwrap();
         ppo
     }
 
@@ -339,7 +349,7 @@ mod tests {
     #[test]
     fn a_learner_begins_with_the_policy_of_another_and_nothing_else_of_it() {
         let from = learnt(Backend::Fused, 1);
-        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Division::alone(1)).unwrap();
+        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Exchange::alone(1)).unwrap();
         to.begin_with(&saved(&from)).unwrap();
         assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
         let fresh = config(Backend::Fused, &[8]).learning_rate;
@@ -360,8 +370,12 @@ mod tests {
         assert!(refused.contains("`actor.9.weight` is not part of this policy"), "{refused}");
         assert!(Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &more).is_err());
         let mut negative = checkpoint;
-        negative.insert("adam.square.log_std", Array::F32(vec![2], vec![0.0, -1.0]));
-        assert!(refusal(negative, &mut learner(&[8])).contains("`adam.square.log_std` has a negative value"));
+        negative.insert("adam.square.actor.1.bias", Array::F32(vec![2], vec![0.0, -1.0]));
+        let refused = refusal(negative.clone(), &mut learner(&[8]));
+        assert!(refused.contains("`adam.square.actor.1.bias` has a negative value"), "{refused}");
+        negative.insert(LOG_STD, Array::F32(vec![2], vec![-1.0, -2.0]));
+        let refused = refusal(negative, &mut learner(&[8]));
+        assert!(refused.contains("`log_std` must hold the same F32 value for each action"), "{refused}");
     }
 
     #[test]

@@ -69,7 +69,6 @@ impl Checkpoint {
             }
             numbers[new.bias.clone()][..old.outputs].copy_from_slice(&known[old.bias.clone()]);
         }
-        numbers[new.log_std.clone()].copy_from_slice(&known[old.log_std.clone()]);
         for View { name, shape, range } in new.views() {
             self.insert(&format!("{prefix}{name}"), Array::F32(shape, numbers[range].to_vec()));
         }
@@ -87,7 +86,7 @@ mod tests {
     use super::*;
     use crate::config::{Activation, Symmetry};
     use crate::ppo::{Ppo, Progress};
-    use crate::ranks::Division;
+    use crate::ranks::Exchange;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
@@ -98,7 +97,7 @@ mod tests {
     fn learner(hidden: &[usize], seed: u64) -> Ppo {
         let mut config = crate::config::Config::resolve(None, &[]).unwrap().ppo;
         (config.hidden, config.symmetry) = (hidden.to_vec(), Symmetry::None);
-        let mut ppo = Ppo::new(&config, SPACES, seed, Division::alone(1)).unwrap();
+        let mut ppo = Ppo::new(&config, SPACES, seed, Exchange::alone(1)).unwrap();
         let count = ppo.adam.square.len();
         ppo.adam.mean = (0..count).map(|i| i as f32).collect();
         ppo.adam.square = (0..count).map(|i| 2.0 * i as f32).collect();

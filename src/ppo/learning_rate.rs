@@ -29,9 +29,9 @@ impl LearningRate {
         self.desired_kl = self.ramp.by_equal_factors(env_steps);
     }
 
-    /// Switches to the configured rate if it differs from that in `before` or if the rate is fixed; otherwise keeps the
-    /// adapted rate, clamped to its range.
-    pub(super) fn settle(&mut self, before: &PpoConfig) {
+    /// After a fork, whose parent had the settings `before`: uses the configured rate if the user changed it or fixed it, else
+    /// keeps the adapted one within its bounds.
+    pub(super) fn reconcile(&mut self, before: &PpoConfig) {
         if self.ramp.to == 0.0 || self.configured != before.learning_rate {
             self.rate = self.configured;
         } else {
@@ -105,7 +105,7 @@ mod tests {
         {
             let mut of = LearningRate::new(&config(configured, Ramp::constant(desired)));
             of.rate = adapted;
-            of.settle(&before);
+            of.reconcile(&before);
             assert_eq!(of.rate, expected);
         }
     }

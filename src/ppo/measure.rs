@@ -27,6 +27,7 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {
         let taken = rayon::scope(|_| {
             let start = Instant::now();
+            let minibatch = ppo.exchange.minibatch(&minibatch);
             ppo.minibatch_step(rollout, &minibatch, false).map(|_| start.elapsed())
         });
         seconds.push(taken?.as_secs_f64());

@@ -24,11 +24,11 @@ mod progress;
 mod rollout;
 
 use std::f64::consts::{E, TAU};
+use std::iter::repeat_n;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail, ensure};
-use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
 pub use acting::Acting;
@@ -45,11 +45,11 @@ pub use progress::{Evaluation, Fork, Progress};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{Backend, PpoConfig};
-use crate::ranks::{Division, Slices, totals};
+use crate::ranks::{Exchange, Minibatch, Slices};
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
-use adam::{Adam, norm, norm_chunks, squares};
-use backend::{GradientBackend, Minibatch, ShardSums};
+use adam::{Adam, norm, norm_chunks, sum_of_squares};
+use backend::{GradientBackend, LossSums};
 use candle::Reference;
 use kernels::{Arithmetic, Kernels};
 use learning_rate::LearningRate;
@@ -65,10 +65,10 @@ pub struct Ppo {
     gradient: Vec<f32>,
     adam: Adam,
     learning_rate: LearningRate,
-    division: Division,
-    /// The chunks of each group of parameters, by which the norm of the gradient is computed.
+    exchange: Exchange,
+    /// The chunks of each net, by which the norm of the gradient is computed.
     chunks: Vec<Vec<Range<usize>>>,
-    /// The parameters that each rank moves.
+    /// The parameters that this process moves.
     slices: Slices,
 }
 
@@ -93,7 +93,7 @@ pub struct UpdateStats {
     pub clip_fraction: f64,
     /// Norm of the whole gradient, before clipping.
     pub grad_norm: f64,
-    /// Mean of the standard deviations at noise scale 1, after the update.
+    /// Standard deviation at noise scale 1, after the update.
     pub std: f64,
     /// 1 - Var(returns - values) / Var(returns), with the values predicted during collection.
     pub explained_variance: f64,
@@ -121,13 +121,13 @@ impl UpdateStats {
 }
 
 impl Ppo {
-    /// Creates a learner for environments with these spaces. It computes the shards that `division` assigns to this
-    /// rank; all its randomness is derived from `seed`.
+    /// Creates a learner for environments with these spaces, which learns from what `exchange` deals to it and adds up with
+    /// others. All its randomness is derived from `seed`.
     ///
     /// # Errors
     /// Fails if this machine does not support the configured precision, or if the observations lack the configured
     /// symmetry.
-    pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, division: Division) -> Result<Self> {
+    pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
         let policy = Policy::random(&config.net(), spaces, config.std.by_equal_factors(0), seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
@@ -136,9 +136,9 @@ impl Ppo {
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (config, learning_rate) = (config.clone(), LearningRate::new(config));
-        let chunks = norm_chunks(&policy.layout.groups());
-        let slices = division.slices(&chunks.concat());
-        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, division, chunks, slices })
+        let chunks = norm_chunks(&policy.layout.nets());
+        let slices = exchange.slices(chunks.concat());
+        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, exchange, chunks, slices })
     }
 
     /// Returns the current policy.
@@ -166,8 +166,7 @@ impl Ppo {
             rollout.resize(horizon, &self.policy.spaces);
         }
         self.learning_rate.follow_ramp(env_steps);
-        let std = self.config.std.by_equal_factors(env_steps);
-        self.policy.parameters[self.policy.layout.log_std.clone()].fill(std.ln() as f32);
+        self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
     }
 
     /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
@@ -178,8 +177,7 @@ impl Ppo {
     /// Returns the policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
         let policy = self.policy.freeze_for(self.arithmetic);
-        // All actions have the same standard deviation.
-        let away_scale = (self.config.away_std as f32 / policy.std()[0]).max(1.0);
+        let away_scale = (self.config.away_std as f32 / policy.std()).max(1.0);
         Acting { policy, config: &self.config, away_scale }
     }
 
@@ -203,49 +201,45 @@ impl Ppo {
     fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         let explained_variance = self.prepare(rollout);
         self.backend.begin(&self.policy, rollout);
-        let own = self.division.own();
-        let in_shard = rollout.samples() / own.len();
-        // Each part takes this number of samples from each shard.
-        let shards = self.division.shards();
-        let size = self.config.minibatch_of(in_shard * shards, rollout.horizon()) / shards;
-        let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
-        let mut shuffles: Vec<Rng> = own.clone().map(stream).collect();
-        let mut order: Vec<u32> = (0..rollout.samples() as u32).collect();
-        let (mut samples, mut steps) = (Vec::new(), Vec::new());
+        let samples = rollout.samples();
+        let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
+        let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
+        let mut minibatches = self.exchange.minibatches(samples, size, stream);
+        let mut steps = Vec::new();
         for epoch in 0..self.config.epochs {
-            order.chunks_mut(in_shard).zip(&mut shuffles).for_each(|(shard, shuffle)| shard.shuffle(shuffle));
-            for part in 0..in_shard / size {
+            for (part, minibatch) in minibatches.shuffled().enumerate() {
                 if stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
-                samples.clear();
-                order.chunks(in_shard).for_each(|shard| samples.extend_from_slice(&shard[part * size..][..size]));
-                let step = self.minibatch_step(rollout, &samples, steps.is_empty());
+                let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
                 steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
             }
         }
         self.check_weights()?;
         let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
-        let seen: Vec<Vec<&[f32]>> = seen.chunks(seen.len() / own.len()).map(<[_]>::to_vec).collect();
-        self.policy.see(&seen, &self.division);
+        self.policy.see(&seen, &self.exchange);
         Ok(Some(self.stats(&steps, explained_variance)))
     }
 
-    /// Returns the statistics of an update with these steps.
-    fn stats(&self, steps: &[Step], explained_variance: f64) -> UpdateStats {
-        let mean = |of: fn(&Step) -> f64| steps.iter().map(of).sum::<f64>() / steps.len() as f64;
-        let std = self.policy.std();
+    /// Returns the statistics of an update with these steps: the mean losses and the norm of the gradient of each.
+    fn stats(&self, steps: &[(LossSums, f64)], explained_variance: f64) -> UpdateStats {
+        let mean = |of: &dyn Fn(&LossSums) -> f64| steps.iter().map(|(losses, _)| of(losses)).sum::<f64>();
+        let mean = |of: &dyn Fn(&LossSums) -> f64| mean(of) / steps.len() as f64;
+        // The entropy of the Gaussian at noise scale 1.
+        let of_action = f64::from(self.policy.log_std) + 0.5 * (TAU * E).ln();
+        let entropy: f64 = repeat_n(of_action, self.policy.spaces.action_size).sum();
+        let (first, _) = steps[0];
         UpdateStats {
-            policy_loss: mean(|step| step.losses.policy),
-            value_loss: mean(|step| step.losses.value),
-            excess: mean(|step| step.losses.excess),
-            entropy: mean(|step| step.entropy),
-            kl: mean(|step| step.losses.kl),
-            first_kl: steps[0].losses.kl,
-            first_ratio_error: steps[0].losses.ratio_error,
-            clip_fraction: mean(|step| step.losses.clip_fraction),
-            grad_norm: mean(|step| step.grad_norm),
-            std: std.iter().copied().map(f64::from).sum::<f64>() / std.len() as f64,
+            policy_loss: mean(&|losses| -losses.surrogate),
+            value_loss: mean(&|losses| losses.value_error),
+            excess: mean(&|losses| losses.excess),
+            entropy: mean(&|_| entropy),
+            kl: mean(&|losses| losses.kl),
+            first_kl: first.kl,
+            first_ratio_error: first.ratio_error,
+            clip_fraction: mean(&|losses| losses.clipped),
+            grad_norm: steps.iter().map(|(_, norm)| norm).sum::<f64>() / steps.len() as f64,
+            std: f64::from(self.policy.std()),
             explained_variance,
             learning_rate: self.learning_rate.rate,
         }
@@ -267,32 +261,26 @@ impl Ppo {
         if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
     }
 
-    /// Returns the mean and variance of one array over all samples of all ranks.
+    /// Returns the mean and variance of one array over all samples of the update.
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
-        let shards = self.division.own().len();
-        let sum = |term: &dyn Fn(f64) -> f64| {
-            let blocks = rollout.blocks.chunks(rollout.blocks.len() / shards);
-            let of_shard =
-                |blocks: &[RolloutBlock]| blocks.iter().flat_map(of).map(|&x| term(f64::from(x))).sum::<f64>();
-            self.division.total(blocks.map(|blocks| vec![of_shard(blocks)]))[0]
+        let sum = |term: &(dyn Fn(f64) -> f64 + Sync)| {
+            let of_blocks = |blocks: &[RolloutBlock]| blocks.iter().flat_map(of).map(|&x| term(f64::from(x))).sum();
+            self.exchange.sum(&rollout.blocks, of_blocks, |sum: &mut f64, more| *sum += more)
         };
-        let count = (rollout.samples() / shards * self.division.shards()) as f64;
+        let count = self.exchange.of_all(rollout.samples()) as f64;
         let mean = sum(&|x| x) / count;
         (mean, sum(&|x| (x - mean).powi(2)) / count)
     }
 
-    /// Takes one gradient step on these samples, which are ordered by shard. In the `first` step of an update, the
-    /// policy is still the one that acted.
-    fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], first: bool) -> Result<Step> {
-        let (own_shards, shards) = (self.division.own().len(), self.division.shards());
-        let minibatch = Minibatch { samples, own_shards, shards };
+    /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient. In the `first` step of an
+    /// update, the policy is still the one that acted.
+    fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, first: bool) -> Result<(LossSums, f64)> {
         let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
-        self.division.reduce(&mut self.gradient, &self.slices);
-        let losses = self.losses(&sums, minibatch.count() as f64);
-        let squares = squares(&self.gradient, self.slices.own_chunks());
-        let squares = self.division.gather_chunks(squares, &self.slices);
+        self.slices.reduce_scatter(&mut self.gradient);
+        let losses = self.losses(&sums, minibatch.count);
+        let squares = self.slices.of_chunks(|chunk| sum_of_squares(&self.gradient[chunk.clone()]));
         let grad_norm = norm(&squares, &self.chunks);
-        for (what, value) in [("the loss", losses.total), ("the norm of the gradient", grad_norm)] {
+        for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
             if !value.is_finite() {
                 bail!("{what} is {value}: the training has failed and stops here");
             }
@@ -300,32 +288,30 @@ impl Ppo {
         if !first {
             self.learning_rate.adapt(losses.kl);
         }
-        // The entropy of the Gaussian at noise scale 1.
-        let entropy = self.policy.log_std().iter().map(|&s| f64::from(s) + 0.5 * (TAU * E).ln()).sum();
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
         self.adam.step(parameters, &self.gradient, own, self.learning_rate.rate, scale);
-        self.division.share(parameters, &self.slices);
-        Ok(Step { losses, grad_norm, entropy })
+        self.slices.all_gather(parameters);
+        Ok((losses, grad_norm))
     }
 
-    /// Returns the losses of a minibatch of `samples` samples, given the sums of this rank's shards.
-    fn losses(&self, sums: &[ShardSums], samples: f64) -> Losses {
-        let row =
-            |sums: &ShardSums| [sums.surrogate, sums.value_error, sums.excess, sums.kl, sums.clipped, sums.ratio_error];
-        let rows = self.division.gather(sums.iter().flat_map(row).collect());
-        let totals = totals(&rows, self.division.shards());
-        let mean = |i: usize| totals[i] / samples;
-        let (policy, value, excess, kl, clip_fraction) = (-mean(0), mean(1), mean(2), mean(3), mean(4));
-        let total = policy + self.config.value_coef * value + self.config.bounds_coef * excess;
-        let ratio_error = rows.iter().skip(5).step_by(6).copied().fold(0.0, f64::max);
-        Losses { total, policy, value, excess, kl, clip_fraction, ratio_error }
+    /// Returns the mean losses of a minibatch of `count` samples, given the sums of each of this process' groups.
+    fn losses(&self, sums: &[LossSums], count: usize) -> LossSums {
+        let add = |sum: &mut LossSums, more| *sum += more;
+        let of_groups = |groups: &[LossSums]| {
+            groups.iter().copied().reduce(|mut sum, more| {
+                sum += more;
+                sum
+            })
+        };
+        let total = self.exchange.sum(sums, |groups| of_groups(groups).expect("a group"), add);
+        total.means(count)
     }
 
     /// Brings the learning rate of a fork, whose parent had the settings `before`, in line with its own settings.
-    pub fn settle_learning_rate(&mut self, before: &PpoConfig) {
-        self.learning_rate.settle(before);
+    pub fn reconcile_learning_rate(&mut self, before: &PpoConfig) {
+        self.learning_rate.reconcile(before);
     }
 
     fn check_weights(&self) -> Result<()> {
@@ -335,32 +321,6 @@ impl Ppo {
         }
         Ok(())
     }
-}
-
-/// Losses and statistics of one minibatch.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Losses {
-    /// The loss that is minimised.
-    total: f64,
-    /// The clipped surrogate, negated.
-    policy: f64,
-    /// The clipped squared error of the values.
-    value: f64,
-    /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
-    excess: f64,
-    /// Mean KL divergence of the current distribution from the one that acted, nats.
-    kl: f64,
-    /// Fraction of the samples whose ratio was clipped.
-    clip_fraction: f64,
-    /// The largest |ratio - 1|.
-    ratio_error: f64,
-}
-
-/// The results of one gradient step.
-struct Step {
-    losses: Losses,
-    grad_norm: f64,
-    entropy: f64,
 }
 
 #[cfg(test)]
@@ -374,13 +334,11 @@ mod tests {
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
 
     #[test]
-    fn the_entropy_is_that_of_a_gaussian_with_these_standard_deviations() {
+    fn the_entropy_is_the_one_of_a_gaussian_with_this_standard_deviation() {
         let config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
-        let mut ppo = Ppo::new(&config, SPACES, 0, Division::alone(1)).unwrap();
-        let rollout = Rollout::new(1, &[4], &SPACES);
-        ppo.backend.begin(&ppo.policy, &rollout);
+        let ppo = Ppo::new(&config, SPACES, 0, Exchange::alone(1)).unwrap();
         // With a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of the two actions.
-        let step = ppo.minibatch_step(&rollout, &[0, 1, 2, 3], true).unwrap();
-        assert!((step.entropy - 2.0 * 0.908_113).abs() < 1e-5, "{}", step.entropy);
+        let entropy = ppo.stats(&[(LossSums::default(), 0.0)], 0.0).entropy;
+        assert!((entropy - 2.0 * 0.908_113).abs() < 1e-5, "{entropy}");
     }
 }

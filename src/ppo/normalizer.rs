@@ -3,7 +3,7 @@
 use pulp::Arch;
 use rayon::prelude::*;
 
-use crate::ranks::Division;
+use crate::ranks::Exchange;
 
 /// Added to the variance, so that a constant input does not cause a division by zero.
 const EPSILON: f64 = 1e-5;
@@ -39,20 +39,21 @@ impl Normalizer {
         }
     }
 
-    /// Adds the raw rows `[B, O]` of these shards and of the other ranks' shards to the statistics; `perceive` is first
-    /// applied to each row. A shard consists of several arrays; all shards have the same number of rows.
+    /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the statistics; `perceive` is first
+    /// applied to each row.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
     /// variances" (1979), eq. 2.1.
-    pub fn update(&mut self, shards: &[Vec<&[f32]>], division: &Division, perceive: impl Fn(&mut [f32]) + Sync) {
+    pub fn update(&mut self, arrays: &[&[f32]], exchange: &Exchange, perceive: impl Fn(&mut [f32]) + Sync) {
         let size = self.mean.len();
-        let in_shard = shards[0].iter().map(|part| part.len() / size).sum::<usize>();
-        let rows = (in_shard * division.shards()) as f64;
-        let mean_of = |sums: Vec<Vec<f64>>| -> Vec<f64> {
-            division.total(sums.into_iter()).into_iter().map(|total| total / rows).collect()
+        let rows = exchange.of_all(arrays.iter().map(|array| array.len() / size).sum()) as f64;
+        let mean_of = |f: fn(f64, f64) -> f64, means: &[f64]| -> Vec<f64> {
+            let sums = |arrays: &[&[f32]]| column_sums(arrays, means, &perceive, f);
+            let add = |sums: &mut Vec<f64>, more: Vec<f64>| sums.iter_mut().zip(more).for_each(|(sum, x)| *sum += x);
+            exchange.sum(arrays, sums, add).into_iter().map(|total| total / rows).collect()
         };
-        let mean = mean_of(column_sums(shards, &vec![0.0; size], &perceive, |x, _| x));
-        let variance = mean_of(column_sums(shards, &mean, &perceive, |x, mean| (x - mean).powi(2)));
+        let mean = mean_of(|x, _| x, &vec![0.0; size]);
+        let variance = mean_of(|x, mean| (x - mean).powi(2), &mean);
         let total = self.count + rows;
         for i in 0..size {
             let delta = mean[i] - self.mean[i];
@@ -64,13 +65,13 @@ impl Normalizer {
     }
 }
 
-/// Returns, for each shard, the sum of `f(value, mean)` over its perceived rows in each column, with the mean of the column.
+/// Returns the sum of `f(value, mean)` over the perceived rows of these arrays in each column, with the mean of the column.
 fn column_sums(
-    shards: &[Vec<&[f32]>],
+    arrays: &[&[f32]],
     means: &[f64],
     perceive: impl Fn(&mut [f32]) + Sync,
     f: impl Fn(f64, f64) -> f64 + Sync,
-) -> Vec<Vec<f64>> {
+) -> Vec<f64> {
     let size = means.len();
     let of_task = |rows: &[f32]| {
         let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
@@ -88,12 +89,9 @@ fn column_sums(
         );
         sums
     };
-    let of_shard = |parts: &Vec<&[f32]>| -> Vec<f64> {
-        let tasks: Vec<&[f32]> = parts.iter().flat_map(|part| part.chunks(ROWS_PER_TASK * size)).collect();
-        let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
-        (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum()).collect()
-    };
-    shards.par_iter().map(of_shard).collect()
+    let tasks: Vec<&[f32]> = arrays.iter().flat_map(|array| array.chunks(ROWS_PER_TASK * size)).collect();
+    let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
+    (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum()).collect()
 }
 
 /// The normalisation `(x - mean) · factor`, clipped.
@@ -134,7 +132,7 @@ mod tests {
             .collect();
         let mut normalizer = Normalizer::new(2);
         for batch in [&[&rows[..14]][..], &[&rows[14..3000], &rows[3000..3004]], &[&rows[3004..]]] {
-            normalizer.update(&[batch.to_vec()], &Division::alone(1), |_| {});
+            normalizer.update(batch, &Exchange::alone(1), |_| {});
         }
         for column in 0..2 {
             let values: Vec<f64> = rows.iter().skip(column).step_by(2).map(|&x| f64::from(x)).collect();

@@ -5,19 +5,13 @@
 
 use std::ops::Range;
 
-/// The name of the logarithms of the standard deviations.
-const LOG_STD: &str = "log_std";
-
-/// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases; then the
-/// logarithms of the standard deviations.
+/// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
     /// The layers of the actor.
     pub actor: Vec<Layer>,
     /// The layers of the critic.
     pub critic: Vec<Layer>,
-    /// The logarithms of the standard deviations, `[A]`.
-    pub log_std: Range<usize>,
 }
 
 /// One layer of a net.
@@ -61,19 +55,17 @@ impl Layout {
             };
             hidden.iter().chain([&outputs]).map(layer).collect()
         };
-        let (actor, critic) = (net(action_size), net(1));
-        Self { actor, critic, log_std: take(action_size) }
+        Self { actor: net(action_size), critic: net(1) }
     }
 
-    /// Returns the number of weights, biases and standard deviations.
+    /// Returns the number of weights and biases.
     pub fn count(&self) -> usize {
-        self.log_std.end
+        self.nets()[1].end
     }
 
-    /// Returns the ranges of actor, critic and standard deviations.
-    pub fn groups(&self) -> [Range<usize>; 3] {
-        let of = |net: &[Layer]| net[0].weight.start..net[net.len() - 1].bias.end;
-        [of(&self.actor), of(&self.critic), self.log_std.clone()]
+    /// Returns the ranges of actor and critic.
+    pub fn nets(&self) -> [Range<usize>; 2] {
+        [&self.actor, &self.critic].map(|net| net[0].weight.start..net[net.len() - 1].bias.end)
     }
 
     /// Returns each parameter tensor with its name, in order.
@@ -86,7 +78,6 @@ impl Layout {
                 views.push(View { name: format!("{net}.{i}.bias"), shape: vec![*outputs], range: bias.clone() });
             }
         }
-        views.push(View { name: LOG_STD.into(), shape: vec![self.log_std.len()], range: self.log_std.clone() });
         views
     }
 }
@@ -102,7 +93,7 @@ mod tests {
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let layers = "0.weight 0.bias 1.weight 1.bias 2.weight 2.bias";
         let of = |net: &str| layers.split(' ').map(|layer| format!("{net}.{layer} ")).collect::<String>();
-        assert_eq!(names.join(" "), of("actor") + &of("critic") + "log_std");
+        assert_eq!(names.join(" "), of("actor") + of("critic").trim_end());
         let mut end = 0;
         for View { name, shape, range } in &views {
             assert_eq!((range.start, range.len()), (end, shape.iter().product()), "{name}");
@@ -110,7 +101,7 @@ mod tests {
         }
         assert_eq!(end, layout.count());
         assert_eq!(views[4].shape, [2, 4], "the actor's last layer");
-        let [actor, critic, log_std] = layout.groups();
-        assert_eq!([actor.start, actor.end, critic.end, log_std.end], [0, critic.start, log_std.start, end]);
+        let [actor, critic] = layout.nets();
+        assert_eq!([actor.start, actor.end, critic.end], [0, critic.start, end]);
     }
 }

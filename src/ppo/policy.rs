@@ -1,4 +1,4 @@
-//! The policy: actor and critic MLPs, standard deviations that do not depend on the state, and observation reading.
+//! The policy: actor and critic MLPs, one standard deviation for all actions, and observation reading.
 
 use anyhow::Result;
 use rand::RngExt;
@@ -9,19 +9,21 @@ use super::normalizer::CLIP;
 use super::parameters::{Layer, Layout};
 use super::perception::{Perception, ROTATIONS, Reader};
 use crate::config::{Activation, NetConfig};
-use crate::ranks::Division;
+use crate::ranks::Exchange;
 use crate::rng::{self, Rng};
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// The factor on the initial weights of the actor's last layer; it keeps first actions near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
 
-/// A Gaussian policy with diagonal covariance, and its value function. It reads raw observations.
+/// A Gaussian policy whose actions are independent and have the same standard deviation, and its value function. It reads raw observations.
 pub struct Policy {
     /// The location of each parameter.
     pub layout: Layout,
-    /// All weights, biases and logarithms of standard deviations.
+    /// All weights and biases.
     pub parameters: Vec<f32>,
+    /// The logarithm of the standard deviation of each action.
+    pub log_std: f32,
     /// Statistics of the observations after perception.
     pub normalizer: Normalizer,
     /// The function after each hidden layer.
@@ -37,8 +39,6 @@ pub struct FrozenPolicy<'a> {
     actor: Net<'a>,
     critic: Net<'a>,
     reader: Reader,
-    /// `[A]`: standard deviations
-    std: Vec<f32>,
 }
 
 /// What the actor computes, as numbers for another program: the symmetry, then `(x - mean) * factor` within ± `clip`, then the
@@ -93,15 +93,21 @@ impl Policy {
         }
     }
 
-    /// Creates a policy with these parameters for environments with these spaces.
+    /// Creates a policy with these parameters and this logarithm of the standard deviation for environments with these spaces.
     ///
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
-    pub fn new(net: &NetConfig, spaces: Spaces, parameters: Vec<f32>, normalizer: Normalizer) -> Result<Self> {
+    pub fn new(
+        net: &NetConfig,
+        spaces: Spaces,
+        parameters: Vec<f32>,
+        log_std: f32,
+        normalizer: Normalizer,
+    ) -> Result<Self> {
         let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         assert_eq!(parameters.len(), layout.count(), "number of parameters");
         let perception = Perception::new(net.symmetry, &spaces)?;
-        Ok(Self { layout, parameters, normalizer, activation: net.activation, spaces, perception })
+        Ok(Self { layout, parameters, log_std, normalizer, activation: net.activation, spaces, perception })
     }
 
     /// Creates an untrained policy with weights drawn from `seed` and this standard deviation.
@@ -113,7 +119,7 @@ impl Policy {
     pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Result<Self> {
         let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
         let mut rng = rng::stream(seed, "weights", 0);
-        let mut parameters = vec![std.ln() as f32; layout.count()];
+        let mut parameters = vec![0.0; layout.count()];
         let mut fill = |layer: &Layer, shrink: f32| {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
             uniform(&mut rng, bound * shrink, &mut parameters[layer.weight.clone()]);
@@ -123,23 +129,18 @@ impl Policy {
         hidden.iter().for_each(|layer| fill(layer, 1.0));
         fill(last, LAST_ACTOR_LAYER);
         layout.critic.iter().for_each(|layer| fill(layer, 1.0));
-        Self::new(net, spaces, parameters, Normalizer::new(spaces.observation_size))
+        Self::new(net, spaces, parameters, std.ln() as f32, Normalizer::new(spaces.observation_size))
     }
 
-    /// Returns the logarithms of the standard deviations, `[A]`.
-    pub fn log_std(&self) -> &[f32] {
-        &self.parameters[self.layout.log_std.clone()]
+    /// Returns the standard deviation of each action at noise scale 1; training may scale the noise (see `Acting`).
+    pub fn std(&self) -> f32 {
+        self.log_std.exp()
     }
 
-    /// Returns the standard deviations, `[A]`.
-    pub fn std(&self) -> Vec<f32> {
-        self.log_std().iter().map(|log_std| log_std.exp()).collect()
-    }
-
-    /// Adds the raw rows `[B, O]` of these shards and of the other ranks' shards to the normaliser.
-    pub(super) fn see(&mut self, shards: &[Vec<&[f32]>], division: &Division) {
+    /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the normaliser.
+    pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
         let perception = self.perception;
-        self.normalizer.update(shards, division, |row| perception.turn(row));
+        self.normalizer.update(arrays, exchange, |row| perception.turn(row));
     }
 
     /// Returns the way it currently reads observations.
@@ -166,7 +167,7 @@ impl Policy {
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
         let nets = [&self.layout.actor, &self.layout.critic];
         let [actor, critic] = nets.map(|layers| self.net(layers).for_few_rows().packed(arithmetic, false));
-        FrozenPolicy { policy: self, actor, critic, reader: self.reader(), std: self.std() }
+        FrozenPolicy { policy: self, actor, critic, reader: self.reader() }
     }
 }
 
@@ -182,9 +183,9 @@ impl FrozenPolicy<'_> {
         &self.policy.spaces
     }
 
-    /// Returns the standard deviations `[A]` at noise scale 1; training may scale the noise (see `Acting`).
-    pub fn std(&self) -> &[f32] {
-        &self.std
+    /// Returns the standard deviation of each action (see [`Policy::std`]).
+    pub fn std(&self) -> f32 {
+        self.policy.std()
     }
 
     /// Writes the mean actions `[B, A]` for raw observations `[B, O]`.

@@ -1,18 +1,26 @@
 //! How this process was started: alone, or by a launcher as one of several.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
-use anyhow::{Result, bail};
+use anyhow::{Result, anyhow, bail};
 
-use super::{Alone, Ranks};
+use super::{Alone, Exchange};
+use crate::os;
+use crate::schedule::panic_message;
+
+/// The time that the first rank has to save what it can and to tell of an error before another one does, and ends it.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What a launcher has said about this process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Launched {
+struct Launched {
     /// The index of this process.
-    pub rank: usize,
+    rank: usize,
     /// The number of processes.
-    pub size: usize,
+    size: usize,
 }
 
 /// The variables in which launchers tell size and rank: OpenMPI, MPICH and its relatives, Slurm.
@@ -23,7 +31,7 @@ const TOLD: [(&str, &str); 3] = [
 ];
 
 /// Returns what a launcher has said, if this process is one of several.
-pub fn launched() -> Option<Launched> {
+fn launched() -> Option<Launched> {
     told(|name| std::env::var(name).ok())
 }
 
@@ -31,6 +39,22 @@ pub fn launched() -> Option<Launched> {
 /// each.
 pub fn launched_by_mpirun() -> bool {
     std::env::var_os(TOLD[0].0).is_some()
+}
+
+/// Returns whether this process is the one that says what all of those that were started together would say.
+pub fn is_spokesman() -> bool {
+    launched().is_none_or(|launched| launched.rank == 0)
+}
+
+/// Checks that no launcher has started several processes, for what only one process can do.
+///
+/// # Errors
+/// Fails if there are several.
+pub fn expect_one() -> Result<()> {
+    match launched() {
+        Some(Launched { size, .. }) => bail!("only `train` runs on several ranks; {size} processes were started"),
+        None => Ok(()),
+    }
 }
 
 fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
@@ -41,10 +65,39 @@ fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
     })
 }
 
+/// Joins the processes that the launcher has started together with this one, and returns what `work` does as one of them. If it
+/// fails on one of several, all end.
+///
+/// # Errors
+/// Fails if there should be several, but this process cannot talk to the others; or as `work` does, if this process is alone.
+pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<ExitCode> {
+    let Membership { exchange, .. } = &match join() {
+        // All meet the same error; one of them tells.
+        Err(_) if !is_spokesman() => return Ok(ExitCode::FAILURE),
+        joined => joined?,
+    };
+    if exchange.is_alone() {
+        return work(exchange);
+    }
+    if !exchange.is_first() {
+        os::speak_as(&format!("rank {}", exchange.number()));
+    }
+    // To leave the others means to wait for them, and they may be waiting for this one.
+    let result = catch_unwind(AssertUnwindSafe(|| work(exchange)));
+    let result = result.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
+    result.or_else(|error| {
+        if !exchange.is_first() {
+            // What all ranks meet at once, such as a loss that is not finite, is told by the first.
+            std::thread::sleep(PATIENCE);
+        }
+        os::say(&format!("error: {error:#}"));
+        exchange.abort()
+    })
+}
+
 /// This process as a member of its ranks. When it is dropped, it leaves them, which waits for the others.
-pub struct Membership {
-    /// The ranks.
-    pub ranks: Arc<dyn Ranks>,
+struct Membership {
+    exchange: Exchange,
     #[cfg(feature = "mpi")]
     _universe: Option<super::mpi::Universe>,
 }
@@ -52,36 +105,29 @@ pub struct Membership {
 impl Membership {
     fn alone() -> Self {
         Self {
-            ranks: Arc::new(Alone),
+            exchange: Exchange::new(Arc::new(Alone)),
             #[cfg(feature = "mpi")]
             _universe: None,
         }
     }
 }
 
-/// Joins the processes that the launcher has started together with this one; without a launcher, there is one rank.
-///
-/// # Errors
-/// Fails if there should be several ranks, but this process cannot talk to the others.
 #[cfg(feature = "mpi")]
-pub fn join() -> Result<Membership> {
+fn join() -> Result<Membership> {
     let Some(Launched { size, .. }) = launched() else { return Ok(Membership::alone()) };
     let (universe, ranks) = super::mpi::join()?;
-    if ranks.size() == 1 {
+    let exchange = Exchange::new(Arc::new(ranks));
+    if exchange.is_alone() {
         bail!(
             "{size} processes were started, but each finds itself alone; under Slurm, start them with srun --mpi=pmix, or with the \
              mpirun of the MPI that this program was built with"
         );
     }
-    Ok(Membership { ranks: Arc::new(ranks), _universe: Some(universe) })
+    Ok(Membership { exchange, _universe: Some(universe) })
 }
 
-/// The same in a build that cannot talk to other processes.
-///
-/// # Errors
-/// Fails if there should be several ranks.
 #[cfg(not(feature = "mpi"))]
-pub fn join() -> Result<Membership> {
+fn join() -> Result<Membership> {
     if let Some(Launched { size, .. }) = launched() {
         bail!(
             "{size} processes were started, but this build has no MPI: each would train on its own; build with --features mpi \

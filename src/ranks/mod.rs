@@ -5,42 +5,45 @@
 //! many samples is computed shard by shard and combined in the order of the shards, gradients as a binary tree. A rank
 //! computes consecutive shards, which form a subtree. So one, two or four ranks give the same bits.
 //!
-//! In a gradient step each rank sends its gradient, cut into the slices of the ranks; adds up its own slice; tells the others
-//! its part of the losses and of the norm; moves its slice of the parameters; and sends that to all. At the end of an
-//! iteration they add up statistics and tell the first rank of the episodes that ended, and for a checkpoint the states of
-//! their environments.
+//! The rest of the program knows only [`Exchange`], which sums over all shards and gathers what the ranks have. In a gradient
+//! step the gradient is reduced and scattered: each rank adds up its slice, moves its slice of the parameters, and gathers the
+//! slices of all. Sums of losses, norms and statistics, the episodes that ended and the states of environments are gathered
+//! as bytes.
 
-mod division;
+mod blocks;
+mod exchange;
 mod launch;
+mod minibatches;
 #[cfg(feature = "mpi")]
 mod mpi;
+mod slices;
 
 use std::ops::Range;
 
 use pulp::Arch;
 
-pub use division::{Division, Slices, Traffic, totals};
-pub use launch::{Launched, Membership, join, launched, launched_by_mpirun};
+pub use blocks::Blocks;
+pub use exchange::{Exchange, Traffic};
+pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
+pub use minibatches::{Minibatch, Minibatches};
+pub use slices::Slices;
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {
-    /// Returns the number of ranks: a power of two.
+    /// Returns the number of ranks.
     fn size(&self) -> usize;
 
     /// Returns the index of this rank.
     fn rank(&self) -> usize;
 
-    /// Sends `numbers[parts[i]]` to rank i, for every i. Returns what the ranks have sent to this one, in their order.
-    fn exchange(&self, numbers: &[f32], parts: &[Range<usize>]) -> Vec<f32>;
+    /// Sends `numbers[slices[i]]` to rank i, for every i. Returns what the ranks have sent to this one, in their order.
+    fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32>;
 
-    /// Replaces `numbers[parts[i]]` by the values that rank i has there, for every i.
-    fn share(&self, numbers: &mut [f32], parts: &[Range<usize>]);
+    /// Replaces `numbers[slices[i]]` by the values that rank i has there, for every i.
+    fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]);
 
-    /// Returns the values of all ranks, in their order; all ranks pass the same number of values.
-    fn gather(&self, numbers: Vec<f64>) -> Vec<f64>;
-
-    /// Returns the bytes of each rank, in their order, to rank 0, and nothing to the others.
-    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>>;
+    /// Returns the bytes of all ranks, in their order.
+    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>>;
 
     /// Returns the bytes of rank 0.
     fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8>;
@@ -61,17 +64,13 @@ impl Ranks for Alone {
         0
     }
 
-    fn exchange(&self, numbers: &[f32], _: &[Range<usize>]) -> Vec<f32> {
+    fn all_to_all(&self, numbers: &[f32], _: &[Range<usize>]) -> Vec<f32> {
         numbers.to_vec()
     }
 
-    fn share(&self, _: &mut [f32], _: &[Range<usize>]) {}
+    fn all_gather_slices(&self, _: &mut [f32], _: &[Range<usize>]) {}
 
-    fn gather(&self, numbers: Vec<f64>) -> Vec<f64> {
-        numbers
-    }
-
-    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
         vec![bytes]
     }
 

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use mpi::Threading;
 use mpi::datatype::{Partition, PartitionMut};
 use mpi::topology::SimpleCommunicator;
-use mpi::traits::{Communicator, CommunicatorCollectives, Destination, Root, Source};
+use mpi::traits::{Communicator, CommunicatorCollectives, Root};
 
 use super::Ranks;
 
@@ -43,25 +43,7 @@ fn world() -> SimpleCommunicator {
 
 /// Returns these numbers as MPI counts them.
 fn counts(numbers: impl Iterator<Item = usize>) -> Vec<i32> {
-    numbers.map(|n| n.try_into().expect("a net has fewer than 2^31 weights")).collect()
-}
-
-fn send(bytes: &[u8], to: i32) {
-    let peer = world();
-    let peer = peer.process_at_rank(to);
-    peer.send(&(bytes.len() as u64));
-    bytes.chunks(LONGEST).for_each(|part| peer.send(part));
-}
-
-fn receive(from: i32) -> Vec<u8> {
-    let peer = world();
-    let peer = peer.process_at_rank(from);
-    let (length, _) = peer.receive::<u64>();
-    let mut bytes = vec![0; length as usize];
-    bytes.chunks_mut(LONGEST).for_each(|part| {
-        peer.receive_into(part);
-    });
-    bytes
+    numbers.map(|n| n.try_into().expect("fewer than 2^31 weights, and bytes of states")).collect()
 }
 
 impl Ranks for Mpi {
@@ -73,35 +55,42 @@ impl Ranks for Mpi {
         self.rank
     }
 
-    fn exchange(&self, numbers: &[f32], parts: &[Range<usize>]) -> Vec<f32> {
-        let own = parts[self.rank].len();
+    fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
+        let own = slices[self.rank].len();
         let mut received = vec![0.0; own * self.size];
         let [sent_counts, sent_firsts] =
-            [counts(parts.iter().map(Range::len)), counts(parts.iter().map(|part| part.start))];
+            [counts(slices.iter().map(Range::len)), counts(slices.iter().map(|slice| slice.start))];
         let [counts, firsts] = [counts((0..self.size).map(|_| own)), counts((0..self.size).map(|rank| rank * own))];
         let sent = Partition::new(numbers, sent_counts, sent_firsts);
         world().all_to_all_varcount_into(&sent, &mut PartitionMut::new(&mut received[..], counts, firsts));
         received
     }
 
-    fn share(&self, numbers: &mut [f32], parts: &[Range<usize>]) {
-        let own = numbers[parts[self.rank].clone()].to_vec();
-        let [counts, firsts] = [counts(parts.iter().map(Range::len)), counts(parts.iter().map(|part| part.start))];
+    fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]) {
+        let own = numbers[slices[self.rank].clone()].to_vec();
+        let [counts, firsts] = [counts(slices.iter().map(Range::len)), counts(slices.iter().map(|slice| slice.start))];
         world().all_gather_varcount_into(&own[..], &mut PartitionMut::new(numbers, counts, firsts));
     }
 
-    fn gather(&self, numbers: Vec<f64>) -> Vec<f64> {
-        let mut all = vec![0.0; numbers.len() * self.size];
-        world().all_gather_into(&numbers[..], &mut all[..]);
-        all
-    }
-
-    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
-        if self.rank > 0 {
-            send(&bytes, 0);
-            return Vec::new();
-        }
-        std::iter::once(bytes).chain((1..self.size).map(|rank| receive(rank as i32))).collect()
+    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+        let mut lengths = vec![0_u64; self.size];
+        world().all_gather_into(&(bytes.len() as u64), &mut lengths[..]);
+        let lengths: Vec<usize> = lengths.into_iter().map(|length| length as usize).collect();
+        let firsts = lengths.iter().scan(0, |end, length| {
+            *end += length;
+            Some(*end - length)
+        });
+        let (firsts, mut all) = (counts(firsts), vec![0; lengths.iter().sum()]);
+        let mut places = PartitionMut::new(&mut all[..], counts(lengths.iter().copied()), firsts);
+        world().all_gather_varcount_into(&bytes[..], &mut places);
+        drop(places);
+        let mut rest = &all[..];
+        let cut = |length: usize| {
+            let (bytes, after) = rest.split_at(length);
+            rest = after;
+            bytes.to_vec()
+        };
+        lengths.into_iter().map(cut).collect()
     }
 
     fn broadcast(&self, mut bytes: Vec<u8>) -> Vec<u8> {

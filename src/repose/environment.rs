@@ -8,12 +8,13 @@ use std::sync::Arc;
 use anyhow::{Result, ensure};
 
 use super::conditions::Conditions;
+use super::divergence::{Diverged, Recorder};
 use super::observation::{Cells, SPACES};
 use super::randomization::{Draw, Randomization};
+use super::reward::{Step, task_reward};
 use super::servos::{Servos, Targets};
-use super::tail::{Recorder, Tail};
 use super::task::Task;
-use super::{ACTION_SIZE, EpisodeStats, Lesson, Recent, RewardTerms, Shaping};
+use super::{ACTION_SIZE, EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward};
 use crate::config::{EnvConfig, SuccessHold};
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
@@ -36,21 +37,11 @@ pub struct Repose {
     age: u32,
     held: u32,
     episode: EpisodeStats,
-    recent: Recent,
+    /// Since they were last taken.
+    sums: StepSums,
     last: StepDetails,
     recorder: Recorder,
     diverged: Option<Diverged>,
-}
-
-/// The end of an episode whose physics diverged.
-#[derive(Clone, Debug)]
-pub struct Diverged {
-    /// The length of the episode in control steps, including the last one.
-    pub length: u32,
-    /// What the episode has drawn, if it was randomised.
-    pub draw: Option<Draw>,
-    /// The last steps of the episode.
-    pub tail: Tail,
 }
 
 /// Details of the last step.
@@ -63,7 +54,7 @@ pub struct StepDetails {
     /// Distance of the cube from the goal position after the step, m.
     pub goal_dist: f64,
     /// The reward by term.
-    pub reward: RewardTerms,
+    pub reward: TaskReward,
     /// Whether the physics diverged.
     pub diverged: bool,
     /// The random force on the cube in the step, N, if there are such forces in the episode.
@@ -91,7 +82,7 @@ impl Repose {
             age: 0,
             held: 0,
             episode: EpisodeStats::default(),
-            recent: Recent::default(),
+            sums: StepSums::default(),
             last: StepDetails::default(),
             recorder: Recorder::default(),
             diverged: None,
@@ -139,8 +130,8 @@ impl Repose {
     }
 
     /// Returns the sums since the last call.
-    pub fn take_recent(&mut self) -> Recent {
-        std::mem::take(&mut self.recent)
+    pub fn take_sums(&mut self) -> StepSums {
+        std::mem::take(&mut self.sums)
     }
 
     /// Returns the last episode that has diverged since the last call.
@@ -164,6 +155,36 @@ impl Repose {
         let at = self.task.hand.cube.qpos;
         let q = self.sim.qpos();
         Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
+    }
+
+    /// Returns what the rewards of a step depend on, after its physics.
+    fn outcome(&self, rot_dist_before: f64, previous_action: [f32; ACTION_SIZE]) -> Step {
+        let (task, cube, qvel) = (&self.task, self.cube(), self.sim.qvel());
+        let rot_dist = quat::angle_between(cube.orientation, self.goal);
+        let offset = [0, 1, 2].map(|axis| cube.position[axis] - task.config.goal_position[axis]);
+        let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
+        Step {
+            rot_dist_before,
+            rot_dist,
+            goal_dist,
+            within: rot_dist <= self.lesson.tolerance,
+            dropped: goal_dist >= task.config.fall_dist,
+            action: self.previous_action,
+            previous_action,
+            cube,
+            cube_velocity: self.cube_velocity(),
+            joint_pos: task.hand.joints.map(|joint| self.sim.qpos()[joint.qpos]),
+            joint_vel: task.hand.joints.map(|joint| qvel[joint.dof]),
+        }
+    }
+
+    /// Returns the velocity of the cube, in the world frame.
+    fn cube_velocity(&self) -> Velocity {
+        let [vx, vy, vz, spin @ ..] =
+            self.sim.qvel()[self.task.hand.cube.dof..].first_chunk::<6>().expect("a free joint");
+        // MuJoCo stores the angular velocity of a free joint in the body's frame.
+        let angular = quat::rotate(self.cube().orientation, *spin);
+        Velocity { linear: [*vx, *vy, *vz], angular }
     }
 
     /// Clips the action, writes as controls the targets that take effect now, and returns those.
@@ -220,12 +241,11 @@ impl Repose {
         cells.put("joint_vel", hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
         let Pose { position, orientation } = self.cube();
-        let [vx, vy, vz, spin @ ..] = qvel[hand.cube.dof..].first_chunk::<6>().expect("a free joint");
+        let Velocity { linear, angular } = self.cube_velocity();
         cells.put("cube_pos", position);
         cells.put("cube_quat", quat::canonical(orientation));
-        cells.put("cube_linvel", [*vx, *vy, *vz]);
-        // MuJoCo stores the angular velocity of a free joint in the body's frame.
-        cells.put("cube_angvel", quat::rotate(orientation, *spin).map(|x| config.vel_obs_scale * x));
+        cells.put("cube_linvel", linear);
+        cells.put("cube_angvel", angular.map(|x| config.vel_obs_scale * x));
         cells.put("goal_pos", config.goal_position);
         cells.put("goal_quat", quat::canonical(self.goal));
         cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
@@ -296,7 +316,7 @@ impl Env for Repose {
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
-        let rot_dist_before = self.rot_dist();
+        let (rot_dist_before, previous_action) = (self.rot_dist(), self.previous_action);
         let sent = self.actuate(action);
         let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, push);
@@ -306,37 +326,30 @@ impl Env for Repose {
             self.send(sent);
         }
 
-        let config = &self.task.config;
-        let Pose { position, orientation } = self.cube();
-        let rot_dist = quat::angle_between(orientation, self.goal);
-        let offset = [0, 1, 2].map(|axis| position[axis] - config.goal_position[axis]);
-        let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let reward = match diverged {
-            true => RewardTerms::default(),
-            false => RewardTerms::of_step(config, rot_dist, goal_dist, &self.previous_action),
-        };
-        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged, push };
-
+        let step = self.outcome(rot_dist_before, previous_action);
+        let (mut reward, mut added, mut reached) = (TaskReward::default(), TrainingReward::default(), false);
         self.age += 1;
         self.episode.length += 1;
-        self.episode.reward += reward;
         self.episode.diverged = diverged;
-        self.episode.dropped = !diverged && goal_dist >= self.task.config.fall_dist;
-        self.recent.steps += 1;
-        self.recent.reward += reward;
-        self.recent.diverged += u64::from(diverged);
-        let (mut shaping, mut reached) = (Shaping::default(), false);
+        self.episode.dropped = !diverged && step.dropped;
+        self.sums.steps += 1;
+        self.sums.diverged += u64::from(diverged);
         if diverged {
             let (length, draw) = (self.episode.length, self.conditions.draw().cloned());
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
         } else {
-            self.episode.rot_dist_sum += rot_dist;
-            self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
-            let within = rot_dist <= self.lesson.tolerance;
-            reached = self.hold(within);
-            shaping = self.lesson.shaping(rot_dist_before, rot_dist, within, self.episode.dropped);
-            self.recent.shaping += shaping;
+            reward = task_reward(&self.task.config, &step);
+            added = self.lesson.reward(&step);
+            self.episode.reward += reward;
+            self.episode.rot_dist_sum += step.rot_dist;
+            self.episode.in_tolerance += u32::from(step.rot_dist <= self.task.config.success_tolerance);
+            self.sums.task += reward;
+            self.sums.training += added;
+            self.sums.turned += rot_dist_before - step.rot_dist;
+            reached = self.hold(step.within);
         }
+        let Step { rot_dist, goal_dist, .. } = step;
+        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged, push };
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
@@ -345,12 +358,12 @@ impl Env for Repose {
             let goal_ends = if reached { self.lesson.goals_end } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(goal_ends.then_some(End::Redirected))
         };
-        // Where reaching a goal ends it, the final observation must still show it, since its value is bootstrapped.
+        // When the goal is cut off, its final observation must show the old goal; `redirect` replaces it afterwards.
         if reached && !self.lesson.goals_end {
             self.replace_goal();
         }
         self.observe(observation);
-        Transition { reward: self.lesson.total(reward.total(), shaping) as f32, end }
+        Transition { reward: self.lesson.total(reward.total(), &added) as f32, end }
     }
 
     /// Draws another goal and resets the hold counter.
@@ -385,16 +398,9 @@ impl Resumable for Repose {
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
         ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
-        // Older versions did not save whether the episode is randomised. The share was constant; a fork may have another one.
-        let is_saved = state.counters_left() > EpisodeStats::COUNTERS;
-        let randomized = if is_saved {
-            let [flag] = state.counters()?;
-            ensure!(flag <= 1, "an episode is randomised or not, but the state says {flag}");
-            flag as f64
-        } else {
-            self.lesson.randomized
-        };
-        self.conditions.begin(&self.rng, randomized, &mut self.sim, &self.task);
+        let [randomized] = state.counters()?;
+        ensure!(randomized <= 1, "an episode is randomised or not, but the state says {randomized}");
+        self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
         let fixed = 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS;
         // A fork may have other delays than its parent.
         let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / ACTION_SIZE;
@@ -411,7 +417,7 @@ impl Resumable for Repose {
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
         let under_way: Vec<Targets> = (0..under_way).map(|_| state.numbers()).collect::<Result<_>>()?;
         self.servos.restore(targets, &under_way, self.conditions.delay(&self.task));
-        self.recent = Recent::default();
+        self.sums = StepSums::default();
         self.last = StepDetails::default();
         self.recorder.clear();
         self.observe(observation);

@@ -1,13 +1,16 @@
 //! Statistics of an episode, and the score of a set of episodes.
 
-use anyhow::{Result, ensure};
+use std::ops::AddAssign;
 
-use super::{RewardTerms, Shaping};
+use anyhow::{Result, ensure};
+use serde::{Deserialize, Serialize};
+
+use super::divergence::divergence;
+use super::{TaskReward, TrainingReward};
 use crate::env::{EnvState, SavedEnv};
-use crate::ranks::Division;
 
 /// The sums over one episode.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeStats {
     /// Control steps.
     pub length: u32,
@@ -18,12 +21,12 @@ pub struct EpisodeStats {
     /// Sum of the rotation error over the steps, rad; a diverged step adds nothing.
     pub rot_dist_sum: f64,
     /// Sums of the reward terms.
-    pub reward: RewardTerms,
+    pub reward: TaskReward,
     /// Whether the cube was dropped.
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// Whether it was randomised. Who saves the episode saves this.
+    /// Whether it was randomised. Not written by `save`; the environment stores it beside the episode.
     pub randomized: bool,
 }
 
@@ -31,43 +34,18 @@ impl EpisodeStats {
     /// The number of `f64` values that [`Self::save`] writes.
     pub(super) const NUMBERS: usize = 6;
 
-    /// The number of counters that it writes.
-    pub(super) const COUNTERS: usize = 5;
-
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);
-        let RewardTerms { rotation, distance, action, bonus, fall } = self.reward;
-        state.numbers.extend([rotation, distance, action, bonus, fall]);
+        state.numbers.extend(self.reward.values());
         state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
         state.counters.extend([self.dropped, self.diverged].map(u64::from));
-    }
-
-    /// Returns the episodes of all ranks to the first rank, in the order of the ranks.
-    pub fn gathered(own: Vec<Self>, division: &Division) -> Vec<Self> {
-        if division.is_alone() {
-            return own;
-        }
-        let mut state = EnvState::default();
-        for episode in own {
-            episode.save(&mut state);
-            state.counters.push(u64::from(episode.randomized));
-        }
-        let all = state.gathered(division);
-        let count = all.numbers.len() / Self::NUMBERS;
-        let read = |mut row: SavedEnv| -> Result<Self> {
-            let episode = Self::saved(&mut row)?;
-            Ok(Self { randomized: row.counters::<1>()? == [1], ..episode })
-        };
-        let rows = if count == 0 { Ok(Vec::new()) } else { all.rows(count).and_then(|rows| rows.map(read).collect()) };
-        rows.expect("the ranks run the same program")
     }
 
     /// # Errors
     /// Fails if values are missing, or if no episode can have these counters.
     pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
         let [rot_dist_sum] = state.numbers()?;
-        let [rotation, distance, action, bonus, fall] = state.numbers()?;
-        let reward = RewardTerms { rotation, distance, action, bonus, fall };
+        let reward = TaskReward::new(state.numbers()?);
         let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
         let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
         ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
@@ -77,65 +55,47 @@ impl EpisodeStats {
     }
 }
 
-/// Sums across episodes since they were last taken. They are taken before a state is saved and are not part of it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Recent {
+/// Sums over steps, across episodes, since they were last taken. They are taken before a state is saved and are not part of it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StepSums {
     /// Control steps.
     pub steps: u64,
-    /// Sums of the reward terms.
-    pub reward: RewardTerms,
-    /// Sums of the shaping terms that training adds.
-    pub shaping: Shaping,
+    /// Sums of the terms of the task's reward.
+    pub task: TaskReward,
+    /// Sums of the terms that training adds.
+    pub training: TrainingReward,
+    /// Sum of the rotation towards the goal, rad; negative away from it.
+    pub turned: f64,
     /// Steps in which the physics diverged.
     pub diverged: u64,
 }
 
-impl Recent {
+impl StepSums {
     /// Returns the mean of each term of the task's reward over the steps, by name.
-    pub fn reward_named(&self) -> [(&'static str, f64); 5] {
-        self.reward.named().map(|(name, sum)| (name, sum / self.steps as f64))
+    pub fn task_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        self.task.map(|sum| sum / self.steps as f64).named()
     }
 
-    /// Returns the mean of each shaping term over the steps, by name.
-    pub fn shaping_named(&self) -> [(&'static str, f64); 4] {
-        self.shaping.named().map(|(name, sum)| (name, sum / self.steps as f64))
+    /// Returns the mean of each term that training adds, by name, and the rotation towards the goal in 100 steps, rad.
+    pub fn training_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let turned = 100.0 * self.turned / self.steps as f64;
+        self.training.map(|sum| sum / self.steps as f64).named().chain([("turned", turned)])
     }
 }
 
-impl std::ops::AddAssign for Recent {
+impl AddAssign for StepSums {
     fn add_assign(&mut self, other: Self) {
-        self.steps += other.steps;
-        self.reward += other.reward;
-        self.shaping += other.shaping;
-        self.diverged += other.diverged;
-    }
-}
-
-impl Recent {
-    /// Returns the sums over all shards, given those of each shard of this rank.
-    pub fn total(own: impl Iterator<Item = Self>, division: &Division) -> Self {
-        let row = |recent: Self| {
-            let RewardTerms { rotation, distance, action, bonus, fall } = recent.reward;
-            let Shaping { progress, approach, within, drop } = recent.shaping;
-            let [steps, diverged] = [recent.steps, recent.diverged].map(|count| count as f64);
-            vec![steps, diverged, rotation, distance, action, bonus, fall, progress, approach, within, drop]
-        };
-        let total = division.total(own.map(row));
-        let [steps, diverged, rotation, distance, action, bonus, fall, progress, approach, within, drop] = total[..]
-        else {
-            unreachable!("one sum for each number of a row")
-        };
-        Self {
-            steps: steps as u64,
-            diverged: diverged as u64,
-            reward: RewardTerms { rotation, distance, action, bonus, fall },
-            shaping: Shaping { progress, approach, within, drop },
-        }
+        let Self { steps, task, training, turned, diverged } = other;
+        self.steps += steps;
+        self.task += task;
+        self.training += training;
+        self.turned += turned;
+        self.diverged += diverged;
     }
 }
 
 /// Means over finished episodes; `NaN` where there is nothing to average.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Score {
     /// The number of episodes.
     pub episodes: usize,
@@ -158,19 +118,9 @@ pub struct Score {
     /// Mean sum of rewards of an episode.
     pub episode_return: f64,
     /// The same, by term.
-    pub reward: RewardTerms,
+    pub reward: TaskReward,
     /// Episodes that ended because the physics diverged.
     pub diverged: usize,
-}
-
-/// Returns a warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
-pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
-    (diverged * 100 > steps).then(|| {
-        format!(
-            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of scene, \
-             env.sim_dt, masses, friction, gains and damping cannot be simulated"
-        )
-    })
 }
 
 impl Score {
@@ -213,7 +163,7 @@ impl Score {
         let mean = goals / n;
         let variance = sum(&|e| (f64::from(e.goals) - mean).powi(2)) / (n - 1.0);
         let margin = 1.96 * (variance / n).sqrt();
-        let mut total = RewardTerms::default();
+        let mut total = TaskReward::default();
         episodes.iter().for_each(|e| total += e.reward);
         Self {
             episodes: episodes.len(),
@@ -238,7 +188,7 @@ mod tests {
 
     #[test]
     fn a_score_is_the_mean_worked_out_by_hand() {
-        let reward = |rotation| RewardTerms { rotation, ..Default::default() };
+        let reward = |rotation| TaskReward::new([rotation, 0.0, 0.0, 0.0, 0.0]);
         let one = EpisodeStats {
             length: 1000,
             goals: 4,

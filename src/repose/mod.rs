@@ -1,6 +1,7 @@
 //! The task: a Shadow Hand turns a cube in its palm to one goal orientation after another.
 
 mod conditions;
+mod divergence;
 mod environment;
 mod episode;
 mod hand;
@@ -10,15 +11,16 @@ mod randomization;
 mod reward;
 mod sensing;
 mod servos;
-mod tail;
 mod task;
+mod terms;
 
-pub use environment::{Diverged, Repose, StepDetails};
-pub use episode::{EpisodeStats, Recent, Score, divergence};
+pub use divergence::{Diverged, Tail, divergence};
+pub use environment::{Repose, StepDetails};
+pub use episode::{EpisodeStats, Score, StepSums};
 pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
-pub use lesson::{Lesson, Shaping};
+pub use lesson::Lesson;
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use randomization::{Draw, Randomization};
-pub use reward::RewardTerms;
-pub use tail::Tail;
+pub use reward::{OfTask, OfTraining, Step, TaskReward, TrainingReward, task_reward};
 pub use task::Task;
+pub use terms::{Description, TermList, Terms};

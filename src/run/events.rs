@@ -12,7 +12,7 @@ use tensorboard_proto::summary::Summary;
 use tensorboard_rs::record_writer::RecordWriter;
 
 use super::records::length_up_to;
-use super::summary::{Figures, Summaries, Tag};
+use super::summary::{Media, Summaries, Tag};
 use crate::os::expect_named;
 use crate::os::{make_own, sync_folder};
 
@@ -79,7 +79,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn iteration(&mut self, step: u64, values: &[(impl AsRef<str>, f64)], figures: &Figures) -> Result<()> {
+    pub(super) fn iteration(&mut self, step: u64, values: &[(impl AsRef<str>, f64)], figures: &Media) -> Result<()> {
         let summary = self.summaries.of_iteration(values, figures);
         self.summary(summary, step)
     }
@@ -176,7 +176,7 @@ mod tests {
     fn steps_after_the_checkpoint_and_half_written_events_are_cut_off() {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 0);
-        let figures = Figures {
+        let figures = Media {
             film: Some(("eval/film", Animation { size: [320, 240], gif: vec![7; 3 << 20] })),
             ..Default::default()
         };
@@ -201,8 +201,8 @@ mod tests {
         let histograms = vec![("histogram/std", Histogram::of([0.5_f32, 1.5].iter()))];
         let film = Some(("eval/film", Animation { size: [3, 2], gif: vec![1, 2] }));
         let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
-        events.iteration(9, &values, &Figures { histograms, film }).unwrap();
-        events.iteration(11, &values, &Figures::default()).unwrap();
+        events.iteration(9, &values, &Media { histograms, film }).unwrap();
+        events.iteration(11, &values, &Media::default()).unwrap();
         let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
         let found = read(&path);
         assert_eq!(found.len(), 5);

@@ -15,5 +15,5 @@ pub use events::SETTINGS;
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use histogram::Histogram;
 pub use report::Report;
-pub use summary::{Animation, Figures, Tag};
+pub use summary::{Animation, Media, Tag};
 pub use table::{MetricsTable, read_metrics};

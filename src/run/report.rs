@@ -12,7 +12,7 @@ use anyhow::Result;
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
-use super::summary::{Figures, Tag};
+use super::summary::{Media, Tag};
 use crate::os::{Status, StatusLine};
 
 /// The columns before the tags.
@@ -135,7 +135,7 @@ impl Report {
     }
 
     /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
-    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], figures: &Figures, status: &Status) {
+    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], figures: &Media, status: &Status) {
         (self.iteration, self.env_steps) = (iteration, status.env_steps);
         let names = values.iter().map(|(name, _)| name.as_ref());
         assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
@@ -208,10 +208,10 @@ mod tests {
         let mut report = open(place.path(), &tags, 0, 0);
         for iteration in 1..=3 {
             let values = [("loss/policy", 0.5 * iteration as f64), ("eval/goals", f64::NAN)];
-            report.iteration(iteration, &values, &Figures::default(), &status(10 * iteration));
+            report.iteration(iteration, &values, &Media::default(), &status(10 * iteration));
         }
         let mut resumed = open(place.path(), &tags, 2, 20);
-        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &Figures::default(), &status(30));
+        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &Media::default(), &status(30));
         let text = std::fs::read_to_string(place.path().join("metrics.csv")).unwrap();
         assert_eq!(text, "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n");
     }
@@ -221,17 +221,17 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("gone");
         let mut report = open(&folder, &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &Figures::default(), &status(10));
+        report.iteration(1, &[("a", 1.0)], &Media::default(), &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
         report.sync();
-        report.iteration(2, &[("a", 2.0)], &Figures::default(), &status(20));
+        report.iteration(2, &[("a", 2.0)], &Media::default(), &status(20));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
         // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
-        report.iteration(3, &[("a", 3.0)], &Figures::default(), &status(30));
+        report.iteration(3, &[("a", 3.0)], &Media::default(), &status(30));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
-        report.iteration(4, &[("a", 4.0)], &Figures::default(), &status(40));
+        report.iteration(4, &[("a", 4.0)], &Media::default(), &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
     }
@@ -241,7 +241,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
         let mut report = open(place.path(), &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &Figures::default(), &status(10));
+        report.iteration(1, &[("a", 1.0)], &Media::default(), &status(10));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (1, 0));
     }

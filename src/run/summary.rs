@@ -21,7 +21,7 @@ pub struct Tag {
 
 /// What some iterations have in the event file besides numbers, each with its tag.
 #[derive(Debug, Default)]
-pub struct Figures {
+pub struct Media {
     /// Histograms.
     pub histograms: Vec<(&'static str, Histogram)>,
     /// An animated picture.
@@ -64,7 +64,7 @@ impl Summaries {
     }
 
     /// Returns the values of an iteration. `NaN` values are left out.
-    pub(super) fn of_iteration(&mut self, values: &[(impl AsRef<str>, f64)], figures: &Figures) -> Summary {
+    pub(super) fn of_iteration(&mut self, values: &[(impl AsRef<str>, f64)], figures: &Media) -> Summary {
         let mut summary = Summary::new();
         for (tag, number) in values.iter().filter(|(_, number)| !number.is_nan()) {
             let mut value = self.value(tag.as_ref(), SCALARS);

@@ -10,7 +10,7 @@ use anyhow::Result;
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
-use crate::repose::{ACTION_SIZE, Repose, RewardTerms, Task};
+use crate::repose::{ACTION_SIZE, Repose, Step, Task, task_reward};
 use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
 /// Whether this build has windows.
@@ -178,14 +178,9 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, history: &History) -> Re
     let tolerance = config.success_tolerance.to_degrees();
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
-    let largest = RewardTerms {
-        rotation: config.rot_reward_scale / config.rot_eps,
-        distance: config.dist_reward_scale * config.fall_dist,
-        action: config.action_penalty_scale * ACTION_SIZE as f64,
-        bonus: config.reach_goal_bonus,
-        fall: config.fall_penalty,
-    };
-    let terms = reward.named().into_iter().zip(largest.named()).map(|((name, value), (_, largest))| {
+    let extreme = Step { goal_dist: config.fall_dist, action: [1.0; ACTION_SIZE], ..Step::default() };
+    let largest = task_reward(config, &extreme).values();
+    let terms = reward.named().zip(largest).map(|((name, value), largest)| {
         let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };
         Gauge { name, fraction, signed: true, text: format!("{value:+.3}") }
     });

@@ -178,7 +178,7 @@ impl Simulation {
 }
 
 /// The pose of a frame in the world.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pose {
     /// Position, m.
     pub position: [f64; 3],
@@ -187,7 +187,7 @@ pub struct Pose {
 }
 
 /// The velocity of a point of a body, in the world frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Velocity {
     /// Linear velocity, m/s.
     pub linear: [f64; 3],

@@ -1,10 +1,9 @@
 //! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
 
-use crate::agent::Iteration;
-use crate::ppo::{Policy, Rollout, RolloutBlock, UpdateStats};
+use super::Outcome;
+use crate::ppo::{Rollout, RolloutBlock};
 use crate::quantities::quantity;
-use crate::ranks::Traffic;
-use crate::repose::{EpisodeStats, Lesson, Recent, Score};
+use crate::repose::{EpisodeStats, Score};
 use crate::run::{self, Histogram, Tag};
 
 /// The scores of the episodes that ended in an iteration.
@@ -30,49 +29,42 @@ impl Ended {
 
 /// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
 /// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings, with the traffic
-/// between the ranks if there are several.
-pub(super) fn row(
-    iteration: &Iteration<Lesson>,
-    ended: &Ended,
-    recent: &Recent,
-    evaluation: &Score,
-    traffic: Option<&Traffic>,
-) -> Vec<(String, f64)> {
+/// between processes if there are several.
+pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
+    let Outcome { iteration, steps, evaluation, traffic, .. } = outcome;
     let mut row = Vec::new();
-    let mut put = |group: &str, values: &[(&str, f64)]| {
-        row.extend(values.iter().map(|(name, value)| (format!("{group}{name}"), *value)));
+    let mut put = |group: &str, values: &mut dyn Iterator<Item = (&'static str, f64)>| {
+        row.extend(values.map(|(name, value)| (format!("{group}{name}"), value)));
     };
-    put("episode/", &ended.nominal.named());
+    put("episode/", &mut ended.nominal.named().into_iter());
     if let Some(randomized) = &ended.randomized {
-        put("randomized/", &randomized.named());
+        put("randomized/", &mut randomized.named().into_iter());
     }
-    put("reward/", &recent.reward_named());
-    put("training/", &recent.shaping_named());
-    put("training/", &iteration.lesson.named());
-    put("eval/", &evaluation.headline());
-    put("", &iteration.update.named());
-    put("time/", &iteration.time_named());
-    put("time/", &Traffic::named(traffic));
-    put("sim/", &[("diverged", recent.diverged as f64)]);
+    put("reward/", &mut steps.task_named());
+    put("training/", &mut steps.training_named());
+    put("training/", &mut iteration.lesson.named());
+    put("eval/", &mut evaluation.headline().into_iter());
+    put("", &mut iteration.update.named().into_iter());
+    put("time/", &mut iteration.time_named().into_iter());
+    put("time/", &mut traffic.named().into_iter());
+    put("sim/", &mut [("diverged", steps.diverged as f64)].into_iter());
     row
 }
 
 /// Returns the names of the values of any iteration, in a training with or without randomised episodes.
-pub(super) fn tags(lesson: Lesson, randomizes: bool) -> Vec<String> {
-    let iteration = Iteration { lesson, update: UpdateStats::default(), steps: 0, collect_s: 0.0, update_s: 0.0 };
-    let empty = row(&iteration, &Ended::of(&[], randomizes), &Recent::default(), &Score::of(&[]), None);
+pub(super) fn tags(randomizes: bool) -> Vec<String> {
+    let empty = row(&Outcome::default(), &Ended::of(&[], randomizes));
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
 // What is logged besides numbers and settings.
-const STD: &str = "histogram/std";
 const ACTIONS: &str = "histogram/actions";
 const ADVANTAGES: &str = "histogram/advantages";
 pub(super) const FILM: &str = "eval/film";
 
 /// Returns the values with these names and all other things that are logged, with their descriptions.
 pub(super) fn described(names: &[String]) -> Vec<Tag> {
-    let all = names.iter().map(String::as_str).chain([STD, ACTIONS, ADVANTAGES, FILM, run::SETTINGS]);
+    let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, FILM, run::SETTINGS]);
     let tag = |name: &str| Tag {
         name: name.to_owned(),
         description: quantity(name).map(|known| known.description).unwrap_or_default(),
@@ -80,14 +72,10 @@ pub(super) fn described(names: &[String]) -> Vec<Tag> {
     all.map(tag).collect()
 }
 
-/// Returns the histograms of a policy and of the rollout that it has just learnt from.
-pub(super) fn histograms(policy: &Policy, rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
+/// Returns the histograms of the rollout that was just learnt from.
+pub(super) fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
     let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::of(rollout.blocks.iter().flat_map(of));
-    vec![
-        (STD, Histogram::of(policy.std().iter())),
-        (ACTIONS, all(|block| &block.actions)),
-        (ADVANTAGES, all(|block| &block.advantages)),
-    ]
+    vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
 }
 
 #[cfg(test)]
@@ -95,14 +83,15 @@ mod tests {
     use std::sync::atomic::AtomicBool;
 
     use super::*;
-    use crate::agent::Agent;
+    use crate::agent::{Agent, Iteration};
     use crate::config::Config;
-    use crate::repose::{RewardTerms, Shaping, Task};
+    use crate::ppo::UpdateStats;
+    use crate::ranks::{Exchange, Traffic};
+    use crate::repose::{Lesson, StepSums, Task, TaskReward, TrainingReward};
 
     #[test]
     fn everything_that_is_logged_is_described() {
-        let lesson = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
-        for tag in described(&tags(lesson, true)) {
+        for tag in described(&tags(true)) {
             assert!(tag.description.ends_with('.'), "{}: {}", tag.name, tag.description);
         }
     }
@@ -111,13 +100,13 @@ mod tests {
     fn histograms_are_those_of_the_quantities_whose_names_they_have() {
         let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
         let config = Config::resolve(None, &sets.map(|set| set.parse().unwrap())).unwrap();
-        let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
+        let mut agent = Agent::for_task(&Task::new(&config.env).unwrap(), &config, Exchange::alone(1)).unwrap();
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
-        let found = histograms(agent.ppo.policy(), &agent.rollout);
-        let [(STD, std), (ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
+        let found = histograms(&agent.rollout);
+        let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
         let count = |histogram: &Histogram| histogram.counts.iter().sum::<f64>();
-        assert_eq!([count(std), count(actions), count(advantages)], [20.0, 32.0 * 20.0, 32.0]);
-        assert!(std.min > 0.5 && std.max < 0.7 && actions.min < -0.5, "{found:?}");
+        assert_eq!([count(actions), count(advantages)], [32.0 * 20.0, 32.0]);
+        assert!(actions.min < -0.5, "{found:?}");
         assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");
     }
 
@@ -140,9 +129,9 @@ mod tests {
             learning_rate: 12.0,
         };
         let iteration = Iteration { lesson, update, steps: 60, collect_s: 13.0, update_s: 17.0 };
-        let reward = RewardTerms { rotation: 20.0, distance: 21.0, action: 22.0, bonus: 23.0, fall: 24.0 };
-        let shaping = Shaping { progress: 25.0, approach: 31.0, within: 26.0, drop: 27.0 };
-        let recent = Recent { steps: 1, reward, shaping, diverged: 28 };
+        let reward = TaskReward::new([20.0, 21.0, 22.0, 23.0, 24.0]);
+        let training = TrainingReward::new([25.0, 31.0, 26.0, 27.0]);
+        let steps = StepSums { steps: 1, task: reward, training, turned: 0.32, diverged: 28 };
         let episode = |reward, length, goals| EpisodeStats {
             length,
             goals,
@@ -152,33 +141,34 @@ mod tests {
             dropped: length < 100,
             ..Default::default()
         };
-        let other = EpisodeStats { randomized: true, ..episode(RewardTerms::default(), 200, 8) };
+        let other = EpisodeStats { randomized: true, ..episode(TaskReward::default(), 200, 8) };
         let ended = |randomizes| Ended::of(&[episode(reward, 80, 2), other], randomizes);
-        let evaluation = Score::of(&[episode(RewardTerms::default(), 1000, 5), episode(reward, 50, 0)]);
+        let evaluation = Score::of(&[episode(TaskReward::default(), 1000, 5), episode(reward, 50, 0)]);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
             episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
-            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, \
+            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, training/turned 32, \
             training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, \
             training/randomized 0, eval/goals 2.5, eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, loss/policy 1, loss/value 2, policy/entropy 4, \
             policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \
             value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, \
             time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
+        let traffic = Traffic { seconds: 29.0, bytes: 30.0 };
+        let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
         let row = |randomizes| {
-            let traffic = Traffic { seconds: 29.0, bytes: 30 };
-            let row = row(&iteration, &ended(randomizes), &recent, &evaluation, Some(&traffic));
+            let row = row(&outcome, &ended(randomizes));
             row.iter().map(|(name, value)| format!("{name} {value}")).collect::<Vec<_>>().join(", ")
         };
         let names =
             |row: &str| row.split(", ").map(|cell| cell.split_once(' ').unwrap().0.to_owned()).collect::<Vec<_>>();
         assert_eq!(row(false), expected);
-        assert_eq!(tags(lesson, false), names(expected));
+        assert_eq!(tags(false), names(expected));
         // Randomised episodes are apart, in columns that only such a training has.
         let apart = "randomized/return 0, randomized/length 200, randomized/goals 8, randomized/in_tolerance 0.25, \
             randomized/drop_rate 0, randomized/rot_dist 1.5, randomized/steps_per_goal 25, ";
         let place = expected.find("reward/").unwrap();
         let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
         assert_eq!(row(true), expected);
-        assert_eq!(tags(lesson, true), names(&expected));
+        assert_eq!(tags(true), names(&expected));
         let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::of(&all, true).shown().goals);
         assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }

@@ -11,19 +11,8 @@ use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
 
-/// The state that a training begins with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Begin {
-    /// The start of a new run, in a new folder.
-    New,
-    /// The newest checkpoint of its folder.
-    FromNewest,
-    /// An older checkpoint of its folder.
-    FromOlder,
-}
-
 /// The saver of a training. It always holds the state at the end of the last complete iteration, which is what remains if the
-/// next one does not complete; with several ranks, that at which they last handed over their states.
+/// next one does not complete; with several ranks, the state at which they last handed over theirs.
 ///
 /// Nothing in the folder of a resumed run is changed before the first iteration is done: until then, anyone who named the wrong
 /// run or checkpoint can stop.
@@ -33,32 +22,34 @@ pub(super) struct Saver {
     keep: usize,
     /// The options with which this training is resumed.
     options: String,
-    end: Arc<Checkpoint>,
-    begin: Begin,
-    /// The state that this session began with.
-    start: Arc<Checkpoint>,
+    /// The state at the end of the last complete iteration.
+    last: Arc<Checkpoint>,
+    /// The state that this session started from.
+    initial: Arc<Checkpoint>,
+    /// Whether that is the newest checkpoint in the folder.
+    from_newest: bool,
     /// Whether this session has written into the folder.
-    begun: bool,
+    wrote: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
     best: Option<Arc<Checkpoint>>,
     best_is_saved: bool,
 }
 
 impl Saver {
-    /// Creates the saver of a training that is at the state `end`. It keeps the newest `keep` checkpoints in the folder;
-    /// `options` are the options for resuming.
+    /// Creates the saver of a training at its `initial` state, which may be the newest checkpoint in the folder. It keeps the newest
+    /// `keep` checkpoints there; `options` are the options for resuming.
     pub(super) fn new(
         (folder, lock): (RunFolder, Locked),
         keep: Option<usize>,
         options: String,
-        end: Checkpoint,
-        begin: Begin,
+        initial: Checkpoint,
+        from_newest: bool,
     ) -> Self {
         // The newest, and one more in case that is damaged.
         let keep = keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
-        let (lock, end) = (Some(lock), Arc::new(end));
-        let (start, begun, best) = (end.clone(), false, None);
-        let saver = Self { folder, lock, keep, options, end, begin, start, begun, best, best_is_saved: true };
+        let (lock, initial) = (Some(lock), Arc::new(initial));
+        let (last, wrote, best, best_is_saved) = (initial.clone(), false, None, true);
+        let saver = Self { folder, lock, keep, options, last, initial, from_newest, wrote, best, best_is_saved };
         saver.save_before_fatal_errors();
         saver
     }
@@ -68,27 +59,22 @@ impl Saver {
         &self.folder
     }
 
-    /// Returns whether the training continues in an existing run folder.
-    pub(super) fn resumes(&self) -> bool {
-        self.begin != Begin::New
-    }
-
     /// Returns whether this session has written into the folder.
-    pub(super) fn has_begun(&self) -> bool {
-        self.begun
+    pub(super) fn wrote(&self) -> bool {
+        self.wrote
     }
 
     /// Returns the progress of the training as text.
     pub(super) fn steps_made(&self) -> String {
-        format!("{} iterations, {} env steps", self.end.progress.iteration, self.end.progress.env_steps)
+        format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
     }
 
-    /// Takes the state at the end of another iteration. If its best evaluation has changed, it is itself the best checkpoint.
-    pub(super) fn take(&mut self, end: Checkpoint) {
-        let is_best = end.progress.best != self.end.progress.best;
-        self.end = Arc::new(end);
+    /// Keeps the state at the end of another iteration, to save it. If its best evaluation has changed, it is itself the best checkpoint.
+    pub(super) fn keep(&mut self, last: Checkpoint) {
+        let is_best = last.progress.best != self.last.progress.best;
+        self.last = Arc::new(last);
         if is_best {
-            (self.best, self.best_is_saved) = (Some(self.end.clone()), false);
+            (self.best, self.best_is_saved) = (Some(self.last.clone()), false);
         }
         self.save_before_fatal_errors();
     }
@@ -98,8 +84,8 @@ impl Saver {
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
-    pub(super) fn begin(&mut self, report: &mut Report) -> Result<()> {
-        if self.begun {
+    pub(super) fn open_folder(&mut self, report: &mut Report) -> Result<()> {
+        if self.wrote {
             return Ok(());
         }
         let lock = match self.lock.take().filter(Locked::holds) {
@@ -113,13 +99,13 @@ impl Saver {
             let aside = self.folder.checkpoints().put_best_aside()?;
             report.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
         }
-        if self.begin != Begin::FromNewest || self.folder.checkpoints().newest_first().is_empty() {
-            write(&self.folder, None, &self.start, self.keep)?;
+        if !self.from_newest || self.folder.checkpoints().newest_first().is_empty() {
+            write(&self.folder, None, &self.initial, self.keep)?;
         }
-        let Progress { iteration, env_steps, fork, .. } = &self.start.progress;
+        let Progress { iteration, env_steps, fork, .. } = &self.initial.progress;
         report.open_logs(fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration, *env_steps);
         self.describe()?;
-        self.begun = true;
+        self.wrote = true;
         self.save_before_fatal_errors();
         Ok(())
     }
@@ -133,10 +119,10 @@ impl Saver {
 
     /// Writes the configuration and the versions into the folder.
     fn describe(&self) -> Result<()> {
-        let fork = self.end.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
+        let fork = self.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
             format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
         });
-        self.folder.describe(&format!("{fork}{}", self.end.config), &version())
+        self.folder.describe(&format!("{fork}{}", self.last.config), &version())
     }
 
     /// Writes the logs, the best policy and the checkpoint, each before anything that refers to it.
@@ -157,7 +143,7 @@ impl Saver {
 
     fn write(&self) -> Result<()> {
         let unsaved = !self.best_is_saved || !self.folder.checkpoints().best().exists();
-        write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.end, self.keep)
+        write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.last, self.keep)
     }
 
     /// Saves for the last time and ends the report. If the folder cannot be written to, the state is saved elsewhere. Before the
@@ -166,14 +152,14 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to; the message states where the state is instead.
     pub(super) fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
-        let saved = if self.begun { self.save(report) } else { Ok(()) };
+        let saved = if self.wrote { self.save(report) } else { Ok(()) };
         report.finish();
         saved.map_err(|error| self.elsewhere(error))
     }
 
     /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
     pub(super) fn elsewhere(&self, reason: Error) -> Error {
-        elsewhere(reason, self.best.as_deref(), &self.end, &self.options)
+        elsewhere(reason, self.best.as_deref(), &self.last, &self.options)
     }
 
     /// Returns the command that resumes this training.
@@ -183,7 +169,7 @@ impl Saver {
 
     /// Arranges for the state at the end of the last iteration to be saved if MuJoCo is about to end the process.
     fn save_before_fatal_errors(&self) {
-        let (end, folder, keep, begun) = (self.end.clone(), self.folder.clone(), self.keep, self.begun);
+        let (last, folder, keep, wrote) = (self.last.clone(), self.folder.clone(), self.keep, self.wrote);
         let holds = self.lock.as_ref().map(Locked::watch);
         let best = self.best.clone().filter(|_| !self.best_is_saved);
         let options = self.options.clone();
@@ -191,16 +177,16 @@ impl Saver {
             os::say(&format!("error: {said}"));
             let replaced = || anyhow!("{} has been replaced", folder.path().display());
             let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
-            if !begun {
+            if !wrote {
                 return os::say("the run folder was not changed");
             }
-            match held.and_then(|()| write(&folder, best.as_deref(), &end, keep)) {
+            match held.and_then(|()| write(&folder, best.as_deref(), &last, keep)) {
                 Ok(()) => {
-                    let iteration = end.progress.iteration;
+                    let iteration = last.progress.iteration;
                     let command = how_to_resume(folder.path(), &options);
                     os::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
                 }
-                Err(error) => os::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &end, &options))),
+                Err(error) => os::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &last, &options))),
             }
         });
     }
@@ -209,26 +195,26 @@ impl Saver {
 /// Returns the score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run: that of the best
 /// checkpoint in the folder; if that is lost, of the policy that was made from it; if that is lost too, the one stored in the
 /// resumed checkpoint.
-pub(super) fn best_so_far(folder: &RunFolder, of_checkpoint: Option<Evaluation>) -> Option<Evaluation> {
+pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<Evaluation>) -> Option<Evaluation> {
     let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
-    score(&folder.checkpoints().best()).or_else(|| score(&folder.policy())).or(of_checkpoint)
+    score(&folder.checkpoints().best()).or_else(|| score(&folder.policy())).or(resumed)
 }
 
-/// Writes the best checkpoint, if there is one to write, and the checkpoint `end` into a run folder.
-fn write(folder: &RunFolder, best: Option<&Checkpoint>, end: &Checkpoint, keep: usize) -> Result<()> {
+/// Writes the best checkpoint, if there is one to write, and the checkpoint `last` into a run folder.
+fn write(folder: &RunFolder, best: Option<&Checkpoint>, last: &Checkpoint, keep: usize) -> Result<()> {
     let checkpoints = folder.checkpoints();
     match best {
         Some(best) => {
             os::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
             checkpoints.write_best(&best.to_bytes()?)?;
         }
-        None => keep_policy(folder, end)?,
+        None => keep_policy(folder, last)?,
     }
-    checkpoints.write(end.progress.iteration, &end.to_bytes()?, keep)
+    checkpoints.write(last.progress.iteration, &last.to_bytes()?, keep)
 }
 
-/// Ensures that the policy file is that of the best checkpoint or, if nothing was scored yet, that of `end`.
-fn keep_policy(folder: &RunFolder, end: &Checkpoint) -> Result<()> {
+/// Ensures that the policy file is that of the best checkpoint or, if nothing was scored yet, that of `last`.
+fn keep_policy(folder: &RunFolder, last: &Checkpoint) -> Result<()> {
     let score = |checkpoint: &Checkpoint| checkpoint.progress.best;
     let shared = load::read(&folder.policy()).ok().as_ref().and_then(score);
     let policy = match load::read(&folder.checkpoints().best()) {
@@ -237,7 +223,7 @@ fn keep_policy(folder: &RunFolder, end: &Checkpoint) -> Result<()> {
         // The policy file is all that is left of the best checkpoint.
         Err(_) if shared.is_some() => return Ok(()),
         Err(_) => {
-            let mut latest = end.policy_alone();
+            let mut latest = last.policy_alone();
             // Any known score belongs to another policy.
             latest.progress.best = None;
             latest
@@ -247,8 +233,8 @@ fn keep_policy(folder: &RunFolder, end: &Checkpoint) -> Result<()> {
 }
 
 /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
-fn elsewhere(reason: Error, best: Option<&Checkpoint>, end: &Checkpoint, options: &str) -> Error {
-    let saved = RunFolder::for_now().and_then(|run| match write(&run, best, end, 1) {
+fn elsewhere(reason: Error, best: Option<&Checkpoint>, last: &Checkpoint, options: &str) -> Error {
+    let saved = RunFolder::for_now().and_then(|run| match write(&run, best, last, 1) {
         Ok(()) => Ok(run),
         Err(error) => {
             run.remove();
@@ -258,7 +244,7 @@ fn elsewhere(reason: Error, best: Option<&Checkpoint>, end: &Checkpoint, options
     match saved {
         Ok(run) => anyhow!(
             "{reason:#}\nThe state after {} iterations is in {} instead; resume with\n  {}",
-            end.progress.iteration,
+            last.progress.iteration,
             run.path().display(),
             how_to_resume(run.path(), options)
         ),

@@ -6,7 +6,7 @@ use shadow_repose::agent::Agent;
 use shadow_repose::config::{Backend, PpoConfig, Precision, Ramp};
 use shadow_repose::env::{End, Env, Transition};
 use shadow_repose::ppo::Ppo;
-use shadow_repose::ranks::Division;
+use shadow_repose::ranks::Exchange;
 use shadow_repose::rng::{self, Rng};
 use shadow_repose::spaces::Spaces;
 
@@ -88,13 +88,13 @@ fn agent(settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
 }
 
 fn agent_of(envs: usize, settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
-    divided(envs, settings, seed, Division::alone(1))
+    of_ranks(envs, settings, seed, Exchange::alone(1))
 }
 
-/// Returns the agent of one rank, with this number of its own points.
-pub(crate) fn divided(envs: usize, settings: &PpoConfig, seed: u64, division: Division) -> Agent<PointMass> {
+/// Returns the agent of one of several ranks, with this number of its own points.
+pub(crate) fn of_ranks(envs: usize, settings: &PpoConfig, seed: u64, exchange: Exchange) -> Agent<PointMass> {
     let point = |_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS };
-    Agent::new((0..envs).map(point).collect(), settings, seed, division, |_| ()).unwrap()
+    Agent::new((0..envs).map(point).collect(), settings, seed, exchange, |_| ()).unwrap()
 }
 
 pub(crate) fn settings() -> PpoConfig {
@@ -137,7 +137,7 @@ fn ppo_learns_with_candles_tensors_too() {
 #[test]
 fn ppo_learns_in_bf16_where_the_processor_has_it() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
-    if Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).is_ok() {
+    if Ppo::new(&settings, PointMass::SPACES, 0, Exchange::alone(1)).is_ok() {
         let [first, last] = distances(&settings, 0);
         assert!(first > 0.5 && last < 0.15, "{first} → {last}");
     }
@@ -147,15 +147,15 @@ fn ppo_learns_in_bf16_where_the_processor_has_it() {
 fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
     let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
     let settings = PpoConfig { std, ..settings() };
-    let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Division::alone(1)).unwrap();
-    assert!(ppo.policy().std().iter().all(|std| (std - 0.5).abs() < 1e-6));
+    let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Exchange::alone(1)).unwrap();
+    assert!((ppo.policy().std() - 0.5).abs() < 1e-6);
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
         ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
-        assert!(ppo.policy().std().iter().all(|std| (std - expected).abs() < 1e-6), "{env_steps}");
+        assert!((ppo.policy().std() - expected).abs() < 1e-6, "{env_steps}");
     }
     let at_once = PpoConfig { std: Ramp { steps: 0, ..std }, ..settings };
-    let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Division::alone(1)).unwrap();
-    assert!(ppo.policy().std().iter().all(|std| (std - 0.125).abs() < 1e-6), "0 steps: the final value from the start");
+    let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Exchange::alone(1)).unwrap();
+    assert!((ppo.policy().std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! A divided training computes the same bits, however it is divided.
+//! A training on several ranks computes the same bits as on one.
 
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
@@ -9,11 +9,11 @@ use shadow_repose::config::Config;
 use shadow_repose::env::Env;
 use shadow_repose::evaluate::{Actor, Episodes, evaluate, evaluate_together};
 use shadow_repose::ppo::{Checkpoint, Ppo};
-use shadow_repose::ranks::{Division, Ranks};
+use shadow_repose::ranks::{Exchange, Ranks};
 use shadow_repose::repose::{EpisodeStats, Lesson, Repose, SPACES, Task};
 
-use crate::point_mass::{divided, settings};
-use crate::support::config;
+use crate::point_mass::{of_ranks, settings};
+use crate::support::{config, started_agent};
 
 /// A rank that is a thread of this process.
 struct Seat {
@@ -28,22 +28,10 @@ struct Table {
 }
 
 impl Seat {
-    /// Returns what all ranks pass, in their order.
-    fn see<T: Copy>(&self, own: Vec<T>, to_bytes: fn(&T) -> Vec<u8>, of_bytes: fn(&[u8]) -> T) -> Vec<Vec<T>> {
-        self.table.put.lock().unwrap()[self.rank] = own.iter().flat_map(to_bytes).collect();
-        self.table.barrier.wait();
-        let all = self.table.put.lock().unwrap().clone();
-        self.table.barrier.wait();
-        all.iter().map(|bytes| bytes.chunks(size_of::<T>()).map(of_bytes).collect()).collect()
-    }
-
-    fn see_bytes(&self, own: Vec<u8>) -> Vec<Vec<u8>> {
-        self.see(own, |x| vec![*x], |bytes| bytes[0])
-    }
-
-    fn see_floats(&self, own: &[f32]) -> Vec<Vec<f32>> {
-        let of_bytes = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().unwrap());
-        self.see(own.to_vec(), |x| x.to_le_bytes().to_vec(), of_bytes)
+    /// Returns the floats of all ranks, in their order.
+    fn floats(&self, own: &[f32]) -> Vec<Vec<f32>> {
+        let all = self.all_gather(own.iter().flat_map(|x| x.to_le_bytes()).collect());
+        all.iter().map(|bytes| bytes.as_chunks().0.iter().map(|x| f32::from_le_bytes(*x)).collect()).collect()
     }
 }
 
@@ -56,31 +44,27 @@ impl Ranks for Seat {
         self.rank
     }
 
-    fn exchange(&self, numbers: &[f32], parts: &[Range<usize>]) -> Vec<f32> {
-        let own = parts[self.rank].clone();
-        self.see_floats(numbers).iter().flat_map(|of_rank| of_rank[own.clone()].to_vec()).collect()
+    fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
+        let own = slices[self.rank].clone();
+        self.floats(numbers).iter().flat_map(|of_rank| of_rank[own.clone()].to_vec()).collect()
     }
 
-    fn share(&self, numbers: &mut [f32], parts: &[Range<usize>]) {
-        for (of_rank, part) in self.see_floats(numbers).iter().zip(parts) {
-            numbers[part.clone()].copy_from_slice(&of_rank[part.clone()]);
+    fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]) {
+        for (of_rank, slice) in self.floats(numbers).iter().zip(slices) {
+            numbers[slice.clone()].copy_from_slice(&of_rank[slice.clone()]);
         }
     }
 
-    fn gather(&self, numbers: Vec<f64>) -> Vec<f64> {
-        let of_bytes = |bytes: &[u8]| f64::from_le_bytes(bytes.try_into().unwrap());
-        let all = self.see(numbers, |x| x.to_le_bytes().to_vec(), of_bytes);
-        assert!(all.iter().all(|of_rank| of_rank.len() == all[0].len()), "all ranks pass the same number of values");
-        all.concat()
-    }
-
-    fn gather_at_first(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
-        let all = self.see_bytes(bytes);
-        if self.rank == 0 { all } else { Vec::new() }
+    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+        self.table.put.lock().unwrap()[self.rank] = bytes;
+        self.table.barrier.wait();
+        let all = self.table.put.lock().unwrap().clone();
+        self.table.barrier.wait();
+        all
     }
 
     fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
-        self.see_bytes(bytes).swap_remove(0)
+        self.all_gather(bytes).swap_remove(0)
     }
 
     fn abort(&self) -> ! {
@@ -89,14 +73,14 @@ impl Ranks for Seat {
 }
 
 /// Returns the results of this number of ranks, each with its part of the `shards` and with its own threads.
-fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Division) -> T + Sync) -> Vec<T> {
+fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Exchange) -> T + Sync) -> Vec<T> {
     let table = Arc::new(Table { barrier: Barrier::new(ranks), put: Mutex::new(vec![Vec::new(); ranks]) });
     std::thread::scope(|scope| {
         let start = |rank| {
             let (table, work) = (table.clone(), &work);
             scope.spawn(move || {
                 let threads = rayon::ThreadPoolBuilder::new().num_threads(1 + rank % 2).build().unwrap();
-                threads.install(|| work(rank, Division::new(shards, Arc::new(Seat { rank, table }))))
+                threads.install(|| work(rank, Exchange::new(Arc::new(Seat { rank, table })).over(shards).unwrap()))
             })
         };
         let all: Vec<_> = (0..ranks).map(start).collect();
@@ -137,10 +121,10 @@ fn assert_same<T: PartialEq>(one: Learnt<T>, ranks: Vec<Learnt<T>>, what: &str, 
 fn the_shards_of_a_training_come_to_the_same_bits_on_any_number_of_ranks() {
     let points = 8 * 5;
     let work = |ranks: usize| {
-        on_ranks(ranks, 8, |_, division| learnt(&mut divided(points / ranks, &settings(), 5, division), 6))
+        on_ranks(ranks, 8, |_, exchange| learnt(&mut of_ranks(points / ranks, &settings(), 5, exchange), 6))
     };
     for ranks in [1, 2, 4, 8] {
-        let alone = learnt(&mut divided(points, &settings(), 5, Division::alone(8)), 6);
+        let alone = learnt(&mut of_ranks(points, &settings(), 5, Exchange::alone(8)), 6);
         assert_same(alone, work(ranks), &format!("{ranks} ranks"), |all| all.sort_by(f64::total_cmp));
     }
 }
@@ -151,10 +135,10 @@ fn hands_that_are_dealt_to_ranks_learn_the_same_bits() {
     let config = config(&sets);
     let task = Task::new(&config.env).unwrap();
     let work = |ranks: usize| {
-        on_ranks(ranks, 8, |_, division| {
+        on_ranks(ranks, 8, |_, exchange| {
             let (envs, of_run) = ((0..16 / ranks).map(|_| Repose::new(&task)).collect(), config.clone());
             let lessons = move |env_steps| Lesson::at(env_steps, &of_run);
-            learnt(&mut Agent::new(envs, &config.ppo, 3, division, lessons).unwrap(), 3)
+            learnt(&mut Agent::new(envs, &config.ppo, 3, exchange, lessons).unwrap(), 3)
         })
     };
     let order = |all: &mut Vec<EpisodeStats>| all.sort_by(|a, b| a.rot_dist_sum.total_cmp(&b.rot_dist_sum));
@@ -165,8 +149,8 @@ fn hands_that_are_dealt_to_ranks_learn_the_same_bits() {
 
 /// Makes this many more iterations on some ranks, from a checkpoint or from the start, and returns the checkpoint of the end.
 fn continued(from: Option<&[u8]>, iterations: usize, ranks: usize, config: &Config, task: &Arc<Task>) -> Vec<u8> {
-    let work = |_, division| {
-        let mut agent = Agent::divided(task, config, division).unwrap();
+    let work = |_, exchange| {
+        let mut agent = Agent::for_task(task, config, exchange).unwrap();
         if let Some(bytes) = from {
             agent.restore(&mut Checkpoint::parse(bytes).unwrap()).unwrap();
         }
@@ -196,7 +180,7 @@ fn a_checkpoint_does_not_know_how_many_ranks_have_saved_it() {
 fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
     let config = config(&["env.max_episode_seconds=0.2", "ppo.hidden=[16]"]);
     let task = Task::new(&config.env).unwrap();
-    let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
+    let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
     let never = AtomicBool::new(false);
     for count in [5, 100] {
         let episodes = Episodes { seed: 3, purpose: "evaluation", first: 10, count };
@@ -204,10 +188,10 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
         let alone = evaluate(&task, &alone, episodes, &never, &mut |_| Ok(())).unwrap().unwrap();
         assert_eq!(alone.len(), count);
         for ranks in [1, 4] {
-            let work = |_, division: Division| {
-                let ppo = Ppo::new(&config.ppo, SPACES, 0, Division::alone(1)).unwrap();
+            let work = |_, exchange: Exchange| {
+                let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
                 let actor = Actor::Mean(ppo.policy().freeze());
-                evaluate_together(&task, &actor, episodes, &division, &never).unwrap().unwrap()
+                evaluate_together(&task, &actor, episodes, &exchange, &never).unwrap().unwrap()
             };
             let mut together = on_ranks(ranks, 4, work);
             assert!(together.swap_remove(0) == alone, "{count} episodes on {ranks} ranks");
@@ -217,21 +201,21 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
 
 #[test]
 fn all_ranks_together_send_no_more_than_a_ring_would() {
-    let work = |_, division: Division| {
-        let mut agent = divided(8, &settings(), 5, division);
+    let work = |_, exchange: Exchange| {
+        let mut agent = of_ranks(8, &settings(), 5, exchange);
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let steps = settings().epochs * settings().minibatches;
-        (agent.division.take_traffic().bytes, agent.ppo.policy().parameters.len(), steps)
+        (agent.exchange.take_traffic().bytes, agent.ppo.policy().parameters.len(), steps)
     };
     for ranks in [2, 4] {
         let all = on_ranks(ranks, 8, work);
-        let sent: u64 = all.iter().map(|(bytes, _, _)| bytes).sum();
+        let sent = all.iter().map(|(bytes, _, _)| bytes).sum::<f64>() as u64;
         let (_, parameters, steps) = all[0];
         // A ring sends each value 2 (n - 1) times; the rest are losses, norms and statistics.
         let ring = (8 * (ranks - 1) * parameters * steps) as u64;
         assert!((ring..ring + 2000 * (ranks * ranks * steps) as u64).contains(&sent), "{sent} against {ring}");
     }
-    assert_eq!(on_ranks(1, 8, work)[0].0, 0);
+    assert!(on_ranks(1, 8, work)[0].0.is_nan(), "a single rank sends nothing");
 }
 
 #[test]
@@ -239,7 +223,7 @@ fn trainings_of_any_number_of_hands_work() {
     let task = Task::new(&config(&[]).env).unwrap();
     for hands in [1, 7, 16, 100] {
         let config = config(&[&format!("env.num_envs={hands}"), "ppo.hidden=[16]"]);
-        let mut agent = Agent::of_task(&task, &config).unwrap();
+        let mut agent = started_agent(&task, &config);
         let (_, figures, _) = learnt(&mut agent, 2);
         let figures: Vec<f64> = figures.into_iter().map(f64::from_bits).collect();
         assert!(figures.iter().all(|x| x.is_finite()), "{hands} hands: {:?}", &figures[..10]);
@@ -270,7 +254,7 @@ fn a_minibatch_may_be_given_by_its_size_so_that_more_hands_make_more_gradient_st
     let after = |more: &[&str]| {
         let config = config(&[&small, more].concat());
         let task = Task::new(&config.env).unwrap();
-        let mut agent = Agent::of_task(&task, &config).unwrap();
+        let mut agent = started_agent(&task, &config);
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let mut end = agent.checkpoint("", None);
         (end.take_counters("adam.steps").unwrap()[0], learnt(&mut agent, 1))

@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::Arc;
 
+use shadow_repose::agent::Agent;
 use shadow_repose::config::{Config, EnvConfig, Override};
 use shadow_repose::env::Env;
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{OBSERVATION_SIZE, Repose, Task};
 use shadow_repose::rng;
 
@@ -48,6 +50,11 @@ pub(crate) fn started(task: &Arc<Task>) -> (Repose, Vec<f32>) {
     let mut observation = vec![0.0; OBSERVATION_SIZE];
     env.reset(rng::stream(7, "test", 0), &mut observation);
     (env, observation)
+}
+
+/// Returns the agent of a training by this process alone.
+pub(crate) fn started_agent(task: &Arc<Task>, config: &Config) -> Agent<Repose> {
+    Agent::for_task(task, config, Exchange::alone(config.shards())).unwrap()
 }
 
 /// Runs the program in `folder`.

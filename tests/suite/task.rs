@@ -3,14 +3,13 @@
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
 
-use shadow_repose::agent::Agent;
 use shadow_repose::env::{End, Env};
 use shadow_repose::quat::{self, Quat};
-use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, RewardTerms, Task};
+use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, Step, Task, task_reward};
 use shadow_repose::rng;
 use shadow_repose::sim::{Pose, Velocity};
 
-use crate::support::{config, env_config, started, task};
+use crate::support::{config, env_config, started, started_agent, task};
 
 const STILL: [f32; 20] = [0.0; 20];
 
@@ -123,7 +122,7 @@ fn actions_are_clipped_and_scaled_to_the_control_ranges() {
         expected
     });
     // The penalty is computed from the clipped action.
-    assert!((env.last_step().reward.action - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
+    assert!((env.last_step().reward["action"] - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
 }
 
 #[test]
@@ -152,11 +151,11 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
         put_cube(&mut env, &task, goal);
         let transition = env.step(&STILL, &mut observation);
         let details = *env.last_step();
-        assert_eq!((details.goal, details.reward.bonus, transition.end), (goal, 2.0, None));
+        assert_eq!((details.goal, details.reward["bonus"], transition.end), (goal, 2.0, None));
         assert!(details.rot_dist < 0.1);
         // The reward is computed against the goal in force.
         let rotation = 1.0 / (details.rot_dist + 0.1);
-        assert!((details.reward.rotation - rotation).abs() < 1e-12);
+        assert!((details.reward["rotation"] - rotation).abs() < 1e-12);
         assert!((f64::from(transition.reward) - details.reward.total()).abs() < 1e-5);
         assert_eq!(env.held(), held);
     }
@@ -192,8 +191,8 @@ fn a_dropped_cube_terminates_and_pays_the_penalty() {
     let transition = env.step(&STILL, &mut observation);
     assert_eq!(transition.end, Some(End::Terminated));
     assert!(env.episode().dropped && !env.episode().diverged);
-    assert_eq!(env.last_step().reward.fall, -5.0);
-    assert!((env.last_step().reward.distance + 10.0 * env.last_step().goal_dist).abs() < 1e-12);
+    assert_eq!(env.last_step().reward["fall"], -5.0);
+    assert!((env.last_step().reward["distance"] + 10.0 * env.last_step().goal_dist).abs() < 1e-12);
 }
 
 #[test]
@@ -220,7 +219,7 @@ fn a_diverged_state_terminates_pays_nothing_and_leaves_no_trace_in_the_next_epis
         assert_eq!(transition.reward, 0.0);
         assert!(env.episode().diverged && env.last_step().diverged && !env.episode().dropped);
         assert!(observation.iter().all(|x| x.is_finite()));
-        assert_eq!(env.take_recent().diverged, 1);
+        assert_eq!(env.take_sums().diverged, 1);
         assert!(env.simulation().ctrl().iter().any(|&c| c != 0.0), "the controls that were sent are still there");
         env.reset(rng::stream(7, "test", 0), &mut observation);
         for _ in 0..10 {
@@ -274,7 +273,7 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
 #[test]
 fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning_goes_on() {
     let config = config(&["env.num_envs=200", "ppo.hidden=[16]"]);
-    let mut agent = Agent::of_task(&Task::new(&config.env).unwrap(), &config).unwrap();
+    let mut agent = started_agent(&Task::new(&config.env).unwrap(), &config);
     let never = AtomicBool::new(false);
     for iteration in 1..=6 {
         let poison = [f64::NAN, f64::INFINITY, -1e200][iteration % 3];
@@ -285,7 +284,7 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
         }
         let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
         assert!(stats.value_loss.is_finite() && stats.kl.is_finite());
-        let diverged: u64 = agent.pool.envs_mut().map(|env| env.take_recent().diverged).sum();
+        let diverged: u64 = agent.pool.envs_mut().map(|env| env.take_sums().diverged).sum();
         assert_eq!(diverged, 2, "iteration {iteration}");
         assert_eq!(
             agent.pool.take_finished().iter().filter(|episode| episode.diverged).count(),
@@ -298,8 +297,8 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
 
 #[test]
 fn every_scale_of_the_reward_is_a_setting() {
-    let paid =
-        |set: &str| RewardTerms::of_step(&env_config(&[set]), 0.3, 0.1, &[0.5; 20]).named().map(|(_, value)| value);
+    let step = |action| Step { rot_dist: 0.3, goal_dist: 0.1, action: [action; 20], ..Step::default() };
+    let paid = |set: &str| task_reward(&env_config(&[set]), &step(0.5)).values();
     let default = [1.0 / 0.4, -1.0, -0.0002 * 5.0, 0.0, 0.0];
     for (set, term, expected) in [
         ("run.seed=0", 0, default[0]),
@@ -316,7 +315,7 @@ fn every_scale_of_the_reward_is_a_setting() {
         }
     }
     let both = env_config(&["env.success_tolerance=0.35", "env.reach_goal_bonus=9", "env.fall_dist=0.05"]);
-    assert_eq!(RewardTerms::of_step(&both, 0.3, 0.1, &[0.0; 20]).bonus, 9.0);
+    assert_eq!(task_reward(&both, &step(0.0))["bonus"], 9.0);
 }
 
 #[test]

@@ -10,23 +10,18 @@ use shadow_repose::quat::{self, Quat};
 use shadow_repose::repose::{Lesson, OBSERVATION_SIZE, Repose, SPACES};
 use shadow_repose::rng;
 
-use crate::support::{config, started, task};
+use crate::support::{config, started, started_agent, task};
 
 const CUBE_ORIENTATION: usize = 51;
 const GOAL_ORIENTATION: usize = 64;
 
 /// Returns the lesson of the task itself with these settings applied over it.
 fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
-    let task = [
-        "task_reward=1",
-        "progress_reward=0",
-        "approach_reward=0",
-        "hold_reward=0",
-        "drop_reward=0",
-        "tolerance=0.1",
-        "hold=50",
-    ];
-    let task = task.map(|setting| format!("training.{setting}"));
+    // Every weight of a reward that training adds.
+    let training = toml::Table::try_from(config(&[]).training).unwrap();
+    let rewards = training.keys().filter(|key| key.ends_with("_reward")).map(|key| format!("{key}=0"));
+    let task = ["task_reward=1", "tolerance=0.1", "hold=50"].map(String::from);
+    let task: Vec<String> = rewards.chain(task).map(|setting| format!("training.{setting}")).collect();
     let mut all: Vec<&str> = task.iter().map(String::as_str).collect();
     all.extend(["training.goal_lifetime=0"]);
     all.extend(settings);
@@ -115,8 +110,8 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
         assert_eq!(shaped.last_step().reward, plain.last_step().reward);
     }
     assert_eq!(shaped.episode(), plain.episode());
-    let recent = shaped.take_recent();
-    assert!(recent.shaping.progress != 0.0 && recent.reward == plain.take_recent().reward);
+    let sums = shaped.take_sums();
+    assert!(sums.training["progress"] != 0.0 && sums.task == plain.take_sums().task);
 }
 
 /// Returns all joint positions after a second of a swinging hand.
@@ -172,7 +167,7 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
     let sets = ["env.num_envs=8", "ppo.hidden=[16]", "ppo.horizon=4", "ppo.minibatches=4"];
     for (symmetry, perceives) in [("cube", true), ("none", false)] {
         let config = config(&[&sets[..], &[&format!("ppo.symmetry={symmetry}")]].concat());
-        let mut agent = Agent::of_task(&task(&[]), &config).unwrap();
+        let mut agent = started_agent(&task(&[]), &config);
         agent.collect(&AtomicBool::new(false)).unwrap().expect("nothing stops it");
         let (policy, mut shown) = (agent.ppo.policy().freeze(), vec![0.0; OBSERVATION_SIZE]);
         let block = &agent.rollout.blocks[0];
@@ -265,7 +260,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
     let task = task(&[]);
     let cube = task.scene().free_body("cube").unwrap().qpos;
-    let mut agent = Agent::of_task(&task, &config(&sets)).unwrap();
+    let mut agent = started_agent(&task, &config(&sets));
     let rows = agent.rollout.first_observations_mut().into_iter();
     let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
     for (env, row) in agent.pool.envs_mut().zip(rows).step_by(2) {

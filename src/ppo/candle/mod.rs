@@ -8,10 +8,10 @@ use anyhow::Result;
 use candle_core::{Device, Module, Tensor};
 
 use super::Policy;
-use super::backend::{self, GradientBackend, ShardSums};
+use super::backend::{GradientBackend, LossSums};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
-use crate::ranks::tree_sum;
+use crate::ranks::{Minibatch, tree_sum};
 use crate::spaces::Spaces;
 use loss::{Batch, Gaussian};
 use nets::Nets;
@@ -59,25 +59,25 @@ impl GradientBackend for Reference {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        minibatch: backend::Minibatch,
+        minibatch: &Minibatch,
         out: &mut [f32],
-    ) -> Result<Vec<ShardSums>> {
+    ) -> Result<Vec<LossSums>> {
         let (mut sums, mut gradients) = (Vec::new(), Vec::new());
-        for shard in minibatch.samples.chunks(minibatch.in_shard()) {
-            let (batch, nets) = (Self::minibatch(policy, rollout, shard)?, Nets::new(policy)?);
+        for group in &minibatch.groups {
+            let (batch, nets) = (Self::minibatch(policy, rollout, group)?, Nets::new(policy)?);
             let means = nets.actor.forward(&batch.observations)?;
             let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
-            let log_std = Tensor::new(policy.log_std(), &Device::Cpu)?;
+            let log_std = Tensor::full(policy.log_std, policy.spaces.action_size, &Device::Cpu)?;
             let new = Gaussian { means, log_std, scales: batch.scales.clone() };
             let losses = loss::losses(&self.config, &batch, &new, &values)?;
             let mut gradient = vec![0.0; out.len()];
-            let share = 1.0 / minibatch.shards as f64;
-            nets.write_gradient(&(losses.total * share)?.backward()?, &mut gradient)?;
+            let weight = group.len() as f64 / minibatch.count as f64;
+            nets.write_gradient(&(losses.total * weight)?.backward()?, &mut gradient)?;
             gradients.push(gradient);
             let ratios = losses.ratios.to_vec1::<f32>()?;
             let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
             let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
-            sums.push(ShardSums {
+            sums.push(LossSums {
                 surrogate: -sum(&losses.policy)?,
                 value_error: sum(&losses.value)?,
                 excess: sum(&losses.excess)?,

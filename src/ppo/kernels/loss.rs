@@ -2,8 +2,11 @@
 //!
 //! J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 
+use std::iter::repeat_n;
+
 use pulp::Arch;
 
+use super::super::backend::LossSums;
 use super::super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 
@@ -15,102 +18,100 @@ pub(super) struct Loss<'a> {
     value_coef: f32,
     bounds_coef: f32,
     /// The weight of one sample in the means over the minibatch.
-    share: f32,
-    /// `[A]`: reciprocals of the standard deviations.
-    inverse_std: Vec<f32>,
+    sample_weight: f32,
+    /// The reciprocal of the standard deviation of an action.
+    inverse_std: f32,
     /// The negated log-density at the mean.
     log_scale: f32,
-}
-
-/// Sums over samples.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Sums {
-    /// The clipped surrogate.
-    pub surrogate: f64,
-    /// The clipped squared error of the values.
-    pub value_error: f64,
-    /// Squared distances of the means from [-1, 1], beyond which actions are clipped.
-    pub excess: f64,
-    /// Samples whose ratio was clipped.
-    pub clipped: usize,
-    /// The largest |ratio - 1|.
-    pub ratio_error: f32,
-    /// `[A]`: squared differences of the means from those that acted, divided by the squared noise scales.
-    pub moved: Vec<f32>,
-}
-
-impl Sums {
-    /// Creates the sums over no samples.
-    pub(super) fn new(action_size: usize) -> Self {
-        Self { moved: vec![0.0; action_size], ..Self::default() }
-    }
+    action_size: usize,
 }
 
 impl<'a> Loss<'a> {
-    /// Creates the losses of a minibatch of `samples` samples of `rollout`; `log_std` `[A]` are the logarithms of the
-    /// standard deviations.
-    pub(super) fn new(rollout: &'a Rollout, samples: usize, config: &PpoConfig, log_std: &[f32]) -> Self {
+    /// Creates the losses of a minibatch of `samples` samples of `rollout` under the policy with the standard deviation
+    /// e^`log_std` for each of its `action_size` actions.
+    pub(super) fn new(
+        rollout: &'a Rollout,
+        samples: usize,
+        config: &PpoConfig,
+        (log_std, action_size): (f32, usize),
+    ) -> Self {
         Self {
             rollout,
             clip: config.clip as f32,
             value_clip: config.value_clip() as f32,
             value_coef: config.value_coef as f32,
             bounds_coef: config.bounds_coef as f32,
-            share: 1.0 / samples as f32,
-            inverse_std: log_std.iter().map(|s| (-s).exp()).collect(),
-            log_scale: log_std.iter().map(|s| s + 0.5 * std::f32::consts::TAU.ln()).sum(),
+            sample_weight: 1.0 / samples as f32,
+            inverse_std: (-log_std).exp(),
+            log_scale: repeat_n(log_std + 0.5 * std::f32::consts::TAU.ln(), action_size).sum(),
+            action_size,
         }
     }
 
-    /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
-    pub(super) fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
-        let width = self.inverse_std.len();
+    /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples. Adds to `squared_shifts` `[A]` the
+    /// squared differences of the means from those that acted, divided by the squared noise scales.
+    pub(super) fn actor(
+        &self,
+        samples: &[u32],
+        means: &[f32],
+        grad: &mut [f32],
+        sums: &mut LossSums,
+        squared_shifts: &mut [f32],
+    ) {
+        let width = self.action_size;
         Arch::new().dispatch(
             #[inline(always)]
             || {
                 let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
                 for (&sample, (mean, grad)) in samples.iter().zip(rows) {
                     let (block, i) = self.rollout.locate(sample);
-                    self.actor_sample(block, i, mean, grad, sums);
+                    self.actor_sample((block, i), mean, grad, sums, squared_shifts);
                 }
             },
         );
     }
 
     #[inline(always)]
-    fn actor_sample(&self, block: &RolloutBlock, i: usize, mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
+    fn actor_sample(
+        &self,
+        (block, i): (&RolloutBlock, usize),
+        mean: &[f32],
+        grad: &mut [f32],
+        sums: &mut LossSums,
+        squared_shifts: &mut [f32],
+    ) {
         let row = RolloutBlock::row(mean.len(), i);
         let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
         // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
-        let sharpness = 1.0 / block.noise_scales[i];
-        for (((z, action), mean), inverse_std) in grad.iter_mut().zip(action).zip(mean).zip(&self.inverse_std) {
-            *z = (action - mean) * (inverse_std * sharpness);
+        let inverse_scale = 1.0 / block.noise_scales[i];
+        for ((z, action), mean) in grad.iter_mut().zip(action).zip(mean) {
+            *z = (action - mean) * (self.inverse_std * inverse_scale);
         }
         let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
         let ratio = (log_prob - block.log_probs[i]).exp();
         let advantage = block.advantages[i];
         let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage);
         // A NaN ratio takes the second branch and makes the sum NaN.
-        let (surrogate, slope) = if free <= bounded { (free, -self.share * free) } else { (bounded, 0.0) };
+        let (surrogate, slope) = if free <= bounded { (free, -self.sample_weight * free) } else { (bounded, 0.0) };
         let error = (ratio - 1.0).abs();
         sums.surrogate += f64::from(surrogate);
-        sums.clipped += usize::from(error > self.clip);
-        sums.ratio_error = sums.ratio_error.max(error);
-        for ((sum, mean), old_mean) in sums.moved.iter_mut().zip(mean).zip(old_mean) {
-            let moved = (mean - old_mean) * sharpness;
-            *sum += moved * moved;
+        sums.clipped += f64::from(u8::from(error > self.clip));
+        sums.ratio_error = sums.ratio_error.max(f64::from(error));
+        for ((sum, mean), old_mean) in squared_shifts.iter_mut().zip(mean).zip(old_mean) {
+            let shift = (mean - old_mean) * inverse_scale;
+            *sum += shift * shift;
         }
-        let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.share);
-        for ((z, inverse_std), mean) in grad.iter_mut().zip(&self.inverse_std).zip(mean) {
+        let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.sample_weight);
+        for (z, mean) in grad.iter_mut().zip(mean) {
             let beyond = mean - mean.clamp(-1.0, 1.0);
             excess += beyond * beyond;
-            *z = *z * (slope * sharpness * inverse_std) + pull * beyond;
+            *z = *z * (slope * inverse_scale * self.inverse_std) + pull * beyond;
         }
         sums.excess += f64::from(excess);
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
-    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
+    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut LossSums) {
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let (old, target) = (block.values[i], block.returns[i]);
@@ -121,15 +122,16 @@ impl<'a> Loss<'a> {
             let (error, slope) =
                 if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
             sums.value_error += f64::from(error * error);
-            *grad = self.value_coef * self.share * slope;
+            *grad = self.value_coef * self.sample_weight * slope;
         }
     }
 }
 
-/// Returns the sum over samples of the KL divergence of diagonal Gaussians with the same standard deviations, given the
-/// sums of squared differences of their means `[A]` and the logarithms of the standard deviations `[A]`.
-pub(super) fn kl(moved: &[f64], log_std: &[f32]) -> f64 {
-    moved.iter().zip(log_std).map(|(moved, &log_std)| 0.5 * moved / (2.0 * f64::from(log_std)).exp()).sum()
+/// Returns the sum over samples of the KL divergence of Gaussians with the same standard deviation e^`log_std`, given the sums of
+/// squared differences of their means `[A]`.
+pub(super) fn kl(squared_shifts: &[f32], log_std: f32) -> f64 {
+    let variance = (2.0 * f64::from(log_std)).exp();
+    squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum()
 }
 
 #[cfg(test)]
@@ -143,9 +145,10 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The expected values are those of the PyTorch program at the test of the same name in `candle/loss.rs`.
+    /// The expected values are those of the formulas in the PyTorch program in `candle/loss.rs`, with a logarithm of -0.5 for both
+    /// actions, in doubles; gradients by central differences.
     #[test]
-    fn losses_and_gradients_match_pytorch() {
+    fn losses_and_gradients_are_those_of_the_formulas() {
         let spaces = Spaces { observation_size: 1, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
         let mut rollout = Rollout::new(1, &[3], &spaces);
         let block = &mut rollout.blocks[0];
@@ -155,25 +158,24 @@ mod tests {
         block.values[..3].copy_from_slice(&[0.2, -0.1, 1.0]);
         block.returns = vec![0.5, 0.1, 1.9];
         block.noise_scales = vec![1.0, 1.5, 0.8];
-        let log_std = [-0.5f32, 0.2];
+        let log_std = -0.5f32;
         for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
-            let std = log_std.map(|log_std| block.noise_scales[i] * log_std.exp());
-            let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std[j]);
-            *log_prob = -0.5 * (z[0] * z[0] + z[1] * z[1]) - log_std[0] - log_std[1] - std::f32::consts::TAU.ln();
+            let std = block.noise_scales[i] * log_std.exp();
+            let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std);
+            *log_prob = -0.5 * (z[0] * z[0] + z[1] * z[1]) - 2.0 * log_std - std::f32::consts::TAU.ln();
         }
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
-        let loss = Loss::new(&rollout, 3, &config, &log_std);
-        let mut sums = Sums::new(2);
+        let loss = Loss::new(&rollout, 3, &config, (log_std, 2));
+        let (mut sums, mut shifts) = (LossSums::default(), [0.0; 2]);
         let mut grad = [0.0; 6];
-        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums);
-        assert_close(&grad, &[0.0, 0.0, 0.142_810_8, -0.026_412_528, 2.924_584_2, 0.841_392_4]);
-        assert_close(&[-sums.surrogate as f32 / 3.0], &[0.599_859_9]);
-        assert_close(&[sums.ratio_error], &[0.721_431]);
-        assert_eq!(sums.clipped, 2);
-        let moved: Vec<f64> = sums.moved.iter().map(|&x| f64::from(x)).collect();
-        assert_close(&[kl(&moved, &log_std) as f32 / 3.0], &[0.046_028_256]);
+        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums, &mut shifts);
+        assert_close(&grad, &[0.0, 0.0, 0.130_386_1, -0.097_789_58, 6.613_660_5, 7.715_937_3]);
+        assert_close(&[-sums.surrogate as f32 / 3.0], &[2.060_326_3]);
+        assert_close(&[sums.ratio_error as f32], &[2.892_847_6]);
+        assert_eq!(sums.clipped, 2.0);
+        assert_close(&[kl(&shifts, log_std) as f32 / 3.0], &[0.103_508_65]);
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
@@ -183,13 +185,14 @@ mod tests {
         // Means beyond ±1 add 2 · 0.5 · their distance, divided by three samples, to the gradient of the surrogate.
         let grads = [[1.5, -0.2], [1.0, -0.2]].map(|mean| {
             let mut grad = [0.0; 2];
-            loss.actor(&[2], &mean, &mut grad, &mut sums);
+            loss.actor(&[2], &mean, &mut grad, &mut sums, &mut shifts);
             grad
         });
         assert!((sums.excess - 0.25).abs() < 1e-6);
         config.bounds_coef = 0.0;
         let mut free = [0.0; 2];
-        Loss::new(&rollout, 3, &config, &log_std).actor(&[2], &[1.5, -0.2], &mut free, &mut sums);
+        let loss = Loss::new(&rollout, 3, &config, (log_std, 2));
+        loss.actor(&[2], &[1.5, -0.2], &mut free, &mut sums, &mut shifts);
         assert_close(&[grads[0][0] - free[0], grads[0][1] - free[1]], &[0.5 / 3.0, 0.0]);
     }
 }

@@ -1,10 +1,10 @@
 //! Custom kernels: the gradient of a minibatch in one pass over its samples, without an autograd graph.
 //!
-//! The network inputs of all samples are computed once per rollout. The samples of each shard in a minibatch are split
-//! into groups, and each (group, net) is one job for one thread. The job gathers a block of rows at a time, runs the
+//! The network inputs of all samples are computed once per rollout. The samples of a minibatch come in
+//! groups, and each (group, net) is one job for one thread. The job gathers a block of rows at a time, runs the
 //! forward pass, the loss and the backward pass while all of it is in the cache of that core, and accumulates the
 //! gradient of its group. Then the gradients of the groups are added as a binary tree. The grouping depends only on the
-//! numbers of samples and shards, so the result is the same for any number of threads. After the first minibatch, the
+//! settings, so the result is the same for any number of threads. After the first minibatch, the
 //! only float arrays that are allocated are the packing buffers of gemm and small temporaries of the sums; bf16 also
 //! packs the weights anew for each minibatch.
 
@@ -29,18 +29,11 @@ pub use net::Workspace;
 pub(super) use product::Matrix;
 
 use super::Policy;
-use super::backend::{GradientBackend, Minibatch, ShardSums};
+use super::backend::{GradientBackend, LossSums};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
-use crate::ranks::tree_sum;
-use loss::{Loss, Sums};
-
-/// The largest number of groups in a minibatch, unless it has more shards. More groups can occupy more threads (there
-/// are two jobs per group), but take more memory and more time to add up.
-const GROUPS: usize = 16;
-
-/// The fewest samples of a shard that are worth their own group.
-const SMALLEST_GROUP: usize = 32;
+use crate::ranks::{Minibatch, tree_sum};
+use loss::{Loss, kl};
 
 /// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
 pub(super) const ROWS: usize = 256;
@@ -64,7 +57,9 @@ pub(super) struct Kernels {
 #[derive(Clone, Default)]
 struct Partial {
     gradient: Vec<f32>,
-    sums: Sums,
+    sums: LossSums,
+    /// See [`Loss::actor`].
+    squared_shifts: Vec<f32>,
 }
 
 /// The net that a job works on.
@@ -106,32 +101,6 @@ impl Kernels {
             tree_sum(out, &of_groups);
         });
     }
-
-    /// Returns the sums of a shard from the results of its groups.
-    fn shard_sums(parts: &[Partial], log_std: &[f32]) -> ShardSums {
-        let sum = |of: fn(&Sums) -> f64| parts.iter().map(|part| of(&part.sums)).sum::<f64>();
-        let moved: Vec<f64> = (0..log_std.len())
-            .map(|i| parts.iter().step_by(2).map(|part| f64::from(part.sums.moved[i])).sum())
-            .collect();
-        ShardSums {
-            surrogate: sum(|sums| sums.surrogate),
-            value_error: sum(|sums| sums.value_error),
-            excess: sum(|sums| sums.excess),
-            kl: loss::kl(&moved, log_std),
-            clipped: sum(|sums| sums.clipped as f64),
-            ratio_error: parts.iter().map(|part| f64::from(part.sums.ratio_error)).fold(0.0, f64::max),
-        }
-    }
-}
-
-/// Returns the number of groups that each shard of `samples` samples is split into: a power of two, so that all groups
-/// can be added as a tree. It depends on nothing but `samples` and `shards`.
-fn groups_of_shard(samples: usize, shards: usize) -> usize {
-    let mut groups = (GROUPS / shards).max(1);
-    while groups > 1 && samples / groups < SMALLEST_GROUP {
-        groups /= 2;
-    }
-    groups
 }
 
 impl GradientBackend for Kernels {
@@ -151,26 +120,22 @@ impl GradientBackend for Kernels {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        minibatch: Minibatch,
+        minibatch: &Minibatch,
         out: &mut [f32],
-    ) -> Result<Vec<ShardSums>> {
-        let in_shard = minibatch.in_shard();
-        let groups = groups_of_shard(in_shard, minibatch.shards);
-        let all_groups = groups * minibatch.own_shards;
-        let rows = self.reserve(policy, all_groups, in_shard.div_ceil(groups));
+    ) -> Result<Vec<LossSums>> {
+        let groups = &minibatch.groups;
+        let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
         let nets = [&policy.layout.actor, &policy.layout.critic];
         let nets = nets.map(|layers| policy.net(layers).packed(self.arithmetic, true));
-        let log_std = policy.log_std();
-        let loss = Loss::new(rollout, minibatch.count(), &self.config, log_std);
-        let bounds: Vec<usize> = (0..=groups).map(|i| in_shard * i / groups).collect();
-        let shards = minibatch.samples.chunks(in_shard);
-        let tasks = shards.flat_map(|shard| bounds.windows(2).map(|bounds| &shard[bounds[0]..bounds[1]]));
-        let tasks = tasks.flat_map(|group| ROLES.map(|role| (group, role)));
+        let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
+        let loss = Loss::new(rollout, minibatch.count, &self.config, (log_std, action_size));
+        let tasks = groups.iter().flat_map(|group| ROLES.map(|role| (group, role)));
         let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
         tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
             let net = &nets[role as usize];
             part.gradient.resize(net.parameter_count(), 0.0);
-            part.sums = Sums::new(log_std.len());
+            part.sums = LossSums::default();
+            part.squared_shifts = vec![0.0; action_size];
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
@@ -180,18 +145,22 @@ impl GradientBackend for Kernels {
                 net.forward(block.len(), work);
                 let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
                 match role {
-                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
+                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums, &mut part.squared_shifts),
                     Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
                 }
                 net.backward(block.len(), work, &mut part.gradient, i > 0);
             }
         });
 
-        let [actor, critic, of_log_std] = policy.layout.groups();
-        self.add_up(Role::Actor, all_groups, &mut out[actor]);
-        self.add_up(Role::Critic, all_groups, &mut out[critic]);
-        out[of_log_std].fill(0.0);
-        let parts = &self.parts[..2 * all_groups];
-        Ok(parts.chunks(2 * groups).map(|parts| Self::shard_sums(parts, log_std)).collect())
+        for (role, range) in ROLES.into_iter().zip(policy.layout.nets()) {
+            self.add_up(role, groups.len(), &mut out[range]);
+        }
+        let of_group = |parts: &[Partial]| {
+            let [actor, critic] = parts else { unreachable!("one part for each net") };
+            let mut sums = LossSums { kl: kl(&actor.squared_shifts, log_std), ..actor.sums };
+            sums += critic.sums;
+            sums
+        };
+        Ok(self.parts[..2 * groups.len()].chunks(2).map(of_group).collect())
     }
 }

@@ -1,0 +1,230 @@
+//! What the ranks of a training compute together, and how they exchange it.
+
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
+
+use anyhow::{Result, ensure};
+use rayon::prelude::*;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::{Alone, Ranks, Slices};
+
+/// The shards of a training, those of them that this rank computes, and the exchange with the other ranks. All ranks make the same
+/// calls in the same order. Copies share the count of their traffic.
+#[derive(Clone)]
+pub struct Exchange {
+    shards: usize,
+    ranks: Arc<dyn Ranks>,
+    sent: Arc<Counters>,
+}
+
+#[derive(Default)]
+struct Counters {
+    nanoseconds: AtomicU64,
+    bytes: AtomicU64,
+}
+
+/// The cost of the exchange.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Traffic {
+    /// The time spent, waiting for others included, s; `NaN` for a single rank.
+    pub seconds: f64,
+    /// The bytes that this rank has sent to others; `NaN` for a single rank.
+    pub bytes: f64,
+}
+
+impl Traffic {
+    /// Returns the traffic by name.
+    pub fn named(&self) -> [(&'static str, f64); 2] {
+        [("exchange_s", self.seconds), ("exchange_bytes", self.bytes)]
+    }
+}
+
+impl Exchange {
+    /// Creates the exchange of a single shard.
+    pub fn new(ranks: Arc<dyn Ranks>) -> Self {
+        Self { shards: 1, ranks, sent: Arc::default() }
+    }
+
+    /// Creates the exchange of one rank that computes all shards.
+    pub fn alone(shards: usize) -> Self {
+        Self::new(Arc::new(Alone)).over(shards).expect("one rank")
+    }
+
+    /// Deals this number of shards, a power of two, to the ranks.
+    ///
+    /// # Errors
+    /// Fails if the number of ranks is not a power of two, or if there are fewer shards.
+    pub fn over(self, shards: usize) -> Result<Self> {
+        let ranks = self.ranks.size();
+        ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
+        ensure!(
+            ranks <= shards,
+            "{ranks} ranks, but the training has {shards} shards (run.shards), and a rank computes at least one of them"
+        );
+        assert!(shards.is_power_of_two(), "{shards} shards");
+        Ok(Self { shards, ..self })
+    }
+
+    /// Returns the number of all shards.
+    pub(super) fn shards(&self) -> usize {
+        self.shards
+    }
+
+    /// Returns the shards of this rank.
+    pub(super) fn own_shards(&self) -> Range<usize> {
+        self.own(self.shards)
+    }
+
+    /// Returns this rank's part of `count` things in a row: parts differ by one thing at most.
+    pub fn own(&self, count: usize) -> Range<usize> {
+        part(count, self.ranks.rank(), self.ranks.size())
+    }
+
+    /// Returns the number of things of all ranks, if each has `own` of them.
+    pub fn of_all(&self, own: usize) -> usize {
+        own * self.ranks.size()
+    }
+
+    /// Returns whether there is no other rank.
+    pub fn is_alone(&self) -> bool {
+        self.ranks.size() == 1
+    }
+
+    /// Returns whether this is the rank that reports and saves.
+    pub fn is_first(&self) -> bool {
+        self.ranks.rank() == 0
+    }
+
+    /// Returns the number of this rank.
+    pub(super) fn number(&self) -> usize {
+        self.ranks.rank()
+    }
+
+    /// Ends all ranks at once.
+    pub(super) fn abort(&self) -> ! {
+        self.ranks.abort()
+    }
+
+    /// Deals the chunks of an array, which follow one another, to the ranks.
+    pub fn slices(&self, chunks: Vec<Range<usize>>) -> Slices {
+        let ranks = self.ranks.size();
+        Slices::new(self.clone(), chunks, (self.ranks.rank(), ranks))
+    }
+
+    /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts are those of this
+    /// rank, shard after shard, equally many for each.
+    pub fn sum<P, T>(&self, parts: &[P], of: impl Fn(&[P]) -> T + Send + Sync, add: impl Fn(&mut T, T)) -> T
+    where
+        P: Sync,
+        T: Serialize + DeserializeOwned + Send,
+    {
+        let own: Vec<T> = parts.par_chunks(parts.len() / self.own_shards().len()).map(of).collect();
+        let all = self.all_gather(own).into_iter().flatten();
+        all.reduce(|mut sum, next| {
+            add(&mut sum, next);
+            sum
+        })
+        .expect("there is a shard")
+    }
+
+    /// Returns the values of all ranks, in their order.
+    pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
+        if self.is_alone() {
+            return vec![own];
+        }
+        let own = to_bytes(&own);
+        let all = self.timed(own.len() * (self.ranks.size() - 1), || self.ranks.all_gather(own));
+        all.iter().map(|bytes| from_bytes(bytes)).collect()
+    }
+
+    /// Returns the value of the first rank; the others pass `None`.
+    pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
+        match first {
+            Some(value) if self.is_alone() => value,
+            first => from_bytes(&self.ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value)))),
+        }
+    }
+
+    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them.
+    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Vec<f32> {
+        self.timed(4 * (numbers.len() - own), || self.ranks.all_to_all(numbers, slices))
+    }
+
+    /// Replaces the slices of the other ranks by what these have computed.
+    pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>], own: usize) {
+        self.timed(4 * own * (self.ranks.size() - 1), || self.ranks.all_gather_slices(numbers, slices));
+    }
+
+    /// Returns the traffic since the last call.
+    pub fn take_traffic(&self) -> Traffic {
+        let [nanoseconds, bytes] = [&self.sent.nanoseconds, &self.sent.bytes].map(|of| of.swap(0, Ordering::Relaxed));
+        let known = |value: f64| if self.is_alone() { f64::NAN } else { value };
+        Traffic { seconds: known(nanoseconds as f64 * 1e-9), bytes: known(bytes as f64) }
+    }
+
+    fn timed<T>(&self, bytes: usize, talk: impl FnOnce() -> T) -> T {
+        let started = Instant::now();
+        let result = talk();
+        self.sent.nanoseconds.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
+        self.sent.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+        result
+    }
+}
+
+fn to_bytes<T: Serialize>(value: &T) -> Vec<u8> {
+    postcard::to_stdvec(value).expect("values of known size")
+}
+
+fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> T {
+    postcard::from_bytes(bytes).expect("the ranks run the same program")
+}
+
+pub(super) fn part(count: usize, rank: usize, ranks: usize) -> Range<usize> {
+    count * rank / ranks..count * (rank + 1) / ranks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_are_added_in_the_order_of_the_shards() {
+        let exchange = Exchange::alone(4);
+        // 1 is lost when added to 1e16: once in this order, never or twice in others.
+        let of_shard = |parts: &[f64]| parts.iter().sum::<f64>();
+        assert_eq!(exchange.sum(&[1e16, 1.0, -1e16, 1.0], of_shard, |sum, next| *sum += next), 1.0);
+        assert_eq!(exchange.sum(&[1e16, 1.0, 0.0, 0.0, -1e16, 1.0, 0.0, 1.0], of_shard, |sum, next| *sum += next), 1.0);
+    }
+
+    #[test]
+    fn trainings_that_cannot_be_dealt_to_the_ranks_are_refused() {
+        struct Three;
+        impl Ranks for Three {
+            fn size(&self) -> usize {
+                3
+            }
+            fn rank(&self) -> usize {
+                0
+            }
+            fn all_to_all(&self, _: &[f32], _: &[Range<usize>]) -> Vec<f32> {
+                Vec::new()
+            }
+            fn all_gather_slices(&self, _: &mut [f32], _: &[Range<usize>]) {}
+            fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
+                vec![bytes]
+            }
+            fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
+                bytes
+            }
+            fn abort(&self) -> ! {
+                panic!()
+            }
+        }
+        let refused = Exchange::new(Arc::new(Three)).over(16).err().unwrap().to_string();
+        assert!(refused.contains("3 ranks") && refused.contains("power of two"), "{refused}");
+    }
+}

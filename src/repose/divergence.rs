@@ -1,0 +1,125 @@
+//! How the physics of an episode diverged: its last steps, as JSON that any MuJoCo can replay.
+
+use serde_json::{Value, json};
+
+use super::{ACTION_SIZE, Draw};
+use crate::config::EnvConfig;
+use crate::sim::{Simulation, SimulationState};
+
+/// The end of an episode whose physics diverged.
+#[derive(Clone, Debug)]
+pub struct Diverged {
+    /// The length of the episode in control steps, including the last one.
+    pub length: u32,
+    /// What the episode has drawn, if it was randomised.
+    pub draw: Option<Draw>,
+    /// The last steps of the episode.
+    pub tail: Tail,
+}
+
+impl Diverged {
+    /// Returns one object: `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step, `ctrl` the controls
+    /// of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes, `randomization`
+    /// is what this one has drawn (null if nothing), on top of the settings, and `pushes` the force on the cube in each step.
+    pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
+        let tail = &self.tail;
+        let actions: Vec<Value> = tail.actions.iter().map(|action| json!(action.as_slice())).collect();
+        let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
+        let mut dump = json!({
+            "model": config.model,
+            "friction_scale": config.friction_scale,
+            "cube_mass_scale": config.cube_mass_scale,
+            "sim_dt": config.sim_dt,
+            "ctrl_dt": config.ctrl_dt,
+            "iteration": iteration,
+            "environment": env,
+            "episode_length": self.length,
+            "state": tail.start.numbers(),
+            "ctrl": ctrl,
+            "actions": actions,
+        });
+        config.varied().for_each(|(key, value)| dump[key] = json!(value));
+        dump["randomization"] = self.draw.as_ref().map_or(Value::Null, |draw| {
+            json!({
+                "friction": draw.friction,
+                "cube_mass": draw.cube_mass,
+                "hand_mass": draw.hand_mass,
+                "cube_size": draw.cube_size,
+                "cube_com": draw.cube_com,
+                "gains": draw.gains,
+                "damping": draw.damping,
+                "frictionloss": draw.frictionloss,
+                "gravity": draw.gravity,
+                "delay": draw.delay,
+            })
+        });
+        dump["pushes"] = json!(tail.pushes);
+        format!("{dump}\n")
+    }
+}
+
+/// Returns a warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
+pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
+    (diverged * 100 > steps).then(|| {
+        format!(
+            "in {diverged} of {steps} steps the physics diverged and the episode ended: this combination of scene, \
+             env.sim_dt, masses, friction, gains and damping cannot be simulated"
+        )
+    })
+}
+
+/// The number of steps between two kept states.
+const STEPS: usize = 16;
+
+/// The data needed to replay the end of an episode in any MuJoCo.
+#[derive(Clone, Debug)]
+pub struct Tail {
+    /// The state before the first of these steps.
+    pub start: SimulationState,
+    /// The controls sent in each step, in the model's order.
+    pub controls: Vec<[f64; ACTION_SIZE]>,
+    /// The policy's action in each step.
+    pub actions: Vec<[f32; ACTION_SIZE]>,
+    /// The random force on the cube in each step, N; empty where there is none.
+    pub pushes: Vec<[f64; 3]>,
+}
+
+/// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
+#[derive(Debug, Default)]
+pub(super) struct Recorder {
+    before: Option<Tail>,
+    now: Option<Tail>,
+}
+
+impl Recorder {
+    /// Forgets the episode.
+    pub(super) fn clear(&mut self) {
+        (self.before, self.now) = (None, None);
+    }
+
+    /// Records a step that is about to be taken, after its controls have been set.
+    pub(super) fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>) {
+        if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS) {
+            let (controls, actions) = (Vec::with_capacity(STEPS), Vec::with_capacity(STEPS));
+            self.before = self.now.replace(Tail { start: sim.state(), controls, actions, pushes: Vec::new() });
+        }
+        let tail = self.now.as_mut().expect("just begun");
+        tail.controls.push(*sim.ctrl().first_chunk().expect("one control per actuator"));
+        tail.actions.push(*action.first_chunk().expect("a complete action"));
+        tail.pushes.extend(push);
+    }
+
+    /// Returns the recorded steps; `None` before the first step.
+    pub(super) fn tail(&self) -> Option<Tail> {
+        let now = self.now.clone()?;
+        Some(match self.before.clone() {
+            Some(mut tail) => {
+                tail.controls.extend(now.controls);
+                tail.actions.extend(now.actions);
+                tail.pushes.extend(now.pushes);
+                tail
+            }
+            None => now,
+        })
+    }
+}
