@@ -1,4 +1,4 @@
-"""Makes the small tables of this folder from the metrics.csv of a run: python thin.py RUN TABLE
+"""Makes a small table, such as those of docs/curves, from the metrics.csv of a run: python thin.py RUN TABLE
 
 A row holds the means over the iterations of 400 000 control steps, the steps at its end, and the sums of the times in seconds.
 An iteration with an evaluation is the last of its row, so that evaluations appear at the steps at which they were made.
@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 MEANS = ["episode/goals", "episode/in_tolerance", "episode/drop_rate", "episode/rot_dist", "episode/length", "training/progress"]
-MEANS += ["policy/std", "eval/goals", "eval/drop_rate", "eval/rot_dist"]
-# Only a training with randomised episodes has these.
+MEANS += ["training/turned", "policy/std", "eval/goals", "eval/drop_rate", "eval/rot_dist"]
+# Only a training with randomised episodes has these. Runs before `training/turned` was logged lack that column.
 RANDOMIZED = ["randomized/goals", "randomized/drop_rate", "randomized/rot_dist"]
 # Only a training by the task's own reward is measured by its return.
 RETURNS = ["episode/return", "eval/return"]
@@ -35,7 +35,7 @@ def main(run, table):
     Path(table).parent.mkdir(parents=True, exist_ok=True)
     with open(table, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        columns = MEANS + [column for column in RANDOMIZED if column in rows[0]]
+        columns = [column for column in MEANS + RANDOMIZED if column in rows[0]]
         columns += RETURNS if float(rows[0].get("training/task_reward") or 0) == 1 else []
         writer.writerow(["env_steps", *columns, *SUMS])
         # The last group has too few iterations for a mean.
