@@ -111,7 +111,7 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
             Err(error) => os::say(&format!("warning: {error:#}; skipped")),
         }
     }
-    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/metrics, is not smoothed more.
+    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
     let in_row = tables.iter().filter_map(|(_, table)| Some(table.required[0].get(1)? - table.required[0][0]));
     let window = args.smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
     let run = |(place, table): (&Path, MetricsTable)| {
@@ -213,12 +213,18 @@ fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
     collect_s.iter().zip(update_s).map(until).collect()
 }
 
-/// Returns the name of a run: that of its folder, with control characters replaced.
+/// Returns the name of a run, with control characters replaced: that of its folder, or of a table that is kept under a name of
+/// its own, as in docs/curves.
 fn name_of(place: &Path) -> String {
     let whole = place.canonicalize().unwrap_or_else(|_| place.to_owned());
-    let folder = if whole.is_dir() { Some(whole.as_path()) } else { whole.parent() };
-    let name =
-        folder.and_then(Path::file_name).map_or_else(|| place.display().to_string(), |n| n.to_string_lossy().into());
+    let name = if whole.is_dir() {
+        whole.file_name()
+    } else if whole.file_name().is_some_and(|file| file == "metrics.csv") {
+        whole.parent().and_then(Path::file_name)
+    } else {
+        whole.file_stem()
+    };
+    let name = name.map_or_else(|| place.display().to_string(), |n| n.to_string_lossy().into());
     name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()
 }
 
@@ -242,6 +248,14 @@ fn smooth(along: &[f64], values: &[f64], lengths: &[usize]) -> Vec<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_run_is_named_after_its_folder_and_a_table_by_itself_after_its_file() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let names =
+            ["docs/curves", "docs/curves/default-0.csv", "runs/seed-1/metrics.csv"].map(|of| name_of(&root.join(of)));
+        assert_eq!(names, ["curves", "default-0", "seed-1"]);
+    }
 
     #[test]
     fn a_point_is_the_mean_of_the_rows_that_have_a_value() {

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tomllib
 
-THIN = pathlib.Path(__file__).resolve().parents[2] / "docs/metrics/thin.py"
+THIN = pathlib.Path(__file__).resolve().with_name("thin.py")
 # The metrics in tables, with their decimal digits.
 METRICS = {"turned": 3, "eval/goals": 2, "eval/drop_rate": 3}
 # The number of iterations whose times are replaced by their median, so that interruptions of a training do not count.

@@ -57,6 +57,11 @@ fn an_experiment_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     let row = said.lines().skip_while(|line| *line != "at 1,280 steps:").find(|line| line.starts_with("| same"));
     assert!(row.is_some_and(|row| row.contains("(+0.000 ± 0.000, up in 0 of 2)")), "{said}");
     assert!(runs.join("picture.svg").exists());
+    succeeded(experiment(folder).args(["--publish", "published"]).output().unwrap());
+    let published = folder.join("published");
+    assert!(published.join("README.md").exists() && published.join("experiment.toml").exists());
+    let table = fs::read_to_string(published.join("louder-1/metrics.csv")).unwrap();
+    assert!(table.starts_with("env_steps,episode/goals,") && table.contains(",time/update_s\n"), "{table}");
     // Other settings are refused in the same folder.
     let changed = fs::read_to_string(folder.join("what.toml")).unwrap().replace("0.8", "0.9");
     fs::write(folder.join("what.toml"), changed).unwrap();
