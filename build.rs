@@ -91,6 +91,9 @@ fn fetch(library: &Path) -> Result<(), String> {
     let partial = folder.join(format!("libmujoco.partial.{}", std::process::id()));
     fs::copy(&unpacked, &partial).map_err(|e| format!("{}: {e}", unpacked.display()))?;
     fs::rename(&partial, library).map_err(told)?;
+    // As old as this script, so that the next build does not take it for something that has changed since this one.
+    let written = fs::metadata("build.rs").and_then(|facts| facts.modified()).map_err(told)?;
+    fs::File::options().write(true).open(library).and_then(|file| file.set_modified(written)).map_err(told)?;
     let _ = fs::remove_dir_all(&work);
     Ok(())
 }

@@ -59,7 +59,6 @@ pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
         config.run.shards = 1;
         let mut agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
         agent.restore(&mut checkpoint)?;
-        checkpoint.take_counters("scene")?;
         checkpoint.finish()?;
         // Learning from untrained values may fail, but nothing else may.
         if let Err(error) = agent.iterate(&AtomicBool::new(false)) {

@@ -34,26 +34,35 @@ def checksum(texts, arrays, data):
     return f"{crc:08x}"
 
 
+def read(path):
+    """Returns the texts, the arrays and the data of a file."""
+    with open(path, "rb") as file:
+        whole = file.read()
+    length = struct.unpack("<Q", whole[:8])[0]
+    arrays, data = json.loads(whole[8 : 8 + length]), whole[8 + length :]
+    texts = arrays.pop("__metadata__")
+    if texts.pop("checksum") != checksum(texts, arrays, data):
+        sys.exit(f"{path}: damaged, or not a policy of this program")
+    return texts, arrays, data
+
+
+def write(path, texts, arrays, data):
+    """Writes a file with these texts and arrays, and their checksum."""
+    texts = {**texts, "checksum": checksum(texts, arrays, data)}
+    header = json.dumps({"__metadata__": dict(sorted(texts.items())), **arrays}, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    with open(path, "wb") as file:
+        file.write(struct.pack("<Q", len(header)) + header + data)
+
+
 def main():
     if len(sys.argv) != 3:
         sys.exit(__doc__)
     facts = json.load(sys.stdin)
     if {key: type(value) for key, value in facts.items()} != FACTS:
         sys.exit(f"expected exactly {', '.join(FACTS)}")
-    with open(sys.argv[1], "rb") as file:
-        whole = file.read()
-    length = struct.unpack("<Q", whole[:8])[0]
-    arrays, data = json.loads(whole[8 : 8 + length]), whole[8 + length :]
-    texts = arrays.pop("__metadata__")
-    stored = texts.pop("checksum")
-    if checksum(texts, arrays, data) != stored:
-        sys.exit(f"{sys.argv[1]}: damaged, or not a policy of this program")
-    texts["provenance"] = json.dumps(facts)
-    texts["checksum"] = checksum(texts, arrays, data)
-    header = json.dumps({"__metadata__": dict(sorted(texts.items())), **arrays}, separators=(",", ":")).encode()
-    header += b" " * (-len(header) % 8)
-    with open(sys.argv[2], "wb") as file:
-        file.write(struct.pack("<Q", len(header)) + header + data)
+    texts, arrays, data = read(sys.argv[1])
+    write(sys.argv[2], {**texts, "provenance": json.dumps(facts)}, arrays, data)
 
 
 if __name__ == "__main__":

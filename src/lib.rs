@@ -13,7 +13,7 @@
 //! | module | what it is | imports |
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, dump, evaluate, load, os, ppo, quantities, ranks, repose, run, schedule, see, sim |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, evaluate, load, os, ppo, quantities, ranks, repose, run, schedule, see, sim |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, load, os, pace, repose, robustness, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, see, sim |
@@ -29,7 +29,7 @@
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
 //! | [`cli`] | the structure of the command line | config, sim |
-//! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, ranks, rng, sim, spaces |
+//! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, rng, sim, spaces |
 //! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, quat, ranks, rng, spaces |
 //! | [`sim`] | the only interface to MuJoCo | quat, schedule |
@@ -37,8 +37,8 @@
 //! | [`run`] | the folder of a run and its logs | os |
 //! | [`draw`] | charts, films and pictures as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |
-//! | [`quantities`] | what a training logs: names, meanings, units | - |
-//! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | - |
+//! | [`quantities`] | what a training logs: names, meanings, units | repose |
+//! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | os, rng, schedule |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
 //! | [`quat`] | rotations | - |

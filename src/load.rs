@@ -6,7 +6,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Error, Result, bail, ensure};
+use anyhow::{Context, Error, Result, bail};
 
 use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::os;
@@ -191,10 +191,9 @@ pub fn is_damage(error: &Error) -> bool {
 /// Returns the configuration for resuming the training from a checkpoint in the file `path`, overlaid with `overrides`.
 ///
 /// # Errors
-/// Fails if the checkpoint is of another version, or if its configuration is invalid, belongs to another policy, or names a scene
+/// Fails if its configuration is invalid, belongs to another policy, or names a scene
 /// that no override names.
 pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<Config> {
-    expect_trainable(checkpoint)?;
     let config = Config::from_text(path, &checkpoint.config, overrides)?;
     expect_usable(checkpoint, &config.ppo.net(), &config.env, overrides)?;
     Ok(config)
@@ -211,7 +210,6 @@ pub fn for_fork(
     user: Option<&Source>,
     overrides: &[Override],
 ) -> Result<(Config, Config)> {
-    expect_trainable(checkpoint)?;
     let parent = Config::from_text(path, &checkpoint.config, &[])?;
     checkpoint.expect_policy(&parent.ppo.net(), &SPACES)?;
     let config = parent.changed(user, overrides)?;
@@ -237,13 +235,6 @@ fn cannot_use(path: &Path) -> String {
 fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
     checkpoint.expect_policy(net, &SPACES)?;
     expect_named_scene(env, overrides.iter().any(|set| set.key == MODEL))
-}
-
-/// Checks that a checkpoint has a format from which this version can resume.
-fn expect_trainable(checkpoint: &Checkpoint) -> Result<()> {
-    let advice = "resume it with that version, or start a new run with its policy (--init)";
-    ensure!(!checkpoint.is_of_0_1, "made by 0.1.0: {advice}");
-    Ok(())
 }
 
 /// Checks that a scene other than the built-in one was named by the user.

@@ -12,7 +12,7 @@ use rand::seq::SliceRandom;
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
 use shadow_repose::os::{Status, StatusLine};
-use shadow_repose::ppo::{Array, Checkpoint};
+use shadow_repose::ppo::Checkpoint;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::Task;
 use shadow_repose::rng::{self, Rng};
@@ -36,9 +36,9 @@ fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
     let task = Task::new(&config.env).unwrap();
-    let mut checkpoint =
-        Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap().checkpoint(&config.to_text(), None);
-    checkpoint.insert("scene", Array::U64(vec![1], vec![task.scene().fingerprint().unwrap()]));
+    let agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
+    let mut checkpoint = agent.checkpoint(&config.to_text(), None);
+    checkpoint.scene = Some(task.scene().fingerprint());
     checkpoint
 }
 

@@ -15,9 +15,6 @@ use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
 
-/// Values of settings that older policies and runs lack; they may differ from today's defaults.
-const BEFORE: &str = "[training]\napproach_reward = 0.0\n[ppo]\nsymmetry = \"none\"";
-
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Override {
@@ -83,13 +80,13 @@ impl Config {
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
-    /// the values that change nothing.
+    /// their defaults.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
         let table = Source { path: path.into(), text: text.into() }.table()?;
-        layered(Some(path), &[before(), table], overrides)
+        layered(Some(path), &[table], overrides)
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
@@ -155,13 +152,9 @@ impl PolicyConfig {
         if let Some(Value::Table(ppo)) = table.get_mut("ppo") {
             ppo.retain(|key, _| OF_NETS.contains(&key));
         }
-        let Config { env, ppo, .. } = layered(Some(path), &[before(), table], overrides)?;
+        let Config { env, ppo, .. } = layered(Some(path), &[table], overrides)?;
         Ok(Self { env, net: ppo.net() })
     }
-}
-
-fn before() -> Table {
-    BEFORE.parse().expect("the built-in configuration is TOML")
 }
 
 /// Reads the user's configuration file, if one was given.
@@ -213,7 +206,7 @@ fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Res
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Activation, Ramp, Symmetry};
+    use super::super::{Activation, Ramp};
     use super::*;
 
     fn set(text: &str) -> Override {
@@ -236,16 +229,6 @@ mod tests {
 
     fn file(text: &str) -> Source {
         Source { path: "x.toml".into(), text: text.into() }
-    }
-
-    #[test]
-    fn a_run_that_is_older_than_a_setting_goes_on_as_if_it_did_not_exist() {
-        let text = Config::resolve(None, &[]).unwrap().to_text();
-        let older: String =
-            text.lines().filter(|line| !line.contains("approach_reward")).map(|line| format!("{line}\n")).collect();
-        let rewards = [&text, &older]
-            .map(|text| Config::from_text(Path::new("config.toml"), text, &[]).unwrap().training.approach_reward);
-        assert_eq!(rewards, [60.0, 0.0]);
     }
 
     #[test]
@@ -323,38 +306,18 @@ mod tests {
     }
 
     #[test]
-    fn settings_that_are_gone_are_answered_with_what_to_do() {
-        for (gone, advice) in [
-            ("training.tolerance_steps=0", "write it as a ramp"),
-            ("training.hold_scale=0.3", "independent of the task's values"),
-            ("training.bootstrap_reached=true", "training now always behaves"),
-            ("ppo.init_std=0.6", "the std follows a ramp"),
-            ("ppo.min_std=0.2", "the std is not learnt any more"),
-            ("ppo.exploring_share=0", "it did not help"),
-            ("ppo.activation=silu", "no policy that came with the program used it"),
-        ] {
-            let text = errors(&[gone]);
-            let key = gone.split_once('=').unwrap().0;
-            assert!(text.contains(key) && text.contains(": gone since 0.2.0: ") && text.contains(advice), "{text}");
-        }
-    }
-
-    #[test]
     fn of_the_settings_in_a_policys_file_only_those_of_playing_are_read() {
         let trained = "[env]\nnum_envs = 0\nrot_eps = 0.2\n[ppo]\nhidden = [9]\ngamma = \"much\"\nnot_yet = 1\n\
                        [training]\ngoal_reward = 3\n[of_tomorrow]\nx = 1\n[run]\nseed = -1";
         let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, sets);
         let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
         assert_eq!((found.env.rot_eps, found.env.sim_dt, found.net.hidden), (0.2, 0.005, vec![9]));
-        // The file is older than the setting `ppo.symmetry`.
-        assert_eq!(found.net.symmetry, Symmetry::None);
         let whole = Config::resolve(None, &[]).unwrap();
         assert_eq!(policy(&whole.to_text(), &[]).unwrap(), PolicyConfig { env: whole.env, net: whole.ppo.net() });
         for (bad, part) in [
             ("[env]\nrot_eps = 0", "env.rot_eps = 0: must be above 0"),
             ("[env]\nnot_yet = 1", "env.not_yet: unknown key"),
             ("[ppo]\nhidden = []", "must hold one to 64 sizes"),
-            ("[ppo]\nactivation = \"silu\"", "ppo.activation = \"silu\": gone since 0.2.0"),
         ] {
             let text = policy(bad, &[]).unwrap_err().to_string();
             assert!(text.contains(part), "{text}");

@@ -5,12 +5,10 @@
 //! that uses a setting.
 //!
 //! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
-//! If its default changes what is learnt, `layers` also says what it is for the runs that lack it.
 
 mod layers;
 mod overlay;
 mod ramp;
-mod removed;
 mod rules;
 mod settings;
 mod used;

@@ -4,8 +4,8 @@ use std::borrow::Cow;
 
 use toml::{Table, Value};
 
+use super::BASE;
 use super::ramp::Ramp;
-use super::{BASE, removed};
 use crate::os::similar;
 
 /// Returns the table with this one value. Text that is not a TOML value becomes a string, as does any text for a string key.
@@ -59,10 +59,6 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             return;
         }
         let name = format!("{prefix}{key}");
-        if let Some(problem) = removed::answer(&name, value) {
-            problems.push(problem);
-            continue;
-        }
         match (base.get(key), value) {
             (None, _) => problems.push(unknown(&name)),
             // A plain number in place of a ramp is a constant.

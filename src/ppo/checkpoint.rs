@@ -13,10 +13,13 @@ use crate::config::NetConfig;
 use crate::spaces::Spaces;
 
 /// The text `format` of a file.
-const FORMAT: &str = "shadow-repose checkpoint 3";
+const FORMAT: &str = "shadow-repose checkpoint 4";
 
-/// The same in files of version 0.1.0. Their policy can be played, or used as the start of a run, and nothing else.
-const FORMAT_0_1: &str = "shadow-repose checkpoint 2";
+/// The formats of versions that this program does not read.
+const OLDER: [(&str, &str); 2] = [("shadow-repose checkpoint 2", "0.1.0"), ("shadow-repose checkpoint 3", "0.2.0")];
+
+/// The text that identifies the physics of the scene.
+const SCENE: &str = "scene";
 
 /// The most bytes of a configuration that are read; ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
@@ -39,8 +42,8 @@ pub struct Checkpoint {
     pub progress: Progress,
     /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes.
     pub provenance: Option<String>,
-    /// Whether version 0.1.0 wrote it.
-    pub is_of_0_1: bool,
+    /// The fingerprint of the physics of its scene; `None`: the built-in scene.
+    pub scene: Option<String>,
     content: Content,
 }
 
@@ -53,17 +56,19 @@ impl Checkpoint {
         let mut content = Content::parse(bytes)?;
         let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
         let format = text("format")?;
-        let is_of_0_1 = format == FORMAT_0_1;
-        ensure!(format == FORMAT || is_of_0_1, "its format is `{format}`; this program reads `{FORMAT}`");
+        if let Some((_, version)) = OLDER.iter().find(|(older, _)| *older == format) {
+            bail!("made by version {version}, whose files this version does not read");
+        }
+        ensure!(format == FORMAT, "its format is `{format}`; this program reads `{FORMAT}`");
         let config = text("config")?;
         let long = config.len();
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
-        let provenance = content.texts.remove(PROVENANCE);
+        let [provenance, scene] = [PROVENANCE, SCENE].map(|key| content.texts.remove(key));
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata has an unknown `{key}`");
         }
-        Ok(Self { config, progress, provenance, is_of_0_1, content })
+        Ok(Self { config, progress, provenance, scene, content })
     }
 
     /// Returns the bytes of a file.
@@ -77,19 +82,25 @@ impl Checkpoint {
         {
             content.texts.insert(key.into(), text.into());
         }
-        content.texts.extend(self.provenance.clone().map(|text| (PROVENANCE.into(), text)));
+        let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene)];
+        content.texts.extend(others.into_iter().filter_map(|(key, text)| Some((key.into(), text.clone()?))));
         content.to_bytes()
     }
 
-    /// Returns only the parts that playing needs: what is shared does not tell paths of the machine on which it was made.
+    /// Returns only the parts that playing needs. The fork's path is dropped: shared files must not reveal local paths.
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
         let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
         let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
         let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
-        let (provenance, content) = (self.provenance.clone(), Content { arrays, ..Content::default() });
-        Self { config, progress, provenance, content, ..*self }
+        let content = Content { arrays, ..Content::default() };
+        Self { config, progress, provenance: self.provenance.clone(), scene: self.scene.clone(), content }
+    }
+
+    /// Returns whether its scene may be the one with this fingerprint.
+    pub fn is_of_scene(&self, fingerprint: &str) -> bool {
+        self.scene.as_ref().is_none_or(|scene| scene == fingerprint)
     }
 
     /// Adds an array.
@@ -216,7 +227,7 @@ impl Ppo {
     /// progress of the run. All processes of a training call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
-        let mut checkpoint = Checkpoint { config, progress, provenance: None, is_of_0_1: false, content };
+        let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
         let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));

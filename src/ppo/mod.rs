@@ -137,7 +137,7 @@ impl Ppo {
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (config, learning_rate) = (config.clone(), LearningRate::new(config));
         let chunks = norm_chunks(&policy.layout.nets());
-        let slices = exchange.slices(chunks.concat());
+        let slices = exchange.slices(&chunks.concat());
         Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, exchange, chunks, slices })
     }
 

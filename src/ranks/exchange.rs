@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::{Alone, Ranks, Slices};
+use super::{Alone, Ranks};
 
 /// The shards of a training, those of them that this rank computes, and the exchange with the other ranks. All ranks make the same
 /// calls in the same order. Copies share the count of their traffic.
@@ -100,19 +100,18 @@ impl Exchange {
     }
 
     /// Returns the number of this rank.
-    pub(super) fn number(&self) -> usize {
+    pub(super) fn rank(&self) -> usize {
         self.ranks.rank()
+    }
+
+    /// Returns the number of all ranks.
+    pub(super) fn ranks(&self) -> usize {
+        self.ranks.size()
     }
 
     /// Ends all ranks at once.
     pub(super) fn abort(&self) -> ! {
         self.ranks.abort()
-    }
-
-    /// Deals the chunks of an array, which follow one another, to the ranks.
-    pub fn slices(&self, chunks: Vec<Range<usize>>) -> Slices {
-        let ranks = self.ranks.size();
-        Slices::new(self.clone(), chunks, (self.ranks.rank(), ranks))
     }
 
     /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts are those of this

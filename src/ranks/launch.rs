@@ -80,7 +80,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
         return work(exchange);
     }
     if !exchange.is_first() {
-        os::speak_as(&format!("rank {}", exchange.number()));
+        os::speak_as(&format!("rank {}", exchange.rank()));
     }
     // To leave the others means to wait for them, and they may be waiting for this one.
     let result = catch_unwind(AssertUnwindSafe(|| work(exchange)));

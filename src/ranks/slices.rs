@@ -23,8 +23,15 @@ pub struct Slices {
     own: Range<usize>,
 }
 
+impl Exchange {
+    /// Deals the chunks of an array, which follow one another, to the ranks.
+    pub fn slices(&self, chunks: &[Range<usize>]) -> Slices {
+        Slices::new(self.clone(), chunks, (self.rank(), self.ranks()))
+    }
+}
+
 impl Slices {
-    pub(super) fn new(exchange: Exchange, chunks: Vec<Range<usize>>, (rank, ranks): (usize, usize)) -> Self {
+    fn new(exchange: Exchange, chunks: &[Range<usize>], (rank, ranks): (usize, usize)) -> Self {
         let begin =
             |chunk: usize| chunks.get(chunk).map_or_else(|| chunks.last().map_or(0, |last| last.end), |it| it.start);
         let dealt = (0..ranks).map(|rank| part(chunks.len(), rank, ranks));
@@ -88,7 +95,7 @@ mod tests {
             (8, vec![0..0, 0..5, 5..5, 5..10, 10..12, 12..12, 12..17, 17..20]),
         ] {
             let slices: Vec<Slices> =
-                (0..ranks).map(|rank| Slices::new(Exchange::alone(1), chunks.to_vec(), (rank, ranks))).collect();
+                (0..ranks).map(|rank| Slices::new(Exchange::alone(1), &chunks, (rank, ranks))).collect();
             assert_eq!(slices[0].all, expected, "{ranks} ranks");
             let dealt: Vec<Range<usize>> = slices.into_iter().flat_map(|slices| slices.chunks).collect();
             assert_eq!(dealt, chunks);

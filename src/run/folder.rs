@@ -151,9 +151,8 @@ impl RunFolder {
     pub fn claim(&self, lock: Locked) -> Result<Locked> {
         for entry in self.entries()? {
             let (path, name) = (entry.path(), entry.file_name());
-            // 0.1.0 named incomplete files after the files that they would become.
             let left = path.extension().is_some_and(|extension| extension == PARTIAL);
-            if left && (is_abandoned(&name.to_string_lossy()) || !name.as_encoded_bytes().starts_with(b".")) {
+            if left && is_abandoned(&name.to_string_lossy()) {
                 fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
             }
         }
@@ -354,18 +353,16 @@ mod tests {
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
         let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        // The names that 0.1.0 and this version use.
-        let left = ["iteration-00000020.safetensors.partial", ".shadow-repose-999999999-0.partial"];
-        let left = left.map(|name| run.checkpoints().folder().join(name));
-        left.iter().for_each(|half| fs::write(half, "half").unwrap());
+        let left = run.checkpoints().folder().join(".shadow-repose-999999999-0.partial");
+        fs::write(&left, "half").unwrap();
         let living = place.path().join(format!(".shadow-repose-{}-9999.partial", std::process::id()));
         fs::write(&living, "of a trace that is being written").unwrap();
         assert!(run.checkpoints().newest_first().is_empty());
         drop(lock);
         let lock = run.lock().unwrap();
-        assert!(left.iter().all(|half| half.exists()), "locking alone removes nothing");
+        assert!(left.exists(), "locking alone removes nothing");
         run.claim(lock).unwrap();
-        assert!(!left.iter().any(|half| half.exists()) && living.exists());
+        assert!(!left.exists() && living.exists());
     }
 
     #[test]

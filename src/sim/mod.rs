@@ -4,6 +4,7 @@
 
 mod compilation;
 mod fatal;
+mod fingerprint;
 mod finite;
 mod furnish;
 #[cfg(any(feature = "video", feature = "viewer"))]

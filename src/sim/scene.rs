@@ -11,6 +11,7 @@ use mujoco_rs::prelude::{
 use super::Look;
 use super::compilation::{Compilation, origin};
 use super::fatal::quieten_mujoco;
+use super::fingerprint::fingerprint;
 use super::finite::not_finite;
 use super::furnish::furnished;
 
@@ -116,14 +117,9 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Returns a checksum of the whole compiled scene.
-    ///
-    /// # Errors
-    /// Fails only if MuJoCo cannot write the scene to memory.
-    pub fn fingerprint(&self) -> Result<u64> {
-        let mut bytes = vec![0; self.model.size()];
-        self.model.save_to_buffer(&mut bytes)?;
-        Ok(crc32fast::hash(&bytes).into())
+    /// Returns a checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
+    pub fn fingerprint(&self) -> String {
+        fingerprint(&self.model)
     }
 
     /// Returns the size of the compiled scene in bytes.

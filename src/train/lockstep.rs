@@ -40,7 +40,7 @@ struct Vote {
 #[derive(Serialize, Deserialize)]
 struct Member {
     program: u32,
-    scene: u64,
+    scene: String,
     machine: Machine,
 }
 
@@ -83,7 +83,7 @@ impl Session {
             return Ok(None);
         }
         let program = if exchange.is_alone() { 0 } else { os::program_checksum() };
-        let all = exchange.all_gather(Member { program, scene: self.scene, machine: Machine::this() });
+        let all = exchange.all_gather(Member { program, scene: self.scene.clone(), machine: Machine::this() });
         for (rank, member) in all.iter().enumerate() {
             ensure!(member.program == all[0].program, "rank {rank} runs another program than rank 0");
             ensure!(member.scene == all[0].scene, "rank {rank} has another scene than rank 0");

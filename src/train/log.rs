@@ -1,6 +1,6 @@
 //! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
 
-use super::Outcome;
+use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
 use crate::quantities::quantity;
 use crate::repose::{EpisodeStats, Score};

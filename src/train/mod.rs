@@ -4,6 +4,7 @@ mod films;
 mod hints;
 mod lockstep;
 mod log;
+mod outcome;
 mod saver;
 mod session;
 mod start;
@@ -15,19 +16,19 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Error, Result, anyhow};
 
-use crate::agent::Iteration;
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, evaluate_together};
 use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::Evaluation;
-use crate::ranks::{self, Exchange, Traffic};
-use crate::repose::{EpisodeStats, Lesson, Repose, Score, StepSums, divergence};
+use crate::ranks::{self, Exchange};
+use crate::repose::{Repose, Score, StepSums, divergence};
 use crate::run::{Media, Report, RunFolder};
 use crate::schedule::panic_message;
 use hints::hints;
-use lockstep::{Decision, follow};
+use lockstep::follow;
 use log::{Ended, FILM, described, histograms, row, tags};
+use outcome::Outcome;
 use saver::Saver;
 use session::Session;
 
@@ -117,25 +118,6 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
     session.count_divergence();
     os::say(&format!("finished: {}; {}", saver.steps_made(), saver.folder().path().display()));
     Ok(ExitCode::SUCCESS)
-}
-
-/// The results of one iteration, over all processes unless stated otherwise.
-#[derive(Debug, Default)]
-struct Outcome {
-    /// The record of the iteration in this process.
-    iteration: Iteration<Lesson>,
-    /// The episodes that ended.
-    ended: Vec<EpisodeStats>,
-    /// The sums over its steps.
-    steps: StepSums,
-    /// The score of its evaluation, which has no episodes if there was none.
-    evaluation: Score,
-    /// The cost of the exchange with other processes while this one was collecting and learning.
-    traffic: Traffic,
-    /// Histograms and film of this process' environments.
-    media: Media,
-    /// What follows.
-    decision: Decision,
 }
 
 impl Session {

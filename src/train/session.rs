@@ -12,13 +12,10 @@ use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::load::MODEL;
 use crate::os::{self, Locked};
-use crate::ppo::{Array, Checkpoint, Evaluation};
+use crate::ppo::{Checkpoint, Evaluation};
 use crate::ranks::Exchange;
 use crate::repose::{Repose, Task};
 use crate::run::RunFolder;
-
-/// The name under which a checkpoint stores the fingerprint of its environments' scene.
-pub(super) const SCENE: &str = "scene";
 
 /// Everything that a training owns, except its saver.
 pub(super) struct Session {
@@ -39,7 +36,7 @@ pub(super) struct Session {
     /// Whether the steps that led to them are written.
     pub dumps: bool,
     /// The fingerprint of the scene.
-    pub scene: u64,
+    pub scene: String,
 }
 
 impl Session {
@@ -85,7 +82,7 @@ impl Session {
             let task = Task::new(&config.env)?;
             let films = if exchange.is_first() { Films::new(&config) } else { Films::none() };
             let agent = Agent::for_task(&task, &config, exchange)?;
-            let (scene, best) = (task.scene().fingerprint()?, None);
+            let (scene, best) = (task.scene().fingerprint(), None);
             let mut session = Self { config, task, agent, best, films, diverged: 0, warned: false, dumps, scene };
             session.start(from)?;
             Ok(session)
@@ -102,7 +99,7 @@ impl Session {
             StartFrom::Policy(checkpoint) => agent.ppo.begin_with(&checkpoint)?,
             StartFrom::State(mut checkpoint) => {
                 agent.restore(&mut checkpoint)?;
-                if checkpoint.take_counters(SCENE)? != [self.scene] && agent.exchange.is_first() {
+                if !checkpoint.is_of_scene(&self.scene) && agent.exchange.is_first() {
                     os::say(
                         "warning: the scene is not the one of the checkpoint: the resumed run is a different training",
                     );
@@ -121,7 +118,7 @@ impl Session {
     /// Returns the complete state at the end of the last iteration. All ranks call it together.
     pub(super) fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
-        checkpoint.insert(SCENE, Array::U64(vec![1], vec![self.scene]));
+        checkpoint.scene = Some(self.scene.clone());
         checkpoint
     }
 

@@ -7,7 +7,6 @@ use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 
 use super::saver::best_so_far;
-use super::session::SCENE;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, NetConfig, Override, PolicyConfig, user_file};
@@ -155,7 +154,7 @@ impl Plan {
         expect_states(&checkpoint, &parent)?;
         expect_kept(&parent, &config)?;
         absolute_model_path(&mut config)?;
-        expect_scene(&parent, &config, &mut checkpoint)?;
+        expect_scene(&parent, &config, &checkpoint)?;
         checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), SPACES, config.run.seed)?;
         let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
         let progress = &mut checkpoint.progress;
@@ -284,10 +283,10 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
 }
 
 /// Checks that the scene is that of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
-fn expect_scene(parent: &Config, config: &Config, checkpoint: &mut Checkpoint) -> Result<()> {
+fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
-    let same = checkpoint.take_counters(SCENE)? == [Task::new(&before)?.scene().fingerprint()?];
+    let same = checkpoint.is_of_scene(&Task::new(&before)?.scene().fingerprint());
     ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork keeps", config.env.model);
     Ok(())
 }

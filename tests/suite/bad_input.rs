@@ -139,7 +139,7 @@ fn a_checkpoint_that_was_made_to_harm_can_only_be_refused() {
         (set("learning_rate", &Array::F64(vec![1], vec![-1.0])), "its learning rate is -1"),
         (set("adam.steps", &Array::U64(vec![1], vec![u64::MAX])), "`adam.steps`"),
         (set("normalizer.variance", &Array::F64(vec![157], vec![-1.0; 157])), "`normalizer.variance`"),
-        (set("log_std", &Array::F64(vec![20], vec![1.0; 20])), "`log_std` must be of type F32"),
+        (set("log_std", &Array::F64(vec![20], vec![1.0; 20])), "`log_std` must hold the same F32 value"),
         (set("extra", &Array::U64(vec![1], vec![1])), "`extra` is not part of this policy"),
         (config("num_envs = 16", "num_envs = 32"), "cannot have made 128 steps"),
         (config("hidden = [16, 8]", "hidden = [16384, 16384, 8]"), "at most 2^25 weights"),

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use shadow_repose::ppo::{Checkpoint, Evaluation};
+use shadow_repose::ppo::{Checkpoint, Evaluation, sealed};
 
 use crate::support::{metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
 
@@ -231,79 +231,69 @@ fn the_same_training_writes_the_same_bytes() {
 }
 
 #[test]
-fn a_checkpoint_from_before_there_were_shards_is_resumed_with_a_line_that_says_so() {
+fn a_file_of_an_older_version_is_refused_by_one_sentence_that_names_the_version() {
     let folder = trained(&[]);
     let path = folder.path().join("run/checkpoints/latest.safetensors");
-    let mut older = Checkpoint::parse(&fs::read(&path).unwrap()).unwrap();
-    assert!(older.config.contains("shards = 16\n"), "{}", older.config);
-    older.config = older.config.replace("shards = 16\n", "");
-    fs::write(&path, older.to_bytes().unwrap()).unwrap();
-    let resume = ["train", "--resume", "run", "--total-steps", "384"];
-    let said = stderr(&succeeded(program(folder.path(), &resume)));
-    assert!(said.contains("the resumed run is not the same bit for bit"), "{said}");
-    let said = stderr(&succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512"])));
-    assert!(!said.contains("bit for bit"), "{said}");
-}
-
-/// Returns a folder with a run of version 0.1.0 in `old`: checkpoints of one hand, with nets of one neuron.
-fn of_0_1() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    let checkpoints = folder.path().join("old/checkpoints");
-    fs::create_dir_all(&checkpoints).unwrap();
-    let seeds = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/seeds");
-    for name in ["latest", "best", "iteration-00000000"] {
-        let path = checkpoints.join(format!("{name}.safetensors"));
-        fs::copy(seeds.join("checkpoint/bad-of-0.1.0"), path).unwrap();
-    }
-    fs::copy(seeds.join("policy/good-of-0.1.0"), folder.path().join("old/policy.safetensors")).unwrap();
-    folder
-}
-
-#[test]
-fn policies_and_runs_of_0_1_0_are_played_and_begun_with() {
-    let folder = of_0_1();
-    for place in ["old", "old/policy.safetensors", "old/checkpoints/latest.safetensors"] {
-        let play = ["play", "--ckpt", place, "--episodes", "1", "--json", "--set", "env.max_episode_seconds=0.1"];
-        assert_eq!(json(&succeeded(program(folder.path(), &play)))["episode_length"], 10.0, "{place}");
-        // The training has the policy's net, whatever the default is.
-        let args = ["--init", place, "--set", "env.num_envs=16", "--total-steps", "128", "--run-dir", "begun"];
-        succeeded(program(folder.path(), &[&["train"][..], &args].concat()));
-        let config = fs::read_to_string(folder.path().join("begun/config.toml")).unwrap();
-        assert!(config.contains("hidden = [1]") && config.contains("symmetry = \"none\""), "{config}");
-        fs::remove_dir_all(folder.path().join("begun")).unwrap();
+    let bytes = fs::read(&path).unwrap();
+    for (format, version) in [("checkpoint 2", "0.1.0"), ("checkpoint 3", "0.2.0")] {
+        let place = bytes.windows(12).position(|part| part == b"checkpoint 4").unwrap();
+        let mut older = bytes.clone();
+        older[place..place + 12].copy_from_slice(format.as_bytes());
+        fs::write(&path, sealed(&older).unwrap()).unwrap();
+        for args in [["train", "--resume", "run"], ["play", "--json", "--ckpt=run/checkpoints/latest.safetensors"]] {
+            let refused = program(folder.path(), &args);
+            assert_eq!(refused.status.code(), Some(1));
+            let said = stderr(&refused);
+            assert!(
+                said.contains(&format!("made by version {version}, whose files this version does not read")),
+                "{said}"
+            );
+        }
     }
 }
 
-#[test]
-fn runs_of_0_1_0_are_plotted() {
-    let folder = of_0_1();
-    let header = "iteration,env_steps,episode/goals,training/goal,training/goal_angle,episode/rot_dist,eval/goals,\
-                  episode/drop_rate,time/collect_s,time/update_s";
-    let table = format!("{header}\n1,16384,0,0,3.14,2.2,,0.1,0.5,0.3\n2,32768,0.1,0,3.14,2.1,0.2,0.1,0.5,0.3\n");
-    fs::write(folder.path().join("old/metrics.csv"), table).unwrap();
-    succeeded(program(folder.path(), &["plot", "old", "--smooth", "1"]));
-    succeeded(program(folder.path(), &["plot", "old", "--metric", "training/goal_angle", "--out", "angle.svg"]));
-}
+/// Puts back into a checkpoint what version 0.2.0 wrote besides.
+const AS_0_2_0: &str = "
+import json, struct, sys
+sys.path.insert(0, sys.argv[1])
+from provenance import read, write
+texts, arrays, data = read(sys.argv[2])
+texts.pop('scene', None)
+texts['format'] = 'shadow-repose checkpoint 3'
+texts['config'] = texts['config'].replace('symmetry = \"cube\"\\n', '')
+for name, kind, shape, more in [('scene', 'U64', [1], bytes(8))] + [
+    (f'adam.{moment}.log_std', 'F32', [20], bytes(80)) for moment in ('mean', 'square')
+]:
+    arrays[name] = {'dtype': kind, 'shape': shape, 'data_offsets': [len(data), len(data) + len(more)]}
+    data += more
+write(sys.argv[3], texts, arrays, data)
+";
 
 #[test]
-fn a_checkpoint_of_0_1_0_is_not_resumed_and_nothing_is_changed() {
-    let folder = of_0_1();
-    let run = folder.path().join("old");
-    let bytes = || -> Vec<(String, Vec<u8>)> {
-        let files =
-            [names(&run), names(&run.join("checkpoints")).iter().map(|name| format!("checkpoints/{name}")).collect()];
-        let files = files.concat().into_iter().filter(|name| name != "run.lock" && name != "checkpoints");
-        files.map(|name| (name.clone(), fs::read(run.join(name)).unwrap())).collect()
+fn a_checkpoint_of_0_2_0_is_converted_by_a_script_and_goes_on() {
+    let folder = trained(&["--set", "ppo.symmetry=none"]);
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
+    let latest = folder.path().join("run/checkpoints/latest.safetensors");
+    let [older, newer] = ["older", "newer"].map(|name| folder.path().join(name));
+    let python = |first: &std::ffi::OsStr, more: &[&Path]| {
+        let done = std::process::Command::new("python3").arg(first).args(more).output().unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     };
-    let before = bytes();
-    assert_eq!(before.len(), 4);
-    for place in ["old", "old/checkpoints/latest.safetensors"] {
-        let refused = program(folder.path(), &["train", "--resume", place]);
-        assert_eq!(refused.status.code(), Some(1));
-        assert!(stderr(&refused).contains("made by 0.1.0: resume it with that version"), "{}", stderr(&refused));
-        assert!(!stderr(&refused).contains("warning"), "it is not damaged: {}", stderr(&refused));
+    let script = folder.path().join("older.py");
+    fs::write(&script, AS_0_2_0).unwrap();
+    python(script.as_os_str(), &[&scripts, &latest, &older]);
+    python(scripts.join("convert").as_os_str(), &[&older, &newer]);
+    let [one, other] = [&latest, &newer].map(|path| Checkpoint::parse(&fs::read(path).unwrap()).unwrap());
+    assert!(other.config.contains("symmetry = \"none\"") && other.scene.is_none(), "{}", other.config);
+    for name in ["log_std", "envs.numbers", "adam.mean.actor.0.weight"] {
+        assert_eq!(one.shape(name), other.shape(name), "{name}");
     }
-    assert!(bytes() == before);
+    fs::copy(&newer, &latest).unwrap();
+    fs::remove_file(folder.path().join("run/config.toml")).unwrap();
+    succeeded(program(
+        folder.path(),
+        &["train", "--resume", "run/checkpoints/latest.safetensors", "--total-steps", "512"],
+    ));
 }
 
 #[test]

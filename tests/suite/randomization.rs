@@ -287,21 +287,6 @@ fn a_saved_environment_goes_on_with_its_draw_its_noise_and_the_actions_under_way
 }
 
 #[test]
-fn a_state_of_a_version_that_saved_no_draws_follows_from_the_share() {
-    let (mut env, _) = randomized(&[]);
-    played(&mut env, 3);
-    let mut state = EnvState::default();
-    env.save(&mut state);
-    // The counters end with five of the episode; the one before them says whether it is randomised.
-    let place = state.counters.len() - 6;
-    assert_eq!(state.counters.remove(place), 1);
-    let (mut other, _) = randomized(&[]);
-    let mut observation = vec![0.0; OBSERVATION_SIZE];
-    other.restore(&mut state.rows(1).unwrap().next().unwrap(), &mut observation).unwrap();
-    assert_eq!((other.draw(), other.draw().is_some()), (env.draw(), true));
-}
-
-#[test]
 fn randomised_episodes_begin_with_their_ramp_and_those_under_way_stay_what_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();

@@ -44,7 +44,7 @@ fn no_help_shows_what_its_command_does_not_do() {
 #[test]
 fn the_version_names_the_commit_and_mujoco() {
     let version = stdout(&["--version"]);
-    let inside = version.strip_prefix("shadow-repose 0.2.0 (").unwrap().strip_suffix(")\n").unwrap();
+    let inside = version.strip_prefix("shadow-repose 0.3.0 (").unwrap().strip_suffix(")\n").unwrap();
     let (commit, mujoco) = inside.split_once(", ").unwrap();
     assert!(!commit.is_empty() && mujoco == "MuJoCo 3.17.0", "{version}");
 }

@@ -1,0 +1,26 @@
+//! What an iteration of a training gives back.
+
+use super::lockstep::Decision;
+use crate::agent::Iteration;
+use crate::ranks::Traffic;
+use crate::repose::{EpisodeStats, Lesson, Score, StepSums};
+use crate::run::Media;
+
+/// The results of one iteration, over all processes unless stated otherwise.
+#[derive(Debug, Default)]
+pub(super) struct Outcome {
+    /// The record of the iteration in this process.
+    pub iteration: Iteration<Lesson>,
+    /// The episodes that ended.
+    pub ended: Vec<EpisodeStats>,
+    /// The sums over its steps.
+    pub steps: StepSums,
+    /// The score of its evaluation, which has no episodes if there was none.
+    pub evaluation: Score,
+    /// The cost of the exchange with other processes while this one was collecting and learning.
+    pub traffic: Traffic,
+    /// Histograms and film of this process' environments.
+    pub media: Media,
+    /// What follows.
+    pub decision: Decision,
+}
