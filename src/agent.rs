@@ -37,7 +37,7 @@ pub struct Agent<E: Env> {
     pub env_steps: u64,
     /// The point at which it was forked from another training, if it was.
     pub fork: Option<Fork>,
-    /// What deals environments and samples to this process, and adds up with others.
+    /// What deals environments and samples, and adds up with others.
     pub exchange: Exchange,
 }
 
@@ -85,7 +85,7 @@ impl Agent<Repose> {
 }
 
 impl<E: Env> Agent<E> {
-    /// Creates a learner and starts the first episodes of `envs`, those that `exchange` deals to this process. All randomness
+    /// Creates a learner and starts the first episodes of `envs`, those that `exchange` deals. All randomness
     /// follows from `seed`.
     ///
     /// # Errors
@@ -150,7 +150,7 @@ impl<E: Env> Agent<E> {
 
 impl<E: Resumable> Agent<E> {
     /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation. All
-    /// processes of a training call it together.
+    /// that exchange call it together.
     pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
         let progress = Progress { iteration, env_steps, best, fork };

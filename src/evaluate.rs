@@ -100,7 +100,7 @@ pub fn evaluate(
     Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
 }
 
-/// Plays the episodes, those that `exchange` deals to this process, and returns all of them, in order. Returns `None` if
+/// Plays the episodes, as far as `exchange` deals them here, and returns all of them, in order. Returns `None` if
 /// `interrupted` was set meanwhile.
 ///
 /// # Errors
@@ -120,7 +120,7 @@ pub fn evaluate_together(
 }
 
 /// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
-/// episode's result does not depend on which process plays it.
+/// episode's result does not depend on who plays it.
 fn play(
     task: &Arc<Task>,
     actor: &Actor,

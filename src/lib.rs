@@ -58,22 +58,20 @@
 //! ```
 //! Then the learner processes all blocks together:
 //! ```text
-//! rollout --ppo.update--> advantages, epochs × minibatches (equal parts from each shard) of (loss → flat gradient, summed
-//!                         over the shards as a tree → norm → Adam); then the normaliser
+//! rollout --ppo.update--> advantages, epochs × minibatches of (loss → flat gradient, summed over groups as a tree → norm
+//!                         → Adam); then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
 //! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
 //! `ppo::kernels` describes how a minibatch is computed; `ppo::candle` does the same with candle's tensors.
 //!
-//! With several ranks each step of this is computed by all of them, on their own shards; [`ranks`] describes what they tell one
-//! another.
+//! A training may be spread over several processes; [`ranks`] describes what they exchange.
 //!
 //! # Recovery
 //! At the end of each iteration [`train`] copies everything that the next one depends on into a [`ppo::Checkpoint`] with
 //! [`agent::Agent::checkpoint`]: the state of the learner and of the environments. If the following iteration fails or is
 //! stopped (a signal, a panic, a loss that is not finite), that checkpoint is the one to write. [`run`] writes it whole or
-//! not at all, under its number. Several ranks hand over their states only when that is due: if one fails, all end, and the last
-//! checkpoint is what remains. [`load`] is the only way to read such files; it also finds the newest undamaged one.
+//! not at all, under its number. [`load`] is the only way to read such files; it also finds the newest undamaged one.
 
 pub mod agent;
 pub mod bench;

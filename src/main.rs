@@ -39,7 +39,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints the help, the version or a usage error, and returns the exit code. Of several processes, one says it.
+/// Prints the help, the version or a usage error, and returns the exit code. One of several says it.
 fn tell(answer: &clap::Error) -> ExitCode {
     if !ranks::is_spokesman() {
         return ExitCode::from(answer.exit_code() as u8);

@@ -58,24 +58,12 @@ const OTHERS: [(&str, &str, &str); 22] = [
     (
         "time/exchange_s",
         "exchange (s)",
-        "Seconds of collecting and learning in which the first of several processes exchanged data with the others or waited.",
+        "Seconds of collecting and learning that the exchange took, waiting included; with MPI only.",
     ),
-    (
-        "time/exchange_bytes",
-        "exchange (bytes)",
-        "Bytes that the first of several processes sent to the others while collecting and learning.",
-    ),
+    ("time/exchange_bytes", "exchange (bytes)", "Bytes that were sent while collecting and learning; with MPI only."),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
-    (
-        "histogram/actions",
-        "actions",
-        "Actions of the iteration as drawn, before they are clipped to [-1, 1]; of several processes: those of the first.",
-    ),
-    (
-        "histogram/advantages",
-        "advantages",
-        "Advantages of the iteration, with mean 0 and standard deviation 1; of several processes: those of the first.",
-    ),
+    ("histogram/actions", "actions", "Actions of the iteration as drawn, before they are clipped to [-1, 1]."),
+    ("histogram/advantages", "advantages", "Advantages of the iteration, with mean 0 and standard deviation 1."),
     ("eval/film", "film", "The first evaluation episode with mean actions, at the speed of the simulation."),
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];

@@ -5,7 +5,7 @@ use serde_json::{Map, Value, json};
 use crate::config::EnvConfig;
 use crate::env::{End, Env};
 use crate::evaluate::Moment;
-use crate::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION};
+use crate::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION, add_settings};
 
 /// The number of records at which writing stops; episodes are written whole and in order.
 const ENOUGH: usize = 2000;
@@ -30,8 +30,6 @@ impl Trace {
             "max_consecutive_successes": config.max_consecutive_successes,
             "max_episode_steps": config.max_episode_steps(),
             "model": config.model,
-            "friction_scale": config.friction_scale,
-            "cube_mass_scale": config.cube_mass_scale,
             "checkpoint": checkpoint,
             "observation": OBSERVATION.map(|Group { name, start, length, unit }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
@@ -42,7 +40,7 @@ impl Trace {
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
         });
-        config.varied().for_each(|(key, value)| header[key] = json!(value));
+        add_settings(config, &mut header);
         Self { header, episodes: Vec::new(), last: usize::MAX }
     }
 

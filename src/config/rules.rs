@@ -9,8 +9,7 @@ use super::settings::{Backend, Config, Precision};
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule.
 
 /// Settings that must be above 0.
-const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.friction_scale env.cube_mass_scale env.hand_mass_scale env.cube_size_scale \
-    env.gains_scale env.damping_scale env.frictionloss_scale env.act_moving_average env.rot_eps env.success_tolerance \
+const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_eps env.success_tolerance \
     env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
 
 /// Settings that must be at least 0.
@@ -108,18 +107,16 @@ fn env(config: &Config, rules: &mut Rules) {
 
 fn randomization(config: &Config, rules: &mut Rules) {
     let drawn = &config.randomization;
-    for (key, [low, high]) in [
-        ("friction", drawn.friction),
-        ("cube_mass", drawn.cube_mass),
-        ("hand_mass", drawn.hand_mass),
-        ("cube_size", drawn.cube_size),
-        ("gains", drawn.gains),
-        ("damping", drawn.damping),
-        ("frictionloss", drawn.frictionloss),
-    ] {
-        let range = format!("[{low}, {high}]");
-        let rule = "be [low, high] with 0 < low <= high";
-        rules.check(0.0 < low && low <= high, &format!("randomization.{key}"), range, rule);
+    // A factor that is drawn from a range has a setting in [env], too.
+    let [all, task] =
+        [Table::try_from(drawn), Table::try_from(&config.env)].map(|of| of.expect("settings are a table"));
+    for (key, value) in &all {
+        let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice) else { continue };
+        let (name, range) = (format!("randomization.{key}"), format!("[{low}, {high}]"));
+        rules.check(0.0 < *low && low <= high, &name, range, "be [low, high] with 0 < low <= high");
+        let scale = format!("{key}_scale");
+        let factor = task[&scale].as_float().expect("a factor");
+        rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
     }
     let [low, high] = drawn.delay;
     let range = format!("[{low}, {high}]");

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use toml::{Table, Value};
 
 use super::ramp::Ramp;
 
@@ -73,24 +72,6 @@ pub struct EnvConfig {
 
 /// Values by the name of a group of the observation; groups that are not named have 0.
 pub type ByGroup = BTreeMap<String, f64>;
-
-/// The settings of the task that vary its physics, what is observed, and when actions take effect. A policy file or a checkpoint
-/// without one of them means its default: the nominal hand.
-pub const VARIED: [&str; 13] = [
-    "friction_scale",
-    "cube_mass_scale",
-    "hand_mass_scale",
-    "cube_size_scale",
-    "gains_scale",
-    "damping_scale",
-    "frictionloss_scale",
-    "cube_com",
-    "gravity",
-    "cone",
-    "action_delay",
-    "noise",
-    "bias",
-];
 
 /// The shape of the friction cones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -320,12 +301,6 @@ impl EnvConfig {
     /// Returns the number of control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
         (self.max_episode_seconds / self.ctrl_dt).round() as u32
-    }
-
-    /// Returns the settings of [`VARIED`] by name.
-    pub fn varied(&self) -> impl Iterator<Item = (&'static str, Value)> {
-        let mut table = Table::try_from(self).expect("settings are a table");
-        VARIED.into_iter().map(move |key| (key, table.remove(key).expect("a setting")))
     }
 
     /// Returns the path of the user's own scene, or `None` for the built-in one.

@@ -24,11 +24,11 @@ pub struct EnvPool<E: Env> {
 pub struct EnvBlock<E: Env> {
     slots: Vec<Slot<E>>,
     seed: u64,
-    /// The number of this block among the blocks of all processes.
+    /// The number of this block, counted over all that exchange.
     number: usize,
-    /// The number of its first environment among those of all processes.
+    /// The number of its first environment, counted likewise.
     first: usize,
-    /// The number of environments of all processes, by which the episode numbers of one environment increase.
+    /// The number of all environments, by which the episode numbers of one environment increase.
     stride: u64,
     finished: Vec<E::Episode>,
 }
@@ -59,7 +59,7 @@ impl<E: Env> EnvPool<E> {
         Self::in_blocks(seed, envs, blocks)
     }
 
-    /// Creates a pool of environments in these blocks, which other processes may continue.
+    /// Creates a pool of environments in these blocks.
     pub fn in_blocks(seed: u64, envs: Vec<E>, blocks: Blocks) -> Self {
         let (mut first, stride) = (blocks.first_env, blocks.envs as u64);
         let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
@@ -112,7 +112,7 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// Returns the number of the first environment among those of all processes.
+    /// Returns the number of the first environment.
     pub fn first(&self) -> usize {
         self.blocks[0].first
     }
@@ -134,7 +134,7 @@ impl<E: Resumable> EnvPool<E> {
         state
     }
 
-    /// Resumes, bit for bit, from the states of the environments of all processes, and writes the `observations` `[n, O]` of each
+    /// Resumes, bit for bit, from the states of all environments, and writes the `observations` `[n, O]` of each
     /// block to act on next.
     ///
     /// # Errors
@@ -163,7 +163,7 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// Returns the number of this block among the blocks of all processes.
+    /// Returns the number of this block.
     pub fn number(&self) -> usize {
         self.number
     }

@@ -224,7 +224,7 @@ impl Policy {
 
 impl Ppo {
     /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
-    /// progress of the run. All processes of a training call it together.
+    /// progress of the run. All that exchange call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
         let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, content };

@@ -68,7 +68,7 @@ pub struct Ppo {
     exchange: Exchange,
     /// The chunks of each net, by which the norm of the gradient is computed.
     chunks: Vec<Vec<Range<usize>>>,
-    /// The parameters that this process moves.
+    /// The parameters that are moved here.
     slices: Slices,
 }
 
@@ -296,7 +296,7 @@ impl Ppo {
         Ok((losses, grad_norm))
     }
 
-    /// Returns the mean losses of a minibatch of `count` samples, given the sums of each of this process' groups.
+    /// Returns the mean losses of a minibatch of `count` samples, given the sums of each group here.
     fn losses(&self, sums: &[LossSums], count: usize) -> LossSums {
         let add = |sum: &mut LossSums, more| *sum += more;
         let of_groups = |groups: &[LossSums]| {

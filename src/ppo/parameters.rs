@@ -1,6 +1,6 @@
 //! The location of each weight of a policy in the one array that holds them all.
 //!
-//! Code that treats all weights alike (the optimizer, the norm of a gradient, a sum over ranks) uses the array as a
+//! Code that treats all weights alike (the optimizer, the norm of a gradient, the exchange) uses the array as a
 //! whole; code that needs one of them uses its range.
 
 use std::ops::Range;

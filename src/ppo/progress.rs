@@ -30,9 +30,9 @@ pub struct Evaluation {
 impl Evaluation {
     /// Returns whether it is better than the best so far: more goals, or the same number with a smaller error.
     pub fn beats(self, best: Option<Self>) -> bool {
-        let rank = |it: Self| (it.goals, -it.rot_dist);
+        let order = |it: Self| (it.goals, -it.rot_dist);
         // If every episode diverged at once, there is no rotation error to compare.
-        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| rank(self) > rank(best))
+        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| order(self) > order(best))
     }
 }
 

@@ -10,6 +10,7 @@
 //! slices of all. Sums of losses, norms and statistics, the episodes that ended and the states of environments are gathered
 //! as bytes.
 
+mod alike;
 mod blocks;
 mod exchange;
 mod launch;

@@ -49,7 +49,7 @@ impl Conditions {
 
     /// Returns the control steps between an action and its effect.
     pub(super) fn delay(&self, task: &Task) -> usize {
-        (task.config.action_delay + self.draw.as_ref().map_or(0, |draw| draw.delay)) as usize
+        (task.config.action_delay + self.draw.as_ref().map_or(0, Draw::delay)) as usize
     }
 
     /// Returns the largest delay of any episode.

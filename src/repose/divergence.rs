@@ -2,6 +2,7 @@
 
 use serde_json::{Value, json};
 
+use super::physics::add_settings;
 use super::{ACTION_SIZE, Draw};
 use crate::config::EnvConfig;
 use crate::sim::{Simulation, SimulationState};
@@ -27,8 +28,6 @@ impl Diverged {
         let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
         let mut dump = json!({
             "model": config.model,
-            "friction_scale": config.friction_scale,
-            "cube_mass_scale": config.cube_mass_scale,
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
             "iteration": iteration,
@@ -38,21 +37,8 @@ impl Diverged {
             "ctrl": ctrl,
             "actions": actions,
         });
-        config.varied().for_each(|(key, value)| dump[key] = json!(value));
-        dump["randomization"] = self.draw.as_ref().map_or(Value::Null, |draw| {
-            json!({
-                "friction": draw.friction,
-                "cube_mass": draw.cube_mass,
-                "hand_mass": draw.hand_mass,
-                "cube_size": draw.cube_size,
-                "cube_com": draw.cube_com,
-                "gains": draw.gains,
-                "damping": draw.damping,
-                "frictionloss": draw.frictionloss,
-                "gravity": draw.gravity,
-                "delay": draw.delay,
-            })
-        });
+        add_settings(config, &mut dump);
+        dump["randomization"] = self.draw.as_ref().map_or(Value::Null, |draw| draw.physics.as_json());
         dump["pushes"] = json!(tail.pushes);
         format!("{dump}\n")
     }

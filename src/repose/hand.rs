@@ -35,6 +35,8 @@ pub struct Hand {
     pub driven: [Vec<usize>; ACTION_SIZE],
     /// Fingertips: index, middle, ring, little finger, thumb.
     pub fingertips: [Body; 5],
+    /// The body that carries the hand, an arm's included.
+    pub root: Body,
     /// The cube.
     pub cube: FreeJoint,
     /// The cube that shows the goal.
@@ -62,11 +64,13 @@ impl Hand {
             scene.origin(),
             scene.controls()
         );
+        let fingertips = each(FINGERTIPS, |tip| scene.body(tip))?;
         Ok(Self {
             joints,
             driven,
             actuators,
-            fingertips: each(FINGERTIPS, |tip| scene.body(tip))?,
+            fingertips,
+            root: scene.root(fingertips[0]),
             cube: scene.free_body(CUBE)?,
             target: scene.mocap("target")?,
         })

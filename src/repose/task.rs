@@ -6,9 +6,10 @@ use anyhow::{Context, Result};
 
 use super::Hand;
 use super::hand::CUBE;
+use super::physics::Physics;
 use super::sensing::Spread;
 use crate::config::{ConeSetting, EnvConfig};
-use crate::sim::{Compilation, Cone, Look, Scene, Variation};
+use crate::sim::{Compilation, Cone, Look, Scene};
 
 /// A scene, the hand in it, and the settings.
 pub struct Task {
@@ -42,7 +43,7 @@ impl Task {
     fn of(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
         let hand = Hand::bind(&scene)?;
         let nominal = scene;
-        let mut scene = nominal.varied(&variation(config, &nominal, &hand));
+        let mut scene = nominal.varied(&Physics::of_task(config).changes(&hand));
         if let Some(look) = look {
             scene.set_look(look, &nominal);
         }
@@ -77,7 +78,7 @@ impl Task {
         compilation.size *= size;
         compilation.shifts |= shifts;
         let scene = Scene::load(config.model_file(), &compilation)?;
-        Ok(scene.varied(&variation(config, &scene, &self.hand)))
+        Ok(scene.varied(&Physics::of_task(config).changes(&self.hand)))
     }
 }
 
@@ -90,21 +91,4 @@ fn compilation(config: &EnvConfig) -> Compilation {
     };
     let shifts = config.cube_com != [0.0; 3];
     Compilation { timestep: config.sim_dt, cone, object: CUBE, size: config.cube_size_scale, shifts }
-}
-
-/// Returns how a task varies the physics of its scene; what is not varied is not listed.
-fn variation(config: &EnvConfig, scene: &Scene, hand: &Hand) -> Variation {
-    let (cube, root) = (hand.cube.body, scene.root(hand.fingertips[0]));
-    let masses = [(cube, config.cube_mass_scale), (root, config.hand_mass_scale)];
-    let of_joints = |factor: f64| hand.joints.into_iter().map(move |joint| (joint, factor)).filter(|&(_, x)| x != 1.0);
-    let gains = hand.actuators.into_iter().map(|actuator| (actuator, config.gains_scale));
-    Variation {
-        friction: config.friction_scale,
-        masses: masses.into_iter().filter(|&(_, factor)| factor != 1.0).collect(),
-        shift: Some((cube, config.cube_com)).filter(|&(_, offset)| offset != [0.0; 3]),
-        gains: gains.filter(|&(_, factor)| factor != 1.0).collect(),
-        damping: of_joints(config.damping_scale).collect(),
-        frictionloss: of_joints(config.frictionloss_scale).collect(),
-        gravity: config.gravity,
-    }
 }

@@ -26,7 +26,7 @@ pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
 pub use simulation::{BareSimulation, Physics, Pose, Simulation, SimulationState, Velocity};
-pub use variation::{Variants, Variation};
+pub use variation::{Change, Variants};
 
 #[cfg(feature = "viewer")]
 pub use panel::{Controls, Gauge, Readout, SPEEDS, Trend};

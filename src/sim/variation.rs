@@ -13,88 +13,74 @@ use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::{Actuator, Body, Hinge, Scene, Simulation};
 
-/// Changes to the physics of a scene.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Variation {
+/// A change of the physics of a scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Change {
     /// The factor on the friction coefficients of every geom and every pair of geoms.
-    pub friction: f64,
-    /// Bodies, with the factor on the mass and inertia of each and of its descendants.
-    pub masses: Vec<(Body, f64)>,
-    /// A body, and the offset of its centre of mass in its own frame, m. The scene must have been compiled with
-    /// [`super::Compilation::shifts`] if the offset is not zero.
-    pub shift: Option<(Body, [f64; 3])>,
-    /// Position servos, with the factor on the stiffness (kp) of each.
-    pub gains: Vec<(Actuator, f64)>,
-    /// Joints, with the factor on the damping of each.
-    pub damping: Vec<(Hinge, f64)>,
-    /// Joints, with the factor on the friction loss of each.
-    pub frictionloss: Vec<(Hinge, f64)>,
+    Friction(f64),
+    /// The factor on the mass and inertia of a body and of its descendants.
+    Mass(Body, f64),
+    /// The offset of a body's centre of mass in its own frame, m. The scene must have been compiled with
+    /// [`super::Compilation::shifts`].
+    CentreOfMass(Body, [f64; 3]),
+    /// The factor on the stiffness (kp) of a position servo.
+    Gain(Actuator, f64),
+    /// The factor on the damping of a joint.
+    Damping(Hinge, f64),
+    /// The factor on the friction loss of a joint.
+    FrictionLoss(Hinge, f64),
     /// The acceleration that is added to gravity, m/s².
-    pub gravity: [f64; 3],
+    Gravity([f64; 3]),
 }
 
-impl Default for Variation {
-    /// Returns the variation that changes nothing.
-    fn default() -> Self {
-        Self {
-            friction: 1.0,
-            masses: Vec::new(),
-            shift: None,
-            gains: Vec::new(),
-            damping: Vec::new(),
-            frictionloss: Vec::new(),
-            gravity: [0.0; 3],
-        }
-    }
-}
-
-impl Variation {
+impl Change {
     /// Changes what MuJoCo does not derive other values from.
     fn apply(&self, model: &mut MjModel) {
         let scale = |values: &mut [f64], factor: f64| values.iter_mut().for_each(|x| *x *= factor);
-        scale(model.geom_friction_mut().as_flattened_mut(), self.friction);
-        scale(model.pair_friction_mut().as_flattened_mut(), self.friction);
-        for &(Body(top), factor) in &self.masses {
-            // Every body has a higher number than its parent.
-            let mut below = vec![false; model.nbody() as usize];
-            for body in top..below.len() {
-                below[body] = body == top || below[model.body_parentid()[body] as usize];
-                if below[body] {
-                    model.body_mass_mut()[body] *= factor;
-                    scale(&mut model.body_inertia_mut()[body], factor);
+        let add = |values: &mut [f64; 3], by: [f64; 3]| values.iter_mut().zip(by).for_each(|(x, by)| *x += by);
+        match *self {
+            Self::Friction(factor) => {
+                scale(model.geom_friction_mut().as_flattened_mut(), factor);
+                scale(model.pair_friction_mut().as_flattened_mut(), factor);
+            }
+            Self::Mass(Body(top), factor) => {
+                // Every body has a higher number than its parent.
+                let mut below = vec![false; model.nbody() as usize];
+                for body in top..below.len() {
+                    below[body] = body == top || below[model.body_parentid()[body] as usize];
+                    if below[body] {
+                        model.body_mass_mut()[body] *= factor;
+                        scale(&mut model.body_inertia_mut()[body], factor);
+                    }
                 }
             }
+            Self::CentreOfMass(Body(body), offset) => add(&mut model.body_ipos_mut()[body], offset),
+            Self::Gain(actuator, factor) => {
+                // SAFETY: this changes the stiffness of a position servo, which is not an index or a size.
+                unsafe { model.actuator_gainprm_mut()[actuator.id][0] *= factor };
+                model.actuator_biasprm_mut()[actuator.id][1] *= factor;
+            }
+            Self::Damping(joint, factor) => {
+                model.dof_damping_mut()[joint.dof] *= factor;
+                scale(&mut model.dof_dampingpoly_mut()[joint.dof], factor);
+            }
+            Self::FrictionLoss(joint, factor) => model.dof_frictionloss_mut()[joint.dof] *= factor,
+            Self::Gravity(by) => add(&mut model.opt_mut().gravity, by),
         }
-        if let Some((Body(body), offset)) = self.shift {
-            model.body_ipos_mut()[body].iter_mut().zip(offset).for_each(|(x, by)| *x += by);
-        }
-        for &(actuator, factor) in &self.gains {
-            // SAFETY: this changes the stiffness of a position servo, which is not an index or a size.
-            unsafe { model.actuator_gainprm_mut()[actuator.id][0] *= factor };
-            model.actuator_biasprm_mut()[actuator.id][1] *= factor;
-        }
-        for &(joint, factor) in &self.damping {
-            model.dof_damping_mut()[joint.dof] *= factor;
-            scale(&mut model.dof_dampingpoly_mut()[joint.dof], factor);
-        }
-        for &(joint, factor) in &self.frictionloss {
-            model.dof_frictionloss_mut()[joint.dof] *= factor;
-        }
-        model.opt_mut().gravity.iter_mut().zip(self.gravity).for_each(|(x, by)| *x += by);
     }
 
     /// Returns whether MuJoCo derives other values from what is changed, such as the scale of contact forces from the masses.
     fn is_structural(&self) -> bool {
-        self.masses.iter().any(|&(_, factor)| factor != 1.0) || self.shift.is_some_and(|(_, offset)| offset != [0.0; 3])
+        matches!(self, Self::Mass(..) | Self::CentreOfMass(..))
     }
 }
 
 impl Scene {
-    /// Returns this scene with a variation.
-    pub fn varied(&self, variation: &Variation) -> Self {
+    /// Returns this scene with these changes.
+    pub fn varied(&self, changes: &[Change]) -> Self {
         let mut model = (*self.model).clone();
-        variation.apply(&mut model);
-        if variation.is_structural() {
+        changes.iter().for_each(|change| change.apply(&mut model));
+        if changes.iter().any(Change::is_structural) {
             model = with_constants(MjData::new(Box::new(model)));
         }
         Self { model: Arc::new(model), origin: self.origin.clone() }
@@ -107,7 +93,7 @@ fn with_constants(mut data: MjData<Box<MjModel>>) -> MjModel {
     data.model().clone()
 }
 
-/// Scenes that simulations can switch between, each time with another variation.
+/// Scenes that simulations can switch between, each time with other changes.
 pub struct Variants {
     scenes: Vec<Scene>,
     /// Workspaces for updating the constants of a model, one for each thread that has needed one at the same time.
@@ -125,24 +111,24 @@ impl Variants {
         Ok(Self { scenes, workspaces: Mutex::default() })
     }
 
-    /// Returns a scene (by number) with a variation.
-    pub fn scene(&self, scene: usize, variation: &Variation) -> Scene {
-        self.scenes[scene].varied(variation)
+    /// Returns a scene (by number) with these changes.
+    pub fn scene(&self, scene: usize, changes: &[Change]) -> Scene {
+        self.scenes[scene].varied(changes)
     }
 
-    /// Gives `simulation` a model of its own, that of a scene (by number) with a variation, and resets its state.
+    /// Gives `simulation` a model of its own: a scene (by number) with these changes. Its state must be reset after it.
     ///
     /// # Panics
     /// Panics if the simulation belongs to another scene.
-    pub fn vary(&self, simulation: &mut Simulation, scene: usize, variation: &Variation) {
+    pub fn vary(&self, simulation: &mut Simulation, scene: usize, changes: &[Change]) {
         let scene = &self.scenes[scene].model;
         let mut model = simulation.take_own_model().unwrap_or_else(|| (**scene).clone());
         assert!(model.is_compatible_with_model(scene), "scenes that differ only in sizes");
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
         // process if they differ; both come from the same scene, so they do not.
         unsafe { mj_copyModel(model.ffi_mut(), scene.ffi()) };
-        variation.apply(&mut model);
-        if variation.is_structural() {
+        changes.iter().for_each(|change| change.apply(&mut model));
+        if changes.iter().any(Change::is_structural) {
             model = self.update_constants(model);
         }
         simulation.set_own_model(model);
@@ -172,8 +158,8 @@ mod tests {
         // The boxes in which contacts are searched are kept in the frame of the inertia; `mj_setConst` updates them.
         let compilation = Compilation { object: "cube", shifts: true, ..Compilation::plain(0.01) };
         let scene = Scene::load(None, &compilation).unwrap();
-        let shift = Some((scene.body("cube").unwrap(), [0.01, -0.004, 0.002]));
-        let shifted = scene.varied(&Variation { shift, ..Variation::default() }).model;
+        let shift = Change::CentreOfMass(scene.body("cube").unwrap(), [0.01, -0.004, 0.002]);
+        let shifted = scene.varied(&[shift]).model;
         let joint = "<freejoint name=\"cube\"/>";
         let inertia = "<inertial pos=\".01 -.004 .002\" mass=\".028\" diaginertia=\"1.16e-5 1.16e-5 1.16e-5\"/>";
         let compiled = MjModel::from_xml_string(&BUILTIN.replace(joint, &format!("{joint}{inertia}"))).unwrap();

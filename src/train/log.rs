@@ -29,7 +29,7 @@ impl Ended {
 
 /// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
 /// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings, with the traffic
-/// between processes if there are several.
+/// of the exchange.
 pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     let Outcome { iteration, steps, evaluation, traffic, .. } = outcome;
     let mut row = Vec::new();

@@ -37,7 +37,7 @@ use session::Session;
 ///
 /// # Errors
 /// Fails if settings, files or the scene cannot be used, if the run folder cannot be written to at the start or at the end, if a
-/// loss is not finite, or after a panic. One of several processes ends all others then, and does not return.
+/// loss is not finite, or after a panic. One of several ends all others then, and does not return.
 pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     ranks::together(|exchange| match exchange.is_first() {
         true => lead(args, requests, exchange),
@@ -45,7 +45,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     })
 }
 
-/// Trains as the process that reports and saves.
+/// Trains, reports and saves.
 fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     let (mut session, mut saver) = Session::lead(args, exchange)?;
     let place = saver.folder().path().display().to_string();
@@ -121,15 +121,15 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
 }
 
 impl Session {
-    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. The first process passes its
-    /// report and its folder. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
+    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Who leads passes the report
+    /// and the folder. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
     /// at the end of the previous one can be used.
     ///
     /// # Errors
-    /// Fails if a loss is not finite, after a panic, or if other processes do not have the same weights.
+    /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
     fn iterate(&mut self, requests: &Requests, place: Option<(&Report, &RunFolder)>) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
-        // One of several processes cannot stop alone in the middle of an iteration: the others wait for what it computes.
+        // With others, nobody can stop in the middle of an iteration: they wait for what is computed here.
         let never = AtomicBool::new(false);
         let stop = if self.agent.exchange.is_alone() { requests.stop() } else { &never };
         let iterate = || {

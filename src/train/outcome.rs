@@ -6,10 +6,10 @@ use crate::ranks::Traffic;
 use crate::repose::{EpisodeStats, Lesson, Score, StepSums};
 use crate::run::Media;
 
-/// The results of one iteration, over all processes unless stated otherwise.
+/// The results of one iteration, of all that exchange unless stated otherwise.
 #[derive(Debug, Default)]
 pub(super) struct Outcome {
-    /// The record of the iteration in this process.
+    /// The record of the iteration here.
     pub iteration: Iteration<Lesson>,
     /// The episodes that ended.
     pub ended: Vec<EpisodeStats>,
@@ -17,9 +17,9 @@ pub(super) struct Outcome {
     pub steps: StepSums,
     /// The score of its evaluation, which has no episodes if there was none.
     pub evaluation: Score,
-    /// The cost of the exchange with other processes while this one was collecting and learning.
+    /// The cost of the exchange while collecting and learning.
     pub traffic: Traffic,
-    /// Histograms and film of this process' environments.
+    /// Histograms and film of the environments here.
     pub media: Media,
     /// What follows.
     pub decision: Decision,

@@ -12,7 +12,7 @@ use crate::run::{Report, RunFolder};
 use crate::sim;
 
 /// The saver of a training. It always holds the state at the end of the last complete iteration, which is what remains if the
-/// next one does not complete; with several ranks, the state at which they last handed over theirs.
+/// next one does not complete; or the state that was last handed over.
 ///
 /// Nothing in the folder of a resumed run is changed before the first iteration is done: until then, anyone who named the wrong
 /// run or checkpoint can stop.

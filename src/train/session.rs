@@ -1,4 +1,4 @@
-//! A training that is set up: its environments and learner, on every rank; its saver, on the first.
+//! A training that is set up: its environments, learner and saver.
 
 use std::sync::Arc;
 
@@ -25,9 +25,9 @@ pub(super) struct Session {
     pub task: Arc<Task>,
     /// The environments and the learner.
     pub agent: Agent<Repose>,
-    /// The best evaluation so far; of a run that is resumed, only the first rank knows it.
+    /// The best evaluation so far.
     pub best: Option<Evaluation>,
-    /// The films of evaluation episodes, on the first rank.
+    /// The films of evaluation episodes.
     pub films: Films,
     /// The number of steps of this session on which the physics diverged.
     pub diverged: u64,
@@ -40,7 +40,7 @@ pub(super) struct Session {
 }
 
 impl Session {
-    /// Sets up the requested training and its saver, on the first rank.
+    /// Sets up the requested training and its saver.
     ///
     /// # Errors
     /// Fails as [`Plan::new_run`], [`Plan::resume`], [`Plan::fork`] and [`Session::new`] do, or if the run folder cannot be
@@ -53,9 +53,10 @@ impl Session {
         };
         let exchange = exchange.clone().over(plan.config.shards())?;
         Plan::broadcast(Some(&plan), &exchange)?;
-        os::start_threads(plan.config.run.threads)?;
+        let threads = plan.config.run.threads;
+        os::start_threads(threads)?;
         let mut session = Self::new(plan, exchange)?;
-        if let Some(warning) = session.expect_alike()? {
+        if let Some(warning) = session.agent.exchange.expect_alike(&session.scene)?.filter(|_| threads == 0) {
             os::say(&format!("warning: {warning}"));
         }
         // A new folder is created last, so that a training that cannot be set up leaves none behind.
@@ -70,14 +71,14 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Sets up the planned training, on any rank.
+    /// Sets up the planned training.
     ///
     /// # Errors
     /// Fails if the scene or the precision cannot be used, or if it cannot start from what is planned.
     pub(super) fn new(plan: Plan, exchange: Exchange) -> Result<Self> {
         let Plan { mut config, from, context, dumps } = plan;
         let set_up = || {
-            // The saved configuration contains the actual number of shards.
+            // As it is saved.
             config.run.shards = config.shards();
             let task = Task::new(&config.env)?;
             let films = if exchange.is_first() { Films::new(&config) } else { Films::none() };
@@ -115,7 +116,7 @@ impl Session {
         Ok(())
     }
 
-    /// Returns the complete state at the end of the last iteration. All ranks call it together.
+    /// Returns the complete state at the end of the last iteration.
     pub(super) fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
         checkpoint.scene = Some(self.scene.clone());

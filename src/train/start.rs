@@ -1,5 +1,5 @@
-//! What a training starts from: settings, and a policy or a state. The first rank decides it, and the others receive it, so that
-//! nothing can differ between them and only the first needs the files.
+//! What a training starts from: settings, and a policy or a state. Only who leads a training needs the files; others receive the
+//! plan.
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ use crate::ranks::Exchange;
 use crate::repose::{SPACES, Task};
 use crate::run::{self, RunFolder};
 
-/// The settings of a training and what it starts from, the same on all ranks.
+/// The settings of a training and what it starts from.
 pub(super) struct Plan {
     /// The settings of the run.
     pub config: Config,
@@ -53,7 +53,7 @@ pub(super) struct Existing {
     pub best: Option<Evaluation>,
 }
 
-/// A plan as the first rank sends it.
+/// A plan as it is sent.
 #[derive(Serialize, Deserialize)]
 struct Message {
     config: String,
@@ -172,10 +172,10 @@ impl Plan {
         Ok(Self { from: from_state, context, ..Self::new(config, args) })
     }
 
-    /// Sends the plan of the first rank to all others, which pass `None`.
+    /// Sends the plan to all that pass `None`.
     ///
     /// # Errors
-    /// Fails if a value in the checkpoint is not finite, or if the first rank runs another version of the program.
+    /// Fails if a value in the checkpoint is not finite, or if the sender runs another version of the program.
     pub(super) fn broadcast(plan: Option<&Self>, exchange: &Exchange) -> Result<Option<Self>> {
         if exchange.is_alone() {
             return Ok(None);
@@ -185,7 +185,7 @@ impl Plan {
             return Ok(None);
         }
         let Message { config, checkpoint, parent, starts_from_state, context, dumps } = message;
-        let parse = |text: &str| Config::from_text(Path::new("the settings of rank 0"), text, &[]);
+        let parse = |text: &str| Config::from_text(Path::new("the settings that were sent"), text, &[]);
         let checkpoint = checkpoint.map(|bytes| Checkpoint::parse(&bytes)).transpose()?;
         let from = match (checkpoint, &parent) {
             (None, _) => StartFrom::Scratch,

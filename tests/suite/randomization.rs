@@ -207,19 +207,24 @@ fn draws_fill_their_ranges_in_the_share_of_the_episodes_that_was_asked() {
         assert!((below - 0.5).abs() < 0.05, "{name}: {below} below {middle}");
     };
     let of = |value: &dyn Fn(&Draw) -> f64| draws.iter().map(value).collect::<Vec<f64>>();
-    check("friction", of(&|draw| draw.friction), [0.7, 1.3], 1.0);
-    check("cube_mass", of(&|draw| draw.cube_mass), [0.5, 1.5], 1.0);
-    check("cube_com", of(&|draw| draw.cube_com[1]), [-0.003, 0.003], 0.0);
+    check("friction", of(&|draw| draw.physics["friction"][0]), [0.7, 1.3], 1.0);
+    check("cube_mass", of(&|draw| draw.physics["cube_mass"][0]), [0.5, 1.5], 1.0);
+    check("cube_com", of(&|draw| draw.physics["cube_com"][1]), [-0.003, 0.003], 0.0);
     // Uniform in the logarithm: as often below the geometric mean as above it.
-    check("gains", of(&|draw| draw.gains[7]), [0.75, 1.5], 1.125_f64.sqrt());
-    check("damping", of(&|draw| draw.damping[20]), [0.3, 3.0], 0.9_f64.sqrt());
-    let sizes: std::collections::BTreeSet<u64> = draws.iter().map(|draw| (1000.0 * draw.cube_size) as u64).collect();
+    check("gains", of(&|draw| draw.physics["gains"][7]), [0.75, 1.5], 1.125_f64.sqrt());
+    check("damping", of(&|draw| draw.physics["damping"][20]), [0.3, 3.0], 0.9_f64.sqrt());
+    let sizes: std::collections::BTreeSet<u64> =
+        draws.iter().map(|draw| (1000.0 * draw.physics["cube_size"][0]) as u64).collect();
     assert_eq!(sizes.into_iter().collect::<Vec<_>>(), [950, 975, 1000, 1025, 1050]);
-    let delays = [0, 1, 2, 3].map(|delay| draws.iter().filter(|draw| draw.delay == delay).count());
+    let delays = [0, 1, 2, 3].map(|delay| draws.iter().filter(|draw| draw.delay() == delay).count());
     assert!(delays.iter().all(|count| (600..900).contains(count)), "{delays:?}");
-    let alike = draws.iter().filter(|draw| draw.damping.iter().all(|factor| *factor == draw.damping[0])).count();
+    let alike = draws
+        .iter()
+        .filter(|draw| draw.physics["damping"].iter().all(|factor| *factor == draw.physics["damping"][0]))
+        .count();
     assert!((0.45..0.55).contains(&(alike as f64 / draws.len() as f64)), "one factor for all joints: {alike}");
-    let gravity = (draws.iter().map(|draw| draw.gravity[2].powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
+    let gravity =
+        (draws.iter().map(|draw| draw.physics["gravity"][2].powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
     assert!((gravity - 0.4).abs() < 0.02, "{gravity}");
 }
 
@@ -229,12 +234,14 @@ fn one_setting_does_not_change_what_is_drawn_for_another() {
         [&[][..], &["randomization.friction=[1,1]", "randomization.delay=[0,1]"]].map(randomized);
     for episode in 0..20 {
         let (draw, other) = (draw(episode).unwrap(), other(episode).unwrap());
-        assert_eq!((draw.cube_mass, &draw.damping, draw.gravity), (other.cube_mass, &other.damping, other.gravity));
-        assert_eq!(other.friction, 1.0);
+        ["cube_mass", "damping", "gravity"].iter().for_each(|name| assert_eq!(draw.physics[name], other.physics[name]));
+        assert_eq!(other.physics["friction"], [1.0]);
     }
     let (_, few) = randomized(&["randomization.each=0.25"]);
-    let varied =
-        |draw: Draw| u32::from(draw.friction != 1.0) + u32::from(draw.damping[0] != 1.0) + u32::from(draw.has_noise);
+    let varied = |draw: Draw| {
+        ["friction", "damping"].iter().filter(|name| draw.physics[name][0] != 1.0).count() as u32
+            + u32::from(draw.has_noise)
+    };
     let mean = (0..2000).map(|episode| varied(few(episode).unwrap())).sum::<u32>() as f64 / 2000.0;
     assert!((mean - 0.75).abs() < 0.1, "{mean} of three are varied");
 }

@@ -1,0 +1,234 @@
+//! The physical quantities that may differ from those of the scene, as one table: what `[env]` sets for the whole task, what a
+//! randomised episode draws, and what traces and dumps report.
+
+use std::ops::Index;
+
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+use serde_json::{Map, Value, json};
+use toml::Table;
+
+use super::hand::{ACTION_SIZE, Hand, JOINTS};
+use crate::config::{EnvConfig, RandomizationConfig};
+use crate::rng::{self, Rng};
+use crate::sim::Change;
+
+/// A quantity. What it changes is applied to the scene of the task, so a draw comes on top of what the task sets.
+pub struct Quantity {
+    /// Its name in `[randomization]` and in dumps.
+    pub name: &'static str,
+    /// Its name in `[env]`, in traces and in dumps.
+    pub setting: &'static str,
+    /// Its unit; 1 for a factor.
+    pub unit: &'static str,
+    /// The value that changes nothing.
+    pub neutral: f64,
+    /// The value for the whole task.
+    task: fn(&EnvConfig) -> Vec<f64>,
+    law: Law,
+    /// What its values change in a scene: one value, one for each axis, for each actuator in action order, or for each joint in
+    /// observation order. A single value is valid for all actuators or joints.
+    change: fn(&Hand, &[f64]) -> Vec<Change>,
+}
+
+/// How a quantity is drawn.
+enum Law {
+    /// Uniformly between two factors.
+    Uniform(fn(&RandomizationConfig) -> [f64; 2]),
+    /// One of [`SIZES`] factors. Each is a compiled scene, because MuJoCo cannot change sizes in a compiled one.
+    Size(fn(&RandomizationConfig) -> [f64; 2]),
+    /// A whole number from one to another.
+    Whole(fn(&RandomizationConfig) -> [u32; 2]),
+    /// For each axis, uniformly within this distance of zero.
+    Within(fn(&RandomizationConfig) -> f64),
+    /// For each axis, normally with this standard deviation.
+    Normal(fn(&RandomizationConfig) -> f64),
+    /// This number of factors, each uniformly in its logarithm.
+    Each(usize, fn(&RandomizationConfig) -> [f64; 2]),
+}
+
+/// The number of sizes of the cube.
+const SIZES: usize = 5;
+
+/// The quantities that one generator draws, one after another. Each later one has its own, so that a new quantity does not
+/// change what is drawn for the others.
+pub(super) const SHARED: usize = 10;
+
+fn none(_: &Hand, _: &[f64]) -> Vec<Change> {
+    Vec::new()
+}
+
+/// Returns the changes of each of these parts, given one value for all of them or one for each.
+fn each<T: Copy, const N: usize>(parts: [T; N], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
+    parts.into_iter().zip(values.iter().cycle()).map(|(part, &value)| change(part, value)).collect()
+}
+
+fn vector(values: &[f64]) -> [f64; 3] {
+    values.try_into().expect("three axes")
+}
+
+/// All quantities, in the order in which they are drawn.
+#[rustfmt::skip]
+pub const QUANTITIES: [Quantity; 10] = [
+    Quantity { name: "friction", setting: "friction_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.friction_scale], law: Law::Uniform(|drawn| drawn.friction),
+        change: |_, x| vec![Change::Friction(x[0])] },
+    Quantity { name: "cube_mass", setting: "cube_mass_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.cube_mass_scale], law: Law::Uniform(|drawn| drawn.cube_mass),
+        change: |hand, x| vec![Change::Mass(hand.cube.body, x[0])] },
+    Quantity { name: "hand_mass", setting: "hand_mass_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.hand_mass_scale], law: Law::Uniform(|drawn| drawn.hand_mass),
+        change: |hand, x| vec![Change::Mass(hand.root, x[0])] },
+    Quantity { name: "cube_size", setting: "cube_size_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.cube_size_scale], law: Law::Size(|drawn| drawn.cube_size), change: none },
+    Quantity { name: "delay", setting: "action_delay", unit: "control steps", neutral: 0.0,
+        task: |env| vec![f64::from(env.action_delay)], law: Law::Whole(|drawn| drawn.delay), change: none },
+    Quantity { name: "cube_com", setting: "cube_com", unit: "m", neutral: 0.0,
+        task: |env| env.cube_com.into(), law: Law::Within(|drawn| drawn.cube_com),
+        change: |hand, x| vec![Change::CentreOfMass(hand.cube.body, vector(x))] },
+    Quantity { name: "gravity", setting: "gravity", unit: "m/s^2", neutral: 0.0,
+        task: |env| env.gravity.into(), law: Law::Normal(|drawn| drawn.gravity),
+        change: |_, x| vec![Change::Gravity(vector(x))] },
+    Quantity { name: "gains", setting: "gains_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.gains_scale], law: Law::Each(ACTION_SIZE, |drawn| drawn.gains),
+        change: |hand, x| each(hand.actuators, x, Change::Gain) },
+    Quantity { name: "damping", setting: "damping_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.damping_scale], law: Law::Each(JOINTS.len(), |drawn| drawn.damping),
+        change: |hand, x| each(hand.joints, x, Change::Damping) },
+    Quantity { name: "frictionloss", setting: "frictionloss_scale", unit: "1", neutral: 1.0,
+        task: |env| vec![env.frictionloss_scale], law: Law::Each(JOINTS.len(), |drawn| drawn.frictionloss),
+        change: |hand, x| each(hand.joints, x, Change::FrictionLoss) },
+];
+
+/// Settings of `[env]` that vary what is simulated or observed and are no quantities.
+const OTHERS: [&str; 3] = ["cone", "noise", "bias"];
+
+impl Quantity {
+    fn count(&self) -> usize {
+        match self.law {
+            Law::Uniform(_) | Law::Size(_) | Law::Whole(_) => 1,
+            Law::Within(_) | Law::Normal(_) => 3,
+            Law::Each(count, _) => count,
+        }
+    }
+
+    /// Draws the values of an episode.
+    pub(super) fn draw(&self, config: &RandomizationConfig, rng: &mut Rng) -> Vec<f64> {
+        let axes = 0..3;
+        match &self.law {
+            Law::Uniform(range) => {
+                let [low, high] = range(config);
+                vec![rng::uniform(rng, low, high)]
+            }
+            Law::Size(range) => {
+                let sizes = sizes(range(config));
+                vec![sizes[(rng::uniform(rng, 0.0, 1.0) * sizes.len() as f64) as usize]]
+            }
+            Law::Whole(range) => {
+                let [low, high] = range(config);
+                vec![f64::from(rng.random_range(low..=high))]
+            }
+            Law::Within(limit) => axes.map(|_| rng::uniform(rng, -limit(config), limit(config))).collect(),
+            Law::Normal(std) => axes.map(|_| normal(rng, std(config))).collect(),
+            // With probability ½ all joints have the same factor. Independent draws alone would leave their mean near the middle,
+            // and a policy that has met only such hands fails on one whose joints are all damped little.
+            Law::Each(count, range) => {
+                let [low, high] = range(config);
+                let together = rng::uniform(rng, 0.0, 1.0) < 0.5;
+                let own: Vec<f64> = (0..*count).map(|_| rng::uniform(rng, low.ln(), high.ln()).exp()).collect();
+                if together { vec![own[0]; *count] } else { own }
+            }
+        }
+    }
+}
+
+/// Returns the factors on the lengths of the cube that are drawn.
+pub(super) fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
+    let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
+    if low == high { vec![low] } else { (0..SIZES).map(place).collect() }
+}
+
+pub(super) fn normal(rng: &mut Rng, std: f64) -> f64 {
+    std * Distribution::<f64>::sample(&StandardNormal, rng)
+}
+
+/// The values of all quantities.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Physics(Vec<Vec<f64>>);
+
+impl Physics {
+    /// Returns the physics of the scene as it is.
+    pub(super) fn neutral() -> Self {
+        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral; quantity.count()]).collect())
+    }
+
+    /// Returns the physics that a task sets.
+    pub(super) fn of_task(config: &EnvConfig) -> Self {
+        Self(QUANTITIES.iter().map(|quantity| (quantity.task)(config)).collect())
+    }
+
+    /// Sets the values of a quantity, by its place in the table.
+    pub(super) fn set(&mut self, place: usize, values: Vec<f64>) {
+        self.0[place] = values;
+    }
+
+    /// Returns what it changes in a scene.
+    pub(super) fn changes(&self, hand: &Hand) -> Vec<Change> {
+        let differ = QUANTITIES.iter().zip(&self.0).filter(|(of, values)| values.iter().any(|x| *x != of.neutral));
+        differ.flat_map(|(quantity, values)| (quantity.change)(hand, values)).collect()
+    }
+
+    /// Returns the values by name, as a dump reports them.
+    pub(super) fn as_json(&self) -> Value {
+        let value = |(quantity, values): (&Quantity, &Vec<f64>)| {
+            let value = match quantity.law {
+                Law::Whole(_) => json!(values[0] as u64),
+                _ if quantity.count() == 1 => json!(values[0]),
+                _ => json!(values),
+            };
+            (quantity.name.to_owned(), value)
+        };
+        Map::from_iter(QUANTITIES.iter().zip(&self.0).map(value)).into()
+    }
+}
+
+impl Index<&str> for Physics {
+    type Output = [f64];
+
+    /// # Panics
+    /// Panics if there is no quantity of this name.
+    fn index(&self, name: &str) -> &[f64] {
+        let place = QUANTITIES.iter().position(|quantity| quantity.name == name);
+        &self.0[place.unwrap_or_else(|| panic!("no quantity is called {name}"))]
+    }
+}
+
+/// Adds to a JSON object the settings of a task that vary its physics, what is observed, and when actions take effect.
+pub fn add_settings(config: &EnvConfig, object: &mut Value) {
+    let table = Table::try_from(config).expect("settings are a table");
+    let names = QUANTITIES.iter().map(|quantity| quantity.setting).chain(OTHERS);
+    names.for_each(|name| object[name] = json!(table[name]));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn the_physics_of_the_default_task_are_those_of_the_scene() {
+        let config = Config::resolve(None, &[]).unwrap();
+        for (quantity, values) in QUANTITIES.iter().zip(Physics::of_task(&config.env).0) {
+            assert!(values.iter().all(|x| *x == quantity.neutral), "{}", quantity.name);
+        }
+    }
+
+    #[test]
+    fn every_quantity_has_its_two_settings() {
+        let config = Config::resolve(None, &[]).unwrap();
+        let [env, drawn] = [Table::try_from(&config.env).unwrap(), Table::try_from(&config.randomization).unwrap()];
+        for Quantity { name, setting, unit, .. } in &QUANTITIES {
+            assert!(env.contains_key(*setting) && drawn.contains_key(*name) && !unit.is_empty(), "{name}, {setting}");
+        }
+    }
+}
