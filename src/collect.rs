@@ -84,7 +84,7 @@ impl<E: Env> Collecting<'_, E> {
         self.envs.step(&rollout.actions[actions], buffers)?;
         rollout.dones[row.clone()].iter_mut().zip(&*ends).for_each(|(done, end)| *done = end.is_some());
         let cut_off = ends.iter().map(|&end| matches!(end, Some(End::Truncated | End::Redirected)));
-        acting.settle(&mut rollout.rewards[row], cut_off, final_observations, work);
+        acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, final_observations, work);
         if last {
             acting.finish(rollout, t + 1, work);
         }

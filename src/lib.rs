@@ -13,17 +13,17 @@
 //! | module | what it is | imports |
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, evaluate, load, os, ppo, quantities, ranks, repose, run, schedule, see, sim |
-//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, load, os, pace, repose, robustness, see, sim, trace |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, evaluate, load, os, ppo, tags, ranks, repose, run, schedule, see, sim |
+//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, load, os, goal_times, repose, robustness, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, load, os, ppo, repose, spaces |
-//! | [`mod@plot`] | learning curves of runs | cli, draw, os, quantities, run |
+//! | [`mod@plot`] | learning curves of runs | cli, draw, os, tags, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
 //! | [`see`] | rendering of the task: window, film, picture | cli, config, draw, env, evaluate, os, repose, run, sim |
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
-//! | [`pace`] | statistics of the time to reach a goal | config, env, evaluate |
+//! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks, repose |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, repose, rng, schedule, sim |
 //! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
@@ -37,7 +37,7 @@
 //! | [`run`] | the folder of a run and its logs | os |
 //! | [`draw`] | charts, films and pictures as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |
-//! | [`quantities`] | what a training logs: names, meanings, units | repose |
+//! | [`tags`] | what a training logs: names, meanings, units | repose |
 //! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | os, rng, schedule |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
@@ -54,7 +54,7 @@
 //! ```text
 //! observations[t] --acting.act--> actions[t], log_probs[t], values[t]
 //! actions[t] --envs.step--> rewards[t], ends, observations[t + 1] (of the new episode if one ended), final observations
-//! rewards[t] --acting.settle--> scaled; + γ V(final observation) if the episode was truncated or its goal replaced
+//! rewards[t] --acting.scale_and_bootstrap--> scaled; + γ V(final observation) if the episode was truncated or its goal replaced
 //! ```
 //! Then the learner processes all blocks together:
 //! ```text
@@ -82,14 +82,13 @@ pub mod draw;
 pub mod env;
 pub mod evaluate;
 pub mod export;
+pub mod goal_times;
 pub mod load;
 pub mod manual;
 pub mod os;
-pub mod pace;
 pub mod play;
 pub mod plot;
 pub mod ppo;
-pub mod quantities;
 pub mod quat;
 pub mod ranks;
 pub mod repose;
@@ -100,6 +99,7 @@ pub mod schedule;
 pub mod see;
 pub mod sim;
 pub mod spaces;
+pub mod tags;
 pub mod trace;
 pub mod train;
 pub mod view;

@@ -47,20 +47,20 @@ static BUILTIN: [BuiltIn; 2] = [
 
 /// The source of a policy.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Origin {
+pub enum PolicySource {
     /// A policy that is built into the program.
     BuiltIn(&'static BuiltIn),
     /// A checkpoint, or a file with only a policy.
     File(PathBuf),
 }
 
-impl Origin {
+impl PolicySource {
     /// Returns the origin that `place` names: `builtin`, `robust` unless there is such a file or folder, a file, or a run folder,
     /// which stands for its best checkpoint or, if there is none yet, its latest.
     ///
     /// # Errors
     /// Fails if there is no such file, run folder or checkpoint.
-    pub fn of(place: &Path) -> Result<Self> {
+    pub fn find(place: &Path) -> Result<Self> {
         match BUILTIN.iter().position(|policy| place == Path::new(policy.name)) {
             // Other names may be those of runs, made before a policy had them.
             Some(i) if i == 0 || !place.exists() => Ok(Self::BuiltIn(&BUILTIN[i])),
@@ -79,7 +79,7 @@ impl Origin {
     /// Reads the policy for use in any scene, whatever the one in which it was trained.
     ///
     /// # Errors
-    /// Fails as [`Origin::load`] does.
+    /// Fails as [`PolicySource::load`] does.
     pub fn load_for_any_scene(&self) -> Result<(Checkpoint, PolicyConfig)> {
         self.load(&[Override { key: MODEL.into(), value: BUILTIN_MODEL.into() }])
     }
@@ -103,7 +103,7 @@ impl Origin {
     }
 }
 
-impl fmt::Display for Origin {
+impl fmt::Display for PolicySource {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
             Self::BuiltIn(policy) => f.write_str(policy.place),
@@ -115,7 +115,7 @@ impl fmt::Display for Origin {
 /// A policy, and the task that it was trained for, overlaid with `--set`.
 pub struct Loaded {
     /// Where it comes from.
-    pub origin: Origin,
+    pub origin: PolicySource,
     /// What a user is told that it is.
     pub name: String,
     /// The settings of the task.
@@ -130,22 +130,22 @@ impl Loaded {
     /// Loads the policy from `place`, by default from the newest run, or the built-in one if there is no run.
     ///
     /// # Errors
-    /// Fails as [`Origin::of`] and [`Origin::load`] do, or if the policy's numbers cannot be used.
+    /// Fails as [`PolicySource::of`] and [`PolicySource::load`] do, or if the policy's numbers cannot be used.
     pub fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
         let origin = match (place, run::newest_run()) {
-            (Some(place), _) => Origin::of(place)?,
-            (None, Some(newest)) => Origin::of(&newest)?,
+            (Some(place), _) => PolicySource::find(place)?,
+            (None, Some(newest)) => PolicySource::find(&newest)?,
             (None, None) => {
                 os::say("there is no run here: taking the built-in policy");
-                Origin::BuiltIn(&BUILTIN[0])
+                PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
         let policy = Policy::load(&config.net, SPACES, &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let name = match &origin {
-            Origin::BuiltIn(policy) => policy.title.to_owned(),
-            Origin::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
+            PolicySource::BuiltIn(policy) => policy.title.to_owned(),
+            PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
         Ok(Self { origin, name, config: config.env, policy, checkpoint })
     }

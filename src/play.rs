@@ -12,12 +12,12 @@ use serde_json::{Map, Value, json};
 use crate::cli::{Baseline, PlayArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, evaluate};
+use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
 use crate::os::{self, Requests};
-use crate::pace::Pace;
 use crate::repose::{Score, Task};
 use crate::robustness::robustness;
-use crate::see::{Film, HAS_WINDOWS, Window, task_to_see};
+use crate::see::{Film, HAS_WINDOWS, Window, task_for_display};
 use crate::sim::Quality;
 use crate::trace::Trace;
 
@@ -70,12 +70,12 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     // Opened before playing, so that a path that cannot be written to does not cost the score.
     let output = args.trace.as_deref().map(os::OutputFile::create).transpose()?;
     let mut trace = output.as_ref().map(|_| Trace::new(config, checkpoint.as_deref()));
-    let mut pace = Pace::new(config);
+    let mut goal_times = GoalTimes::new(config);
     if let (Some(output), Some(video)) = (&output, &args.video) {
         ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
     }
     let mut observe = |moment: &Moment| {
-        pace.observe(moment);
+        goal_times.observe(moment);
         if let Some(trace) = &mut trace {
             trace.record(moment);
         }
@@ -98,7 +98,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     }
     played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if args.json {
-        os::print(&format!("{}\n", json_score(&played, &pace, checkpoint.as_deref(), args.seed)))?;
+        os::print(&format!("{}\n", json_score(&played, &goal_times, checkpoint.as_deref(), args.seed)))?;
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(checkpoint) = &checkpoint {
@@ -128,7 +128,7 @@ fn wants_window(args: &PlayArgs) -> bool {
 
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
 fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
-    let task = task_to_see(config, &args.shot, [1280, 720], Quality::High)?;
+    let task = task_for_display(config, &args.shot, [1280, 720], Quality::High)?;
     let (names, actors, first) = match (loaded, args.policy) {
         (Some(loaded), _) => {
             let policy = &loaded.policy;
@@ -160,7 +160,7 @@ fn film(
     requests: &Requests,
     observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
-    let task = task_to_see(config, &args.shot, [640, 480], Quality::Fast)?;
+    let task = task_for_display(config, &args.shot, [640, 480], Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
     // Unlike the other outputs, a film is worth keeping if it is interrupted.
@@ -208,7 +208,7 @@ fn score(
 }
 
 /// Returns one object with all figures; those without a value are null.
-fn json_score(score: &Score, pace: &Pace, checkpoint: Option<&str>, seed: u64) -> Value {
+fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
     let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
     let mut value = json!({
         "episodes": score.episodes,
@@ -226,7 +226,7 @@ fn json_score(score: &Score, pace: &Pace, checkpoint: Option<&str>, seed: u64) -
         "checkpoint": checkpoint,
         "seed": seed,
     });
-    for (name, known) in pace.named() {
+    for (name, known) in goal_times.named() {
         value[name] = known;
     }
     value
@@ -278,8 +278,8 @@ mod tests {
 
     #[test]
     fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {
-        let pace = Pace::new(&Config::resolve(None, &[]).unwrap().env);
-        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), &pace, None, 3);
+        let goal_times = GoalTimes::new(&Config::resolve(None, &[]).unwrap().env);
+        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), &goal_times, None, 3);
         let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
         let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal drop_rate \
                         episode_length return reward diverged checkpoint seed steps_to_goal drops_first_second steps_fit";

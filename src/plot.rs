@@ -8,8 +8,8 @@ use anyhow::{Result, bail, ensure};
 use crate::cli::{Along, PlotArgs};
 use crate::draw::{self, Chart, Curve, Picture, Subplot};
 use crate::os::{self, OutputFile, similar};
-use crate::quantities::quantity;
 use crate::run::{self, MetricsTable};
+use crate::tags::quantity;
 
 /// The metrics that are drawn by default: the headline, and what explains it.
 const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];

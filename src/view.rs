@@ -6,7 +6,7 @@ use crate::cli::{Motion, ViewArgs, usage_error};
 use crate::config::{Config, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
 use crate::os;
-use crate::see::{Window, screenshot, task_to_see};
+use crate::see::{Window, screenshot, task_for_display};
 use crate::sim::Quality;
 
 /// Shows the scene in a window, or writes one picture of it.
@@ -21,7 +21,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
-    let task = task_to_see(&config.env, &args.shot, [1280, 720], Quality::High)?;
+    let task = task_for_display(&config.env, &args.shot, [1280, 720], Quality::High)?;
     let actors = [Actor::Zero, Actor::Random, Actor::Wave];
     let first = match args.actions {
         Motion::Zero => 0,

@@ -1,8 +1,8 @@
 //! Where the time of an iteration goes, in the hands of a policy that grasps.
 //!
 //! A policy that grasps makes other contacts than a new one, and contacts are what the physics takes its time for. So a trained
-//! policy acts, whatever nets the settings ask for; these are timed on what it has seen. What remains of collecting without physics and policy is a
-//! difference of three times, so it is less exact than they are.
+//! policy acts, whatever nets the settings ask for; these are timed on what it has seen. The environments' own
+//! time is computed by subtraction, so its error is that of the three measured times together.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -14,7 +14,7 @@ use super::replay::{BarePool, RecordingEnv};
 use crate::agent::Agent;
 use crate::config::Config;
 use crate::env::Env;
-use crate::load::Origin;
+use crate::load::PolicySource;
 use crate::ppo::{Ppo, Rollout};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
@@ -48,7 +48,7 @@ pub(super) const PARTS: [Part; 4] = [
 ///
 /// # Errors
 /// Fails if there is no such policy, or if it does not fit the task.
-pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Origin) -> Result<[f64; 4]> {
+pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &PolicySource) -> Result<[f64; 4]> {
     let mut acting = config.ppo.clone();
     let (checkpoint, of_it) = origin.load_for_any_scene()?;
     let net = of_it.net;

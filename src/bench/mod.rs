@@ -18,7 +18,7 @@ use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
 use crate::draw::{self, BarChart, HeatMap, NamedBar, Picture};
 use crate::env::{End, Env, EnvPool, StepBuffers};
-use crate::load::Origin;
+use crate::load::PolicySource;
 use crate::os::{self, OutputFile};
 use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::ranks::Exchange;
@@ -35,9 +35,9 @@ const ROUNDS: usize = 5;
 /// The minimum number of measured control steps in a round, over all environments.
 const STEPS: usize = 32_768;
 
-/// Control steps of each environment in a turn. Pool and physics take short turns because the speed of a machine drifts within a
+/// Control steps of each environment in a burst. Pool and physics take short bursts because the speed of a machine drifts within a
 /// second.
-const TURN: usize = 4;
+const BURST: usize = 4;
 
 /// The number of gradient steps and of matrix products that are measured.
 const REPEATS: usize = 11;
@@ -94,7 +94,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
             &format!("end to end                {end_to_end:>10.0} steps/s   {total:.0} M steps take {hours:.1} h\n");
     }
     if args.only == Some(Part::Iteration) {
-        let origin = Origin::of(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
+        let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
         let seconds = seconds_of_parts(&task, &config, &origin)?;
         figures.extend(PARTS.iter().zip(seconds).map(|(part, seconds)| (part.key, seconds)));
         lines += &table(seconds);
@@ -134,9 +134,9 @@ fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
     BarChart { title, bars: PARTS.into_iter().zip(seconds).map(bar).collect(), map }
 }
 
-/// The inputs and outputs of a block of environments in a turn.
+/// The inputs and outputs of a block of environments in a burst.
 struct BlockRows {
-    /// The actions of all steps of the turn.
+    /// The actions of all steps of the burst.
     actions: Vec<f32>,
     observations: Vec<f32>,
     final_observations: Vec<f32>,
@@ -159,7 +159,7 @@ impl BlockRows {
 /// Returns the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
 fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let envs = config.env.num_envs;
-    let turns = STEPS.div_ceil(envs * TURN);
+    let bursts = STEPS.div_ceil(envs * BURST);
     let mut noise = rng::stream(config.run.seed, "bench", 0);
     let mut draw =
         || config.ppo.std.by_equal_factors(0) as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
@@ -172,7 +172,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
     let mut bare = BarePool::new(task, randomization, envs);
     let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
     pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
-    let mut turn = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
+    let mut burst = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
         for rows in &mut rows {
             rows.actions = (0..steps * rows.rewards.len() * ACTION_SIZE).map(|_| draw()).collect();
         }
@@ -180,15 +180,15 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)
         play(pool, &mut rows, steps)
     };
     // Unmeasured steps first, so that most cubes lie in the hand; fewer of them for many environments.
-    turn(&mut pool, (2 * STEPS / envs).clamp(4, 64));
+    burst(&mut pool, (2 * STEPS / envs).clamp(4, 64));
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
         let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
-        for _ in 0..turns {
-            pool_seconds += turn(&mut pool, TURN);
+        for _ in 0..bursts {
+            pool_seconds += burst(&mut pool, BURST);
             bare_seconds += bare.replay(&mut pool)?;
         }
-        let done = (turns * TURN * envs) as f64;
+        let done = (bursts * BURST * envs) as f64;
         rates[0].push(done / bare_seconds);
         rates[1].push(done / pool_seconds);
         rates[2].push(bare_seconds / pool_seconds);

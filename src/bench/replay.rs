@@ -7,22 +7,22 @@ use anyhow::{Result, ensure};
 use rayon::prelude::*;
 
 use crate::env::{Env, EnvPool, Transition};
-use crate::repose::{ACTION_SIZE, Draw, EpisodeStats, Lesson, Randomization, Repose, Task};
+use crate::repose::{ACTION_SIZE, EpisodePhysics, EpisodeStats, Lesson, Randomization, Repose, Task};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
 use crate::sim::{BareSimulation, FreeJoint, Scene, SimulationState};
 use crate::spaces::Spaces;
 
-/// The record of what an environment did in a turn.
+/// The record of what an environment did in a burst.
 struct Recording {
     /// Its state at the beginning, and what its episode has drawn.
-    start: (SimulationState, Option<Draw>),
+    start: (SimulationState, Option<EpisodePhysics>),
     /// Its controls, step by step.
     ctrl: Vec<f64>,
     /// The random force on the cube in each step, if there are such forces.
     pushes: Vec<Option<[f64; 3]>>,
     /// The episodes that began: the number of steps before each, its first state, and what it has drawn.
-    resets: Vec<(usize, SimulationState, Option<Draw>)>,
+    resets: Vec<(usize, SimulationState, Option<EpisodePhysics>)>,
     steps: usize,
 }
 
@@ -66,8 +66,8 @@ impl Env for RecordingEnv {
         self.recording.resets.push((self.recording.steps, self.env.simulation().state(), draw));
     }
 
-    fn skip_ahead(&mut self, share: f64) {
-        self.env.skip_ahead(share);
+    fn skip_ahead(&mut self, fraction: f64) {
+        self.env.skip_ahead(fraction);
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
@@ -91,8 +91,8 @@ impl Env for RecordingEnv {
 struct Replay {
     sim: BareSimulation,
     /// What the last episode has drawn, and its scene.
-    drawn: (Option<Draw>, Scene),
-    /// The scenes of the episodes that begin in the next turn.
+    drawn: (Option<EpisodePhysics>, Scene),
+    /// The scenes of the episodes that begin in the next burst.
     resets: Vec<Scene>,
 }
 
@@ -101,8 +101,8 @@ impl Replay {
         Self { sim: BareSimulation::new(nominal), drawn: (None, nominal.clone()), resets: Vec::new() }
     }
 
-    /// Prepares what the replay of a turn needs: its first state and its scenes.
-    fn prepare(&mut self, recording: &Recording, scene_of: impl Fn(Option<&Draw>) -> Scene) {
+    /// Prepares what the replay of a burst needs: its first state and its scenes.
+    fn prepare(&mut self, recording: &Recording, scene_of: impl Fn(Option<&EpisodePhysics>) -> Scene) {
         let (state, draw) = &recording.start;
         if *draw != self.drawn.0 {
             self.drawn = (draw.clone(), scene_of(draw.as_ref()));
@@ -151,7 +151,7 @@ impl<'a> BarePool<'a> {
         let recordings: Vec<&Recording> = pool.envs_mut().map(|env| &env.recording).collect();
         let Self { task, randomization, nominal, replays } = self;
         let (task, randomization, nominal) = (*task, *randomization, &*nominal);
-        let scene_of = |draw: Option<&Draw>| match (randomization, draw) {
+        let scene_of = |draw: Option<&EpisodePhysics>| match (randomization, draw) {
             (Some(randomization), Some(draw)) => randomization.scene_of(draw, task),
             _ => nominal.clone(),
         };

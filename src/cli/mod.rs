@@ -95,7 +95,7 @@ pub fn command() -> clap::Command {
     without_defaults().mut_subcommands(|command| command.mut_args(with_defaults))
 }
 
-/// Returns the command line whose help does not tell the defaults that are settings. They take longer to read than the arguments.
+/// Builds the command line without the defaults that come from settings, which are slow to load.
 fn without_defaults() -> clap::Command {
     let (program, commit) = (env!("CARGO_PKG_VERSION"), env!("SHADOW_REPOSE_COMMIT"));
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
@@ -172,8 +172,8 @@ pub struct TrainArgs {
     /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
-    /// Start from the policy (weights and normaliser) of this checkpoint or run, or of builtin or robust, which come with the program, with nets
-    /// of its size; all else is as in any new run
+    /// Start a new run from an existing policy: a checkpoint, a run folder, or the built-in `builtin` or `robust`. Network sizes are
+    /// taken from it; everything else starts afresh
     #[arg(long, value_name = "FILE|RUN|NAME", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
     /// Start a new run from the full state of this run or checkpoint (weights, hands, counters; ramps continue), with changed
@@ -359,7 +359,7 @@ pub struct PlotArgs {
     /// Quantity on the x axis: control steps, or hours of collecting and learning
     #[arg(long, value_enum, default_value_t = Along::Steps)]
     pub along: Along,
-    /// Number of iterations averaged into each point of a curve, counted in those of the run with the shortest ones
+    /// Iterations averaged into each point; if runs differ in iteration length, the shortest counts
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub smooth: usize,
     /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest

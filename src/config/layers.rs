@@ -183,8 +183,8 @@ fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Res
         let single = with_the_others(table_of(key, value, &base), key, &merged, &base);
         overlay(&mut merged, &single, &base, "", &mut problems);
     }
-    // Unknown words and wrong array sizes: each key is deserialized alone among the defaults, so that the one that fails can be
-    // named. It is replaced by its default so that the other rules can be checked.
+    // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
+    // replaced by its default, so that the other rules can be checked.
     for (section, keys) in &base {
         for (key, default) in keys.as_table().into_iter().flatten() {
             let mut alone = base.clone();

@@ -6,23 +6,23 @@
 //!
 //! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
 
+mod applicability;
 mod layers;
 mod overlay;
 mod ramp;
 mod rules;
 mod settings;
-mod used;
 
 /// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
+pub use applicability::expect_used;
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use settings::{
     Activation, BUILTIN_MODEL, Backend, ByGroup, ConeSetting, Config, EnvConfig, NetConfig, PpoConfig, Precision,
     RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig,
 };
-pub use used::expect_used;
 
 #[cfg(test)]
 mod tests {

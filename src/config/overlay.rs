@@ -77,7 +77,7 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 };
                 overlay(target, inner, &zeros, &format!("{name}."), problems);
             }
-            // A whole ramp that does not say when it begins does so at once, whatever the base says. So it is written, too.
+            // A complete ramp without `after` starts at step 0, even if the default has an `after`; `to_text` relies on this.
             (Some(of), Value::Table(whole))
                 if is_ramp(of)
                     && !whole.contains_key(AFTER)

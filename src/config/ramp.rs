@@ -28,14 +28,14 @@ impl Ramp {
 
     /// Returns the value after `env_steps` control steps; it changes by the same difference in each step.
     pub fn by_equal_steps(&self, env_steps: u64) -> f64 {
-        let share = self.share(env_steps);
-        self.from * (1.0 - share) + self.to * share
+        let fraction = self.fraction(env_steps);
+        self.from * (1.0 - fraction) + self.to * fraction
     }
 
     /// Returns the value after `env_steps` control steps; it changes by the same factor in each step.
     pub fn by_equal_factors(&self, env_steps: u64) -> f64 {
-        let share = self.share(env_steps);
-        self.from.powf(1.0 - share) * self.to.powf(share)
+        let fraction = self.fraction(env_steps);
+        self.from.powf(1.0 - fraction) * self.to.powf(fraction)
     }
 
     /// Returns the control steps of the run after which the value does not change any more.
@@ -44,7 +44,7 @@ impl Ramp {
     }
 
     /// Returns the fraction of the ramp that is over, from 0 to 1.
-    fn share(&self, env_steps: u64) -> f64 {
+    fn fraction(&self, env_steps: u64) -> f64 {
         match env_steps.checked_sub(self.after) {
             None => 0.0,
             Some(_) if self.steps == 0 => 1.0,

@@ -51,8 +51,8 @@ pub trait Env: Send {
     /// Starts an episode that draws all its randomness from `rng`, and writes the first observation.
     fn reset(&mut self, rng: Rng, observation: &mut [f32]);
 
-    /// Makes the episode just started end early, as if the fraction `share` (in [0, 1)) of its maximum length had passed.
-    fn skip_ahead(&mut self, share: f64);
+    /// Makes the episode just started end early, as if the `fraction` (in [0, 1)) of its maximum length had passed.
+    fn skip_ahead(&mut self, fraction: f64);
 
     /// Takes one step and writes the observation after it, even if the step ends the episode.
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition;

@@ -12,7 +12,7 @@ pub(super) fn policy_graph(actor: &ActorParts) -> Graph {
     let actions = actor.layers.last().expect("a net has layers").outputs;
     let mut graph = Graph::new("policy", ("obs", size), ("actions", actions));
     let seen = match actor.cube_and_goal {
-        Some(places) => turn(&mut graph, actor, places),
+        Some(places) => canonicalize(&mut graph, actor, places),
         None => "obs".into(),
     };
     graph.floats("mean", &[size], &actor.mean);
@@ -46,7 +46,7 @@ fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
 }
 
 /// Turns cube and goal by the rotation of the cube's symmetry that brings the cube closest to its unrotated orientation.
-fn turn(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
+fn canonicalize(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
     assert!(cube + 4 <= goal, "the goal follows the cube");
     // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
     let mut cosines = [0.0; 4 * 24];
@@ -78,20 +78,20 @@ fn turn(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal }: CubeA
     // The first of equals, as in `ppo::perception`.
     let nearest = graph.node("ArgMax", &[&nearness], "nearest", &[("axis", Int(1)), ("keepdims", Int(0))]);
     let product = graph.node("Gather", &["products", &nearest], "product", &[("axis", Int(0))]);
-    let [cube, goal] = ["cube", "goal"].map(|quaternion| turned(graph, quaternion, &product));
+    let [cube, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion, &product));
     graph.node("Concat", &["before", &cube, "between", &goal, "after"], "seen", &[("axis", Int(1))])
 }
 
 /// Multiplies a quaternion by the rotation, and negates it if w is negative then.
-fn turned(graph: &mut Graph, quaternion: &str, product: &str) -> String {
+fn rotated(graph: &mut Graph, quaternion: &str, product: &str) -> String {
     let name = |what: &str| format!("{quaternion}_{what}");
     let row = graph.node("Unsqueeze", &[quaternion, "axis"], &name("row"), &[]);
-    let turned = graph.node("MatMul", &[&row, product], &name("turned_row"), &[]);
-    let turned = graph.node("Squeeze", &[&turned, "axis"], &name("turned"), &[]);
-    let w = slice(graph, &turned, [0, 1], &name("w"));
+    let rotated = graph.node("MatMul", &[&row, product], &name("rotated_row"), &[]);
+    let rotated = graph.node("Squeeze", &[&rotated, "axis"], &name("rotated"), &[]);
+    let w = slice(graph, &rotated, [0, 1], &name("w"));
     let negative = graph.node("Less", &[&w, "zero"], &name("negative"), &[]);
     let sign = graph.node("Where", &[&negative, "minus", "plus"], &name("sign"), &[]);
-    graph.node("Mul", &[&turned, &sign], &name("seen"), &[])
+    graph.node("Mul", &[&rotated, &sign], &name("seen"), &[])
 }
 
 fn slice(graph: &mut Graph, row: &str, ends: [usize; 2], output: &str) -> String {

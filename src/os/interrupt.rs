@@ -58,7 +58,7 @@ impl Requests {
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
         let listener = thread::Builder::new().name("signals".into());
-        listener.spawn(move || shared.take(&mut signals, saves)).context("cannot start a thread for signals")?;
+        listener.spawn(move || shared.listen_loop(&mut signals, saves)).context("cannot start a thread for signals")?;
         Ok(requests)
     }
 
@@ -67,7 +67,7 @@ impl Requests {
         self.patient.store(true, Ordering::Relaxed);
     }
 
-    fn take(&self, signals: &mut Signals, saves: bool) {
+    fn listen_loop(&self, signals: &mut Signals, saves: bool) {
         let mut first: Option<Instant> = None;
         for signal in signals.forever() {
             if signal == SIGUSR1 {

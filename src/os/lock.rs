@@ -26,7 +26,7 @@ impl Locked {
     ///
     /// # Errors
     /// Fails if another training process uses the folder, or if it cannot be written to.
-    pub fn take(folder: &Path) -> Result<Self> {
+    pub fn acquire(folder: &Path) -> Result<Self> {
         let path = folder.join(LOCK);
         let context = || format!("cannot write {}", path.display());
         fs::create_dir_all(folder).with_context(context)?;
@@ -85,22 +85,22 @@ mod tests {
     #[test]
     fn a_second_training_in_a_folder_is_refused_until_the_first_ends() {
         let place = tempfile::tempdir().unwrap();
-        let first = Locked::take(place.path()).unwrap().sign().unwrap();
-        let refusal = Locked::take(place.path()).unwrap_err().to_string();
+        let first = Locked::acquire(place.path()).unwrap().sign().unwrap();
+        let refusal = Locked::acquire(place.path()).unwrap_err().to_string();
         assert!(refusal.ends_with(&format!("another program: process {}", std::process::id())), "{refusal}");
         drop(first.sign().unwrap());
-        Locked::take(place.path()).unwrap();
+        Locked::acquire(place.path()).unwrap();
     }
 
     #[test]
     fn a_lock_that_was_copied_by_a_second_name_is_not_shared() {
         let place = tempfile::tempdir().unwrap();
         let [run, copy] = ["run", "copy"].map(|name| place.path().join(name));
-        drop(Locked::take(&run).unwrap());
+        drop(Locked::acquire(&run).unwrap());
         fs::create_dir(&copy).unwrap();
         fs::hard_link(run.join(LOCK), copy.join(LOCK)).unwrap();
-        let lock = Locked::take(&copy).unwrap().sign().unwrap();
-        Locked::take(&run).unwrap();
-        assert!(Locked::take(&copy).is_err() && lock.holds());
+        let lock = Locked::acquire(&copy).unwrap().sign().unwrap();
+        Locked::acquire(&run).unwrap();
+        assert!(Locked::acquire(&copy).is_err() && lock.holds());
     }
 }

@@ -63,7 +63,7 @@ impl StatusLine {
 
     /// Shows the values of an iteration.
     pub fn show(&mut self, status: &Status) {
-        self.shown.take(status);
+        self.shown.update(status);
         let left = self.time_left();
         if let Some(bar) = &self.bar {
             let width = usize::from(Term::stderr().size().1).saturating_sub(1);
@@ -111,7 +111,7 @@ fn is_drawn_on() -> bool {
 }
 
 impl Status {
-    fn take(&mut self, status: &Status) {
+    fn update(&mut self, status: &Status) {
         self.env_steps = status.env_steps;
         for (shown, new) in [
             (&mut self.steps_per_s, status.steps_per_s),

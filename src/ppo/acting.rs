@@ -53,14 +53,14 @@ impl Acting<'_> {
             return 1.0;
         }
         let [near, far] = self.config.away_range.map(|distance| distance as f32);
-        let share = (((self.policy.spaces().distance)(observation) - near) / (far - near)).clamp(0.0, 1.0);
-        1.0 + (self.away_scale - 1.0) * share
+        let fraction = (((self.policy.spaces().distance)(observation) - near) / (far - near)).clamp(0.0, 1.0);
+        1.0 + (self.away_scale - 1.0) * fraction
     }
 
     /// Scales the rewards of a step. Where the future of an environment was cut off, also adds the discounted value of
     /// its final observation, so that advantages need only one array of ends. `cut_off` `[n]`, `final_observations`
     /// `[n, O]`.
-    pub fn settle(
+    pub fn scale_and_bootstrap(
         &self,
         rewards: &mut [f32],
         cut_off: impl Iterator<Item = bool>,

@@ -72,7 +72,7 @@ impl Perception {
 
     /// Maps one raw observation `[O]`, in place, to the one that represents all equivalent observations.
     #[inline(always)]
-    pub fn turn(self, observation: &mut [f32]) {
+    pub fn canonicalize(self, observation: &mut [f32]) {
         let Some(CubeAndGoal { cube, goal }) = self.cube_and_goal else { return };
         let best = nearest(quaternion(observation, cube));
         for place in [cube, goal] {
@@ -93,27 +93,27 @@ fn nearest(cube: [f32; 4]) -> [f32; 4] {
 
 /// The way a policy reads raw observations: perception, then normalisation.
 #[derive(Clone, Debug)]
-pub(super) struct Reader {
+pub(super) struct InputTransform {
     /// The symmetry that it exploits.
     pub perception: Perception,
     /// The normalisation.
     pub scaling: Scaling,
 }
 
-impl Reader {
+impl InputTransform {
     /// Returns the number of values in an observation.
     pub(super) fn size(&self) -> usize {
         self.scaling.size()
     }
 
     /// Writes what the nets see of the `raw` observations `[B, O]` into `out` `[B, O]`.
-    pub(super) fn read(&self, raw: &[f32], out: &mut [f32]) {
+    pub(super) fn apply(&self, raw: &[f32], out: &mut [f32]) {
         out.copy_from_slice(raw);
         Arch::new().dispatch(
             #[inline(always)]
             || {
                 for row in out.chunks_exact_mut(self.size()) {
-                    self.perception.turn(row);
+                    self.perception.canonicalize(row);
                     self.scaling.apply(row);
                 }
             },
@@ -140,7 +140,7 @@ mod tests {
     };
 
     fn perceive(symmetry: Symmetry, row: &mut [f32]) {
-        Perception::new(symmetry, &SPACES).unwrap().turn(row);
+        Perception::new(symmetry, &SPACES).unwrap().canonicalize(row);
     }
 
     fn observation(cube: Quat, goal: Quat) -> Vec<f32> {
@@ -214,10 +214,10 @@ mod tests {
     #[test]
     fn what_is_read_is_perceived_and_then_normalised() {
         let scaling = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 }.scaling();
-        let reader = Reader { perception: Perception::new(Symmetry::Cube, &SPACES).unwrap(), scaling };
+        let transform = InputTransform { perception: Perception::new(Symmetry::Cube, &SPACES).unwrap(), scaling };
         let raw = [observation(random(0), random(1)), observation(random(2), random(3))].concat();
         let mut found = vec![0.0; 40];
-        reader.read(&raw, &mut found);
+        transform.apply(&raw, &mut found);
         for (found, raw) in found.chunks_exact(20).zip(raw.chunks_exact(20)) {
             let mut expected = raw.to_vec();
             perceive(Symmetry::Cube, &mut expected);

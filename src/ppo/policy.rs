@@ -7,7 +7,7 @@ use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
 use super::normalizer::CLIP;
 use super::parameters::{Layer, Layout};
-use super::perception::{Perception, ROTATIONS, Reader};
+use super::perception::{InputTransform, Perception, ROTATIONS};
 use crate::config::{Activation, NetConfig};
 use crate::ranks::Exchange;
 use crate::rng::{self, Rng};
@@ -38,7 +38,7 @@ pub struct FrozenPolicy<'a> {
     policy: &'a Policy,
     actor: Net<'a>,
     critic: Net<'a>,
-    reader: Reader,
+    transform: InputTransform,
 }
 
 /// What the actor computes, as numbers for another program: the symmetry, then `(x - mean) * factor` within ± `clip`, then the
@@ -75,7 +75,7 @@ pub struct LayerParts<'a> {
 impl Policy {
     /// Returns the parts of the actor.
     pub fn actor(&self) -> ActorParts<'_> {
-        let Reader { perception, scaling } = self.reader();
+        let InputTransform { perception, scaling } = self.input_transform();
         let layers = self.layout.actor.iter().map(|layer| LayerParts {
             inputs: layer.inputs,
             outputs: layer.outputs,
@@ -140,12 +140,12 @@ impl Policy {
     /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
         let perception = self.perception;
-        self.normalizer.update(arrays, exchange, |row| perception.turn(row));
+        self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
     }
 
     /// Returns the way it currently reads observations.
-    pub(super) fn reader(&self) -> Reader {
-        Reader { perception: self.perception, scaling: self.normalizer.scaling() }
+    pub(super) fn input_transform(&self) -> InputTransform {
+        InputTransform { perception: self.perception, scaling: self.normalizer.scaling() }
     }
 
     /// Returns the net of these layers.
@@ -167,7 +167,7 @@ impl Policy {
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
         let nets = [&self.layout.actor, &self.layout.critic];
         let [actor, critic] = nets.map(|layers| self.net(layers).for_few_rows().packed(arithmetic, false));
-        FrozenPolicy { policy: self, actor, critic, reader: self.reader() }
+        FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }
 
@@ -214,7 +214,7 @@ impl FrozenPolicy<'_> {
         let mut done = 0;
         for raw in observations.chunks(work.rows() * size) {
             let rows = raw.len() / size;
-            self.reader.read(raw, &mut work.inputs[..raw.len()]);
+            self.transform.apply(raw, &mut work.inputs[..raw.len()]);
             for (net, out) in &mut *outputs {
                 let width = net.outputs();
                 out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));

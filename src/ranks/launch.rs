@@ -72,7 +72,7 @@ fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
 /// Fails if there should be several, but this process cannot talk to the others; or as `work` does, if this process is alone.
 pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<ExitCode> {
     let Membership { exchange, .. } = &match join() {
-        // All meet the same error; one of them tells.
+        // All ranks hit the same error; only rank 0 reports it.
         Err(_) if !is_spokesman() => return Ok(ExitCode::FAILURE),
         joined => joined?,
     };

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::randomization::{Draw, Randomization};
+use super::randomization::{EpisodePhysics, Randomization};
 use super::sensing;
 use super::task::Task;
 use crate::rng::{self, Rng};
@@ -12,7 +12,7 @@ use crate::sim::{Scene, Simulation};
 pub(super) struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
-    draw: Option<Draw>,
+    draw: Option<EpisodePhysics>,
     /// What is added to the values of every observation of the episode, in the order of the values.
     bias: Vec<(usize, f32)>,
 }
@@ -27,10 +27,10 @@ impl Conditions {
         self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
     }
 
-    /// Draws the conditions of the episode of `rng`, which is randomised with probability `share`, and gives the simulation its
+    /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`, and gives the simulation its
     /// physics; the state must be reset after it.
-    pub(super) fn begin(&mut self, rng: &Rng, share: f64, sim: &mut Simulation, task: &Task) {
-        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, share));
+    pub(super) fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
+        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability));
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {
@@ -43,13 +43,13 @@ impl Conditions {
     }
 
     /// Returns what the episode has drawn, if it is randomised.
-    pub(super) fn draw(&self) -> Option<&Draw> {
+    pub(super) fn draw(&self) -> Option<&EpisodePhysics> {
         self.draw.as_ref()
     }
 
     /// Returns the control steps between an action and its effect.
     pub(super) fn delay(&self, task: &Task) -> usize {
-        (task.config.action_delay + self.draw.as_ref().map_or(0, Draw::delay)) as usize
+        (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
     }
 
     /// Returns the largest delay of any episode.
@@ -65,7 +65,7 @@ impl Conditions {
         Some(force)
     }
 
-    /// Adds to an observation the noise after a number of steps of the episode of `rng`, and the offset of the episode.
+    /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
     pub(super) fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
         let spreads = [Some(&task.noise), drawn.and_then(|(randomization, draw)| randomization.noise(draw))];

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::physics::add_settings;
-use super::{ACTION_SIZE, Draw};
+use super::{ACTION_SIZE, EpisodePhysics};
 use crate::config::EnvConfig;
 use crate::sim::{Simulation, SimulationState};
 
@@ -13,7 +13,7 @@ pub struct Diverged {
     /// The length of the episode in control steps, including the last one.
     pub length: u32,
     /// What the episode has drawn, if it was randomised.
-    pub draw: Option<Draw>,
+    pub draw: Option<EpisodePhysics>,
     /// The last steps of the episode.
     pub tail: Tail,
 }

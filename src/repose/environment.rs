@@ -10,7 +10,7 @@ use anyhow::{Result, ensure};
 use super::conditions::Conditions;
 use super::divergence::{Diverged, Recorder};
 use super::observation::{Cells, SPACES};
-use super::randomization::{Draw, Randomization};
+use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::{Servos, Targets};
 use super::task::Task;
@@ -120,7 +120,7 @@ impl Repose {
     }
 
     /// Returns what this episode has drawn, if it is randomised.
-    pub fn draw(&self) -> Option<&Draw> {
+    pub fn draw(&self) -> Option<&EpisodePhysics> {
         self.conditions.draw()
     }
 
@@ -191,7 +191,7 @@ impl Repose {
     fn actuate(&mut self, action: &[f32]) -> Targets {
         self.previous_action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
         let due =
-            self.servos.take(&self.previous_action, &self.task.hand.actuators, self.task.config.act_moving_average);
+            self.servos.apply(&self.previous_action, &self.task.hand.actuators, self.task.config.act_moving_average);
         self.send(due);
         due
     }
@@ -311,8 +311,8 @@ impl Env for Repose {
         self.observe(observation);
     }
 
-    fn skip_ahead(&mut self, share: f64) {
-        self.age = (share * f64::from(self.task.config.max_episode_steps())) as u32;
+    fn skip_ahead(&mut self, fraction: f64) {
+        self.age = (fraction * f64::from(self.task.config.max_episode_steps())) as u32;
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {

@@ -61,7 +61,7 @@ impl Hand {
         ensure!(
             scene.controls() == ACTION_SIZE,
             "{}: has {} controls, but it must have exactly the {ACTION_SIZE} of the hand",
-            scene.origin(),
+            scene.file_label(),
             scene.controls()
         );
         let fingertips = each(FINGERTIPS, |tip| scene.body(tip))?;

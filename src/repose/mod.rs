@@ -22,7 +22,7 @@ pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::Lesson;
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use physics::{Physics, QUANTITIES, Quantity, add_settings};
-pub use randomization::{Draw, Randomization};
+pub use randomization::{EpisodePhysics, Randomization};
 pub use reward::{OfTask, OfTraining, Step, TaskReward, TrainingReward, task_reward};
 pub use task::Task;
 pub use terms::{Description, TermList, Terms};

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 
 use super::physics::{Physics, QUANTITIES, SHARED, normal, sizes};
-use super::sensing::Spread;
+use super::sensing::NoiseStd;
 use super::task::Task;
 use crate::config::RandomizationConfig;
 use crate::rng::{self, Rng};
@@ -22,13 +22,13 @@ pub struct Randomization {
     variants: Variants,
     /// The factor on the lengths of the cube in each variant; the last one is the nominal scene.
     sizes: Vec<f64>,
-    noise: Spread,
-    bias: Spread,
+    noise: NoiseStd,
+    bias: NoiseStd,
 }
 
 /// What a randomised episode has drawn.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Draw {
+pub struct EpisodePhysics {
     /// What is changed on top of what the task sets.
     pub physics: Physics,
     /// Whether there is noise on the observations.
@@ -39,7 +39,7 @@ pub struct Draw {
     pub has_pushes: bool,
 }
 
-impl Draw {
+impl EpisodePhysics {
     /// Returns the control steps between an action and its effect, in addition to those of the task.
     pub fn delay(&self) -> u32 {
         self.physics["delay"][0] as u32
@@ -52,8 +52,8 @@ impl Randomization {
     /// # Errors
     /// Fails if the scene cannot be varied in this way, or if a setting names an unknown group of the observation.
     pub fn new(task: &Task, config: &RandomizationConfig) -> Result<Option<Arc<Self>>> {
-        let noise = Spread::of(&config.noise).context("randomization.noise")?;
-        let bias = Spread::of(&config.bias).context("randomization.bias")?;
+        let noise = NoiseStd::new(&config.noise).context("randomization.noise")?;
+        let bias = NoiseStd::new(&config.bias).context("randomization.bias")?;
         if !config.happens() {
             return Ok(None);
         }
@@ -78,11 +78,11 @@ impl Randomization {
     }
 
     /// Draws the physics of the episode that owns `rng`; the generator's position does not matter. Returns `None` if the episode is
-    /// not randomised, which happens with probability 1 - `share`. All numbers are drawn in any case, so that one setting does not
+    /// not randomised, which happens with probability 1 - `probability`. All numbers are drawn in any case, so that one setting does not
     /// change what is drawn for another.
-    pub fn draw(&self, rng: &Rng, share: f64) -> Option<Draw> {
+    pub fn draw(&self, rng: &Rng, probability: f64) -> Option<EpisodePhysics> {
         let shared = &mut rng::beside(rng, "randomization");
-        let randomized = rng::uniform(shared, 0.0, 1.0) < share;
+        let randomized = rng::uniform(shared, 0.0, 1.0) < probability;
         let is_varied = |rng: &mut Rng| rng::uniform(rng, 0.0, 1.0) < self.config.each;
         let flags = [(); SHARED + 3].map(|()| is_varied(shared));
         let mut physics = Physics::neutral();
@@ -98,38 +98,38 @@ impl Randomization {
             }
         }
         let [.., has_noise, has_bias, has_pushes] = flags;
-        randomized.then_some(Draw { physics, has_noise, has_bias, has_pushes })
+        randomized.then_some(EpisodePhysics { physics, has_noise, has_bias, has_pushes })
     }
 
     /// Gives the simulation the physics of a draw; its state must be reset after it.
-    pub fn vary(&self, simulation: &mut Simulation, draw: &Draw, task: &Task) {
+    pub fn vary(&self, simulation: &mut Simulation, draw: &EpisodePhysics, task: &Task) {
         self.variants.vary(simulation, self.variant(draw), &draw.physics.changes(&task.hand));
     }
 
     /// Returns a scene with the physics of a draw.
-    pub fn scene_of(&self, draw: &Draw, task: &Task) -> Scene {
+    pub fn scene_of(&self, draw: &EpisodePhysics, task: &Task) -> Scene {
         self.variants.scene(self.variant(draw), &draw.physics.changes(&task.hand))
     }
 
     /// Returns the number of the scene with the size of a draw.
-    fn variant(&self, draw: &Draw) -> usize {
+    fn variant(&self, draw: &EpisodePhysics) -> usize {
         let [size] = draw.physics["cube_size"] else { unreachable!("one factor") };
         self.sizes.iter().position(|other| *other == size).expect("a size that can be drawn, or the nominal one")
     }
 
     /// Returns the noise on the observations of an episode, if there is any.
-    pub(super) fn noise(&self, draw: &Draw) -> Option<&Spread> {
+    pub(super) fn noise(&self, draw: &EpisodePhysics) -> Option<&NoiseStd> {
         Some(&self.noise).filter(|_| draw.has_noise)
     }
 
     /// Draws the offset of the observations in the episode of `rng`.
-    pub(super) fn draw_bias(&self, draw: &Draw, rng: &Rng) -> Vec<(usize, f32)> {
+    pub(super) fn draw_bias(&self, draw: &EpisodePhysics, rng: &Rng) -> Vec<(usize, f32)> {
         let drawn = self.bias.draw(&mut rng::beside(rng, "bias of randomization")).collect();
         if draw.has_bias { drawn } else { Vec::new() }
     }
 
     /// Returns the force on the cube, N, in a step (from 0) of the episode of `rng`; `None` if it has none.
-    pub(super) fn push(&self, draw: &Draw, rng: &Rng, step: u32) -> Option<[f64; 3]> {
+    pub(super) fn push(&self, draw: &EpisodePhysics, rng: &Rng, step: u32) -> Option<[f64; 3]> {
         let std = self.config.push;
         let rng = &mut rng::beside_at(rng, "push", step / self.config.push_steps);
         (draw.has_pushes && std > 0.0).then(|| [(); 3].map(|()| normal(rng, std)))

@@ -15,14 +15,14 @@ const MEASURED: [&str; 7] =
 
 /// The standard deviation of what is added to each value of an observation: those that are not 0, by index.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Spread(Vec<(usize, f32)>);
+pub(super) struct NoiseStd(Vec<(usize, f32)>);
 
-impl Spread {
+impl NoiseStd {
     /// Spreads the values of groups over the values of an observation.
     ///
     /// # Errors
     /// Fails on the name of a group that does not exist or is not measured.
-    pub(super) fn of(groups: &ByGroup) -> Result<Self> {
+    pub(super) fn new(groups: &ByGroup) -> Result<Self> {
         for name in groups.keys() {
             if !MEASURED.contains(&name.as_str()) {
                 let known = OBSERVATION.iter().any(|group| group.name == name);
@@ -103,8 +103,8 @@ mod tests {
     use super::*;
     use crate::rng;
 
-    fn spread(groups: &[(&str, f64)]) -> Result<Spread> {
-        Spread::of(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect())
+    fn spread(groups: &[(&str, f64)]) -> Result<NoiseStd> {
+        NoiseStd::new(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect())
     }
 
     #[test]

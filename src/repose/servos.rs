@@ -31,7 +31,7 @@ impl Servos {
 
     /// Turns an action, clipped to [-1, 1], into targets, and returns those that take effect now. `alpha` is the weight of an
     /// action in the smoothed targets.
-    pub(super) fn take(
+    pub(super) fn apply(
         &mut self,
         action: &[f32; ACTION_SIZE],
         actuators: &[Actuator; ACTION_SIZE],

@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use super::Hand;
 use super::hand::CUBE;
 use super::physics::Physics;
-use super::sensing::Spread;
+use super::sensing::NoiseStd;
 use crate::config::{ConeSetting, EnvConfig};
 use crate::sim::{Compilation, Cone, Look, Scene};
 
@@ -17,9 +17,9 @@ pub struct Task {
     pub(super) hand: Hand,
     pub(super) config: EnvConfig,
     /// The standard deviation of white noise on an observation.
-    pub(super) noise: Spread,
+    pub(super) noise: NoiseStd,
     /// The standard deviation of the offset of an observation that lasts an episode.
-    pub(super) bias: Spread,
+    pub(super) bias: NoiseStd,
 }
 
 impl Task {
@@ -29,26 +29,26 @@ impl Task {
     /// Fails with the scene's file if the scene cannot be loaded or lacks a name, or if a setting names an unknown group of the
     /// observation.
     pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::of(Scene::load(config.model_file(), &compilation(config))?, config, None)
+        Self::in_scene(Scene::load(config.model_file(), &compilation(config))?, config, None)
     }
 
     /// Loads the same task in a scene for display.
     ///
     /// # Errors
     /// Fails like [`Task::new`], or if meshes cannot be read.
-    pub fn new_to_see(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::of(Scene::load_to_see(config.model_file(), &compilation(config), look)?, config, Some(look))
+    pub fn for_display(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
+        Self::in_scene(Scene::load_for_display(config.model_file(), &compilation(config), look)?, config, Some(look))
     }
 
-    fn of(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
+    fn in_scene(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
         let hand = Hand::bind(&scene)?;
         let nominal = scene;
         let mut scene = nominal.varied(&Physics::of_task(config).changes(&hand));
         if let Some(look) = look {
             scene.set_look(look, &nominal);
         }
-        let noise = Spread::of(&config.noise).context("env.noise")?;
-        let bias = Spread::of(&config.bias).context("env.bias")?;
+        let noise = NoiseStd::new(&config.noise).context("env.noise")?;
+        let bias = NoiseStd::new(&config.bias).context("env.bias")?;
         Ok(Arc::new(Self { scene, hand, config: config.clone(), noise, bias }))
     }
 

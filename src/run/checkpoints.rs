@@ -25,7 +25,7 @@ pub struct Checkpoints {
 }
 
 impl Checkpoints {
-    pub(super) fn of(run: &Path) -> Self {
+    pub(super) fn new(run: &Path) -> Self {
         Self { folder: run.join("checkpoints") }
     }
 
@@ -44,7 +44,7 @@ impl Checkpoints {
         self.folder.join(BEST)
     }
 
-    fn of_iteration(&self, iteration: u64) -> PathBuf {
+    fn path_of(&self, iteration: u64) -> PathBuf {
         self.folder.join(format!("iteration-{iteration:08}.safetensors"))
     }
 
@@ -54,7 +54,7 @@ impl Checkpoints {
     /// Fails if the checkpoint cannot be written; the earlier ones are kept then.
     pub fn write(&self, iteration: u64, bytes: &[u8], keep: usize) -> Result<()> {
         self.create_folder()?;
-        let path = self.of_iteration(iteration);
+        let path = self.path_of(iteration);
         write_whole(&path, bytes)?;
         name_also(&path, &self.latest())?;
         // Later checkpoints exist if the run was resumed from an earlier one. They must not be resumed from, since the logs
@@ -148,7 +148,7 @@ mod tests {
     #[test]
     fn the_newest_are_kept_and_latest_names_the_newest() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::of(place.path());
+        let checkpoints = Checkpoints::new(place.path());
         for iteration in [0, 20, 40, 60] {
             checkpoints.write(iteration, format!("{iteration}").as_bytes(), 2).unwrap();
             assert_eq!(fs::read_to_string(checkpoints.latest()).unwrap(), iteration.to_string());
@@ -163,22 +163,22 @@ mod tests {
         let newest: Vec<PathBuf> = checkpoints.newest_first();
         assert!(newest.len() == 2 && newest[0].ends_with(kept[1]) && newest[1].ends_with(kept[0]), "{newest:?}");
         // A crash just before the new one becomes the latest.
-        fs::write(checkpoints.of_iteration(80), "newer").unwrap();
-        assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(80));
+        fs::write(checkpoints.path_of(80), "newer").unwrap();
+        assert_eq!(checkpoints.newest_first()[0], checkpoints.path_of(80));
         // A copy, as in a folder that was moved to a file system without hard links.
         fs::remove_file(checkpoints.latest()).unwrap();
         std::thread::sleep(std::time::Duration::from_millis(20));
         fs::write(checkpoints.latest(), "copy").unwrap();
         assert_eq!(checkpoints.newest_first()[0], checkpoints.latest());
         std::thread::sleep(std::time::Duration::from_millis(20));
-        fs::write(checkpoints.of_iteration(100), "newer than the copy").unwrap();
-        assert_eq!(checkpoints.newest_first()[0], checkpoints.of_iteration(100));
+        fs::write(checkpoints.path_of(100), "newer than the copy").unwrap();
+        assert_eq!(checkpoints.newest_first()[0], checkpoints.path_of(100));
     }
 
     #[test]
     fn later_ones_are_put_aside_when_an_earlier_one_is_gone_on_from() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::of(place.path());
+        let checkpoints = Checkpoints::new(place.path());
         for iteration in [20, 40, 60, 30] {
             checkpoints.write(iteration, b"", 3).unwrap();
         }
@@ -191,12 +191,12 @@ mod tests {
     #[test]
     fn what_was_there_stays_when_the_next_cannot_be_written() {
         let place = tempfile::tempdir().unwrap();
-        let checkpoints = Checkpoints::of(place.path());
+        let checkpoints = Checkpoints::new(place.path());
         checkpoints.write(20, b"good", 1).unwrap();
         // A folder with this name cannot be replaced, not even by root.
-        fs::create_dir(checkpoints.of_iteration(40)).unwrap();
+        fs::create_dir(checkpoints.path_of(40)).unwrap();
         assert!(checkpoints.write(40, b"bad", 1).is_err());
         assert_eq!(fs::read(checkpoints.latest()).unwrap(), b"good");
-        assert_eq!(fs::read(checkpoints.of_iteration(20)).unwrap(), b"good");
+        assert_eq!(fs::read(checkpoints.path_of(20)).unwrap(), b"good");
     }
 }

@@ -198,7 +198,7 @@ mod tests {
     fn an_event_file_holds_its_version_the_settings_and_the_values_that_are_known_each_tag_described_once() {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 7);
-        let histograms = vec![("histogram/std", Histogram::of([0.5_f32, 1.5].iter()))];
+        let histograms = vec![("histogram/std", Histogram::new([0.5_f32, 1.5].iter()))];
         let film = Some(("eval/film", Animation { size: [3, 2], gif: vec![1, 2] }));
         let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
         events.iteration(9, &values, &Media { histograms, film }).unwrap();

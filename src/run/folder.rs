@@ -126,7 +126,7 @@ impl RunFolder {
         } else {
             let place = place.canonicalize().with_context(|| format!("cannot read {}", place.display()))?;
             let run = place.parent().and_then(Path::parent);
-            match run.map(|run| (run, Checkpoints::of(run))) {
+            match run.map(|run| (run, Checkpoints::new(run))) {
                 Some((run, checkpoints)) if place.parent() == Some(checkpoints.folder()) => run.to_owned(),
                 _ => bail!("{} does not lie in the checkpoints folder of a run", place.display()),
             }
@@ -141,7 +141,7 @@ impl RunFolder {
     /// Fails if another training process uses the folder, if it contains a link, or if it cannot be written to.
     pub fn lock(&self) -> Result<Locked> {
         self.expect_plain()?;
-        Locked::take(&self.path)
+        Locked::acquire(&self.path)
     }
 
     /// Prepares a locked folder for writing: removes files that a crash left incomplete, and signs the lock.
@@ -207,7 +207,7 @@ impl RunFolder {
 
     /// Returns its checkpoints.
     pub fn checkpoints(&self) -> Checkpoints {
-        Checkpoints::of(&self.path)
+        Checkpoints::new(&self.path)
     }
 
     /// Returns the path of the policy without its training state: the best one, or the latest if none was scored yet.
@@ -270,7 +270,7 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
 /// Returns the run folder: `folder` itself, or its parent if `folder` is the checkpoints folder of a run.
 fn run_of(folder: &Path) -> PathBuf {
     let run = folder.canonicalize().ok().and_then(|whole| Some(whole.parent()?.to_owned()));
-    let inside = run.filter(|run| same_file(Checkpoints::of(run).folder(), folder));
+    let inside = run.filter(|run| same_file(Checkpoints::new(run).folder(), folder));
     inside.unwrap_or_else(|| folder.to_owned())
 }
 

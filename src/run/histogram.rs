@@ -22,7 +22,7 @@ pub struct Histogram {
 
 impl Histogram {
     /// Counts `values`, which must be finite.
-    pub fn of<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> Self {
+    pub fn new<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> Self {
         let values = values.map(|&x| f64::from(x));
         let (min, max) = values.clone().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
         // All values may be the same.
@@ -47,7 +47,7 @@ mod tests {
     #[test]
     fn every_value_is_counted_in_the_bin_between_whose_limits_it_lies() {
         let values: Vec<f32> = (0..=120).map(|i| (i as f32 - 60.0) / 60.0).collect();
-        let found = Histogram::of(values.iter());
+        let found = Histogram::new(values.iter());
         assert_eq!((found.min, found.max, found.limits.len()), (-1.0, 1.0, BINS));
         assert_eq!(found.counts.iter().sum::<f64>(), 121.0);
         // Two values in each bin, and the largest in the last.
@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn equal_values_fill_one_bin() {
-        let found = Histogram::of([0.25_f32; 20].iter());
+        let found = Histogram::new([0.25_f32; 20].iter());
         assert_eq!((found.limits, found.counts), (vec![0.25], vec![20.0]));
     }
 }

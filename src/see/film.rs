@@ -17,7 +17,7 @@ use crate::repose::{Repose, Task};
 use crate::run::Animation;
 use crate::sim::{Quality, Renderer};
 
-use super::task_to_see;
+use super::task_for_display;
 
 /// A film of episodes played one after another.
 pub struct Film {
@@ -94,8 +94,11 @@ impl Film {
         self.writer.finish()?;
         let [width, height] = self.renderer.size();
         let seconds = self.all_frames as f64 / f64::from(self.fps);
-        let pace = self.all_frames as f64 / self.begun.elapsed().as_secs_f64();
-        Ok(format!("{width}x{height}, {} frames, {seconds:.2} s, rendered at {pace:.1} frames/s", self.all_frames))
+        let goal_times = self.all_frames as f64 / self.begun.elapsed().as_secs_f64();
+        Ok(format!(
+            "{width}x{height}, {} frames, {seconds:.2} s, rendered at {goal_times:.1} frames/s",
+            self.all_frames
+        ))
     }
 }
 
@@ -116,7 +119,7 @@ impl EpisodeFilms {
     pub fn new(config: &EnvConfig) -> Result<Self> {
         // Primitives, since a training should not need the hand's meshes.
         let shot = Shot { size: None, camera: None, quality: None, plain: true };
-        let task = task_to_see(config, &shot, ANIMATION.0, Quality::Fast)?;
+        let task = task_for_display(config, &shot, ANIMATION.0, Quality::Fast)?;
         let renderer = Renderer::new(task.scene())?;
         Ok(Self { task, renderer })
     }

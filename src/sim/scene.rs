@@ -70,23 +70,23 @@ impl Scene {
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
         quieten_mujoco();
-        Self::of(compilation.compile(file)?, origin(file), compilation)
+        Self::checked(compilation.compile(file)?, origin(file), compilation)
     }
 
     /// Loads the same scene, with the same physics, and with what is needed for display.
     ///
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
-    pub fn load_to_see(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
+    pub fn load_for_display(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
         let mut scene = Self::load(file, compilation)?;
         if file.is_none() && !look.meshes.is_empty() {
-            scene = Self::of(look.dress(compilation)?, scene.origin, compilation)?;
+            scene = Self::checked(look.dress(compilation)?, scene.origin, compilation)?;
         }
         // A scene that cannot be given more is shown as it is.
         if let Some(file) = file
             && let Ok(Some(model)) = furnished(file, &scene.model, compilation)
         {
-            scene = Self::of(model, scene.origin, compilation)?;
+            scene = Self::checked(model, scene.origin, compilation)?;
         }
         Ok(scene)
     }
@@ -102,7 +102,7 @@ impl Scene {
         look.set_up(model);
     }
 
-    fn of(mut model: MjModel, origin: String, compilation: &Compilation) -> Result<Self> {
+    fn checked(mut model: MjModel, origin: String, compilation: &Compilation) -> Result<Self> {
         if let Some(culprit) = not_finite(&model) {
             bail!("{origin}: {culprit} is not a finite number");
         }
@@ -224,7 +224,7 @@ impl Scene {
     }
 
     /// Returns the scene's file, for messages.
-    pub fn origin(&self) -> &str {
+    pub fn file_label(&self) -> &str {
         &self.origin
     }
 

@@ -57,8 +57,8 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     if randomizes && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
-            "[randomization]: each of {} hands gets its own model of this scene, from {} steps on: {gib:.1} GiB in all; none with \
-             randomization.share=0",
+            "[randomization]: each of {} hands gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
+             (randomization.share=0 avoids this)",
             config.env.num_envs, share.after
         ));
     }
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
     use crate::config::Override;
 
-    fn of(sets: &[&str]) -> Vec<String> {
+    fn hints_for(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
         let default = Config::resolve(None, &[]).unwrap();
         hints(&Config::resolve(None, &sets).unwrap(), &default, 1 << 20)
@@ -80,25 +80,25 @@ mod tests {
 
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
-        let [line] = &of(&["run.total_steps=18000000"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
         assert!(line.contains("training.tolerance, training.hold, ppo.std, which last up to 20000000 steps"), "{line}");
         assert!(!line.contains("task_reward"), "its ramp ends in time: {line}");
-        let [line] = &of(&["ppo.minibatches=32"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["ppo.minibatches=32"])[..] else { panic!("one line") };
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
-        let [line] = &of(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
         assert!(
             line.starts_with("env.dist_reward_scale = -20: training.task_reward multiplies it by only 0.03"),
             "{line}"
         );
-        assert!(of(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
-        let [line] = &of(&["env.num_envs=8192"])[..] else { panic!("one line") };
+        assert!(hints_for(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
+        let [line] = &hints_for(&["env.num_envs=8192"])[..] else { panic!("one line") };
         assert!(
             line.contains("each of 8192 hands gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
             "{line}"
         );
-        assert!(of(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
-        assert!(of(&["env.num_envs=8192", "run.total_steps=30_000_000"]).is_empty(), "it ends before");
-        let [line] = &of(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
+        assert!(hints_for(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
+        assert!(hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]).is_empty(), "it ends before");
+        let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
         assert!(line.ends_with("nothing is randomised in 175000000 steps"), "{line}");
     }
 

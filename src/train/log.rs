@@ -2,9 +2,9 @@
 
 use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
-use crate::quantities::quantity;
 use crate::repose::{EpisodeStats, Score};
 use crate::run::{self, Histogram, Tag};
+use crate::tags::quantity;
 
 /// The scores of the episodes that ended in an iteration.
 pub(super) struct Ended {
@@ -16,7 +16,7 @@ pub(super) struct Ended {
 
 impl Ended {
     /// Computes the scores of `episodes`, in a training with or without randomised ones.
-    pub(super) fn of(episodes: &[EpisodeStats], randomizes: bool) -> Self {
+    pub(super) fn new(episodes: &[EpisodeStats], randomizes: bool) -> Self {
         let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
         Self { nominal: Score::of(&nominal), randomized: randomizes.then(|| Score::of(&drawn)) }
     }
@@ -53,7 +53,7 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
 
 /// Returns the names of the values of any iteration, in a training with or without randomised episodes.
 pub(super) fn tags(randomizes: bool) -> Vec<String> {
-    let empty = row(&Outcome::default(), &Ended::of(&[], randomizes));
+    let empty = row(&Outcome::default(), &Ended::new(&[], randomizes));
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -74,7 +74,7 @@ pub(super) fn described(names: &[String]) -> Vec<Tag> {
 
 /// Returns the histograms of the rollout that was just learnt from.
 pub(super) fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
-    let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::of(rollout.blocks.iter().flat_map(of));
+    let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::new(rollout.blocks.iter().flat_map(of));
     vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
 }
 
@@ -142,7 +142,7 @@ mod tests {
             ..Default::default()
         };
         let other = EpisodeStats { randomized: true, ..episode(TaskReward::default(), 200, 8) };
-        let ended = |randomizes| Ended::of(&[episode(reward, 80, 2), other], randomizes);
+        let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], randomizes);
         let evaluation = Score::of(&[episode(TaskReward::default(), 1000, 5), episode(reward, 50, 0)]);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
             episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
@@ -169,7 +169,7 @@ mod tests {
         let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
         assert_eq!(row(true), expected);
         assert_eq!(tags(true), names(&expected));
-        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::of(&all, true).shown().goals);
+        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, true).shown().goals);
         assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }
 }

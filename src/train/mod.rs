@@ -202,7 +202,7 @@ impl Session {
 
     fn report(&mut self, report: &mut Report, outcome: &Outcome) {
         let Outcome { iteration, steps, evaluation, media, .. } = outcome;
-        let ended = Ended::of(&outcome.ended, self.config.randomization.happens());
+        let ended = Ended::new(&outcome.ended, self.config.randomization.happens());
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
         let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };

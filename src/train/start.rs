@@ -10,7 +10,7 @@ use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
 use crate::config::{Config, NetConfig, Override, PolicyConfig, user_file};
-use crate::load::{self, MODEL, Origin};
+use crate::load::{self, MODEL, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
 use crate::ranks::Exchange;
@@ -78,7 +78,7 @@ impl Plan {
             absolute_model_path(&mut config)?;
             return Ok(Self::new(config, args));
         };
-        let origin = Origin::of(place)?;
+        let origin = PolicySource::find(place)?;
         let (checkpoint, PolicyConfig { net, .. }) = origin.load_for_any_scene()?;
         let mut config = Config::resolve_around(&net, user.as_ref(), &overrides)?;
         absolute_model_path(&mut config)?;
@@ -134,7 +134,7 @@ impl Plan {
     /// # Errors
     /// Fails if the checkpoint cannot be resumed from, or if the settings do not fit it.
     pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
-        if matches!(Origin::of(place), Ok(Origin::BuiltIn(_))) {
+        if matches!(PolicySource::find(place), Ok(PolicySource::BuiltIn(_))) {
             let name = place.display();
             bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
         }

@@ -12,9 +12,9 @@ mod docs;
 mod experiment;
 mod export;
 mod fork;
+mod goal_times;
 mod mpi;
 mod outputs;
-mod pace;
 #[cfg(feature = "video")]
 mod pictures;
 mod point_mass;

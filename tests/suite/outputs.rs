@@ -22,7 +22,7 @@ fn shell(folder: &Path, before: &str, args: &[&str], after: &str) -> Output {
 }
 
 #[test]
-fn m3_what_a_link_leads_to_is_written_and_the_link_stays() {
+fn what_a_link_leads_to_is_written_and_the_link_stays() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     fs::write(folder.join("target"), "old").unwrap();
@@ -41,7 +41,7 @@ fn m3_what_a_link_leads_to_is_written_and_the_link_stays() {
 }
 
 #[test]
-fn m6_a_result_that_cannot_be_printed_is_an_error() {
+fn a_result_that_cannot_be_printed_is_an_error() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let bench = ["bench", "--json", "--only", "learner", "--set", "env.num_envs=16", "--set", "ppo.hidden=[8]"];
@@ -59,7 +59,7 @@ fn m6_a_result_that_cannot_be_printed_is_an_error() {
 }
 
 #[test]
-fn l13_a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
+fn a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let args = [&SHORT[..], &["--episodes", "30", "--trace", "trace"]].concat();
@@ -70,7 +70,7 @@ fn l13_a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
 }
 
 #[test]
-fn l16_one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
+fn one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let refused = |args: &[&str], reason: &str| {
@@ -91,7 +91,7 @@ fn l16_one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
 }
 
 #[test]
-fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
+fn a_trace_that_is_interrupted_leaves_nothing_behind() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     for (signal, number) in [("TERM", 15), ("INT", 2), ("HUP", 1)] {
@@ -111,7 +111,7 @@ fn l18_a_trace_that_is_interrupted_leaves_nothing_behind() {
 }
 
 #[test]
-fn l24_more_threads_than_make_sense_are_refused() {
+fn more_threads_than_make_sense_are_refused() {
     let place = tempfile::tempdir().unwrap();
     for args in [&["train", "--threads", "3000"][..], &["play", "--threads", "3000", "--headless"]] {
         let output = program(place.path(), args);
@@ -122,7 +122,7 @@ fn l24_more_threads_than_make_sense_are_refused() {
 }
 
 #[test]
-fn l25_signals_that_are_ignored_at_the_start_stay_ignored_and_steps_may_be_written_as_powers() {
+fn signals_that_are_ignored_at_the_start_stay_ignored_and_steps_may_be_written_as_powers() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let args = train(&["--total-steps", "9e3", "--run-dir", "run"]);
@@ -145,7 +145,7 @@ fn l25_signals_that_are_ignored_at_the_start_stay_ignored_and_steps_may_be_writt
 }
 
 #[test]
-fn l25_a_name_that_is_no_text_is_resumed_as_the_program_says() {
+fn a_name_that_is_no_text_is_resumed_as_the_program_says() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let odd = std::ffi::OsStr::from_bytes(b"a \xff\n'x");
@@ -186,7 +186,7 @@ fn on_a_terminal(folder: &Path, kind: &str, columns: u32, args: &[&str]) -> Opti
 }
 
 #[test]
-fn m10_plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it_can() {
+fn plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it_can() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     for (run, (kind, columns, drawn)) in
@@ -233,7 +233,7 @@ fn a_quiet_training_says_its_folder_its_evaluations_and_its_end() {
 }
 
 #[test]
-fn m11_a_training_or_a_score_that_mostly_diverges_says_so() {
+fn a_training_or_a_score_that_mostly_diverges_says_so() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let sets = ["--set", "env.cube_mass_scale=1e6", "--set", "env.sim_dt=0.01", "--set", "env.friction_scale=1e6"];
@@ -252,7 +252,7 @@ fn m11_a_training_or_a_score_that_mostly_diverges_says_so() {
 }
 
 #[test]
-fn l14_l15_plot_ends_on_any_file_soon_and_says_little() {
+fn plot_ends_on_any_file_soon_and_says_little() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let header = "iteration,env_steps,time/collect_s,time/update_s,eval/goals,episode/goals,episode/rot_dist,episode/drop_rate\n";

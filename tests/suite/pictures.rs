@@ -192,7 +192,7 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
         quality: Quality::Fast,
     };
     let config = env_config(&[]);
-    let (plain, dressed) = (Task::new(&config).unwrap(), Task::new_to_see(&config, &look).unwrap());
+    let (plain, dressed) = (Task::new(&config).unwrap(), Task::for_display(&config, &look).unwrap());
     same_physics(&plain, &dressed);
 }
 
@@ -222,7 +222,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     std::fs::write(&path, bare).unwrap();
     let config = env_config(&[&format!("env.model={}", path.display())]);
     let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
-    let (plain, furnished) = (Task::new(&config).unwrap(), Task::new_to_see(&config, &look).unwrap());
+    let (plain, furnished) = (Task::new(&config).unwrap(), Task::for_display(&config, &look).unwrap());
     let geoms = [&plain, &furnished].map(|task| task.scene().geoms());
     assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
     same_physics(&plain, &furnished);
@@ -242,7 +242,7 @@ fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
         camera: None,
         quality: Quality::Fast,
     };
-    let refusal = Task::new_to_see(&env_config(&[]), &look).err().unwrap().to_string();
+    let refusal = Task::for_display(&env_config(&[]), &look).err().unwrap().to_string();
     assert!(refusal.contains(".obj"), "{refusal}");
 }
 

@@ -55,8 +55,8 @@ impl Env for PointMass {
         self.write(observation);
     }
 
-    fn skip_ahead(&mut self, share: f64) {
-        self.age = (share * f64::from(STEPS)) as u32;
+    fn skip_ahead(&mut self, fraction: f64) {
+        self.age = (fraction * f64::from(STEPS)) as u32;
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {

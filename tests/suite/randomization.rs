@@ -11,7 +11,7 @@ use shadow_repose::config::{Config, Ramp};
 use shadow_repose::env::{Env, EnvState, Resumable};
 use shadow_repose::evaluate::{Actor, Episodes, evaluate};
 use shadow_repose::load::Loaded;
-use shadow_repose::repose::{Draw, Lesson, OBSERVATION_SIZE, Randomization, Repose, Score, Task};
+use shadow_repose::repose::{EpisodePhysics, Lesson, OBSERVATION_SIZE, Randomization, Repose, Score, Task};
 use shadow_repose::rng;
 
 use crate::support::{
@@ -178,7 +178,7 @@ fn noise_and_bias_are_seen_but_the_hand_is_where_it_is() {
 }
 
 /// Returns an environment in which all is randomised, and the draws of episodes.
-fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<Draw>) {
+fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<EpisodePhysics>) {
     let mut config = Config::from_text(Path::new("all.toml"), ALL, &[]).unwrap();
     let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
     config = config.changed(None, &sets).unwrap();
@@ -197,7 +197,7 @@ fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<Draw>) {
 #[test]
 fn draws_fill_their_ranges_in_the_share_of_the_episodes_that_was_asked() {
     let (_, draw) = randomized(&["randomization.share=0.75"]);
-    let draws: Vec<Draw> = (0..4000).filter_map(draw).collect();
+    let draws: Vec<EpisodePhysics> = (0..4000).filter_map(draw).collect();
     assert!((2900..3100).contains(&draws.len()), "{}", draws.len());
     let check = |name: &str, values: Vec<f64>, [low, high]: [f64; 2], middle: f64| {
         let (least, most) = values.iter().fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(*x), b.max(*x)));
@@ -206,7 +206,7 @@ fn draws_fill_their_ranges_in_the_share_of_the_episodes_that_was_asked() {
         let below = values.iter().filter(|x| **x < middle).count() as f64 / values.len() as f64;
         assert!((below - 0.5).abs() < 0.05, "{name}: {below} below {middle}");
     };
-    let of = |value: &dyn Fn(&Draw) -> f64| draws.iter().map(value).collect::<Vec<f64>>();
+    let of = |value: &dyn Fn(&EpisodePhysics) -> f64| draws.iter().map(value).collect::<Vec<f64>>();
     check("friction", of(&|draw| draw.physics["friction"][0]), [0.7, 1.3], 1.0);
     check("cube_mass", of(&|draw| draw.physics["cube_mass"][0]), [0.5, 1.5], 1.0);
     check("cube_com", of(&|draw| draw.physics["cube_com"][1]), [-0.003, 0.003], 0.0);
@@ -238,7 +238,7 @@ fn one_setting_does_not_change_what_is_drawn_for_another() {
         assert_eq!(other.physics["friction"], [1.0]);
     }
     let (_, few) = randomized(&["randomization.each=0.25"]);
-    let varied = |draw: Draw| {
+    let varied = |draw: EpisodePhysics| {
         ["friction", "damping"].iter().filter(|name| draw.physics[name][0] != 1.0).count() as u32
             + u32::from(draw.has_noise)
     };

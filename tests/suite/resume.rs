@@ -127,7 +127,7 @@ fn a_run_whose_folder_is_deleted_before_its_first_iteration_is_done_is_made_anew
 }
 
 #[test]
-fn m1_a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
+fn a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     fs::write(folder.join("own.xml"), SCENE).unwrap();
@@ -152,7 +152,7 @@ fn m1_a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
 }
 
 #[test]
-fn m4_a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
+fn a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &["--set", "run.eval_every=3"]);
@@ -179,7 +179,7 @@ fn m4_a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
 }
 
 #[test]
-fn m5_a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_bar() {
+fn a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_bar() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &["--set", "run.eval_every=3"]);
@@ -200,7 +200,7 @@ fn m5_a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_b
 }
 
 #[test]
-fn m8_a_copy_by_second_names_does_not_write_into_the_original() {
+fn a_copy_by_second_names_does_not_write_into_the_original() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &[]);
@@ -215,7 +215,7 @@ fn m8_a_copy_by_second_names_does_not_write_into_the_original() {
 }
 
 #[test]
-fn l12_settings_that_were_edited_in_a_run_folder_are_refused_by_name() {
+fn settings_that_were_edited_in_a_run_folder_are_refused_by_name() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &[]);
@@ -248,7 +248,7 @@ fn l12_settings_that_were_edited_in_a_run_folder_are_refused_by_name() {
 }
 
 #[test]
-fn l22_rows_that_are_missing_are_named() {
+fn rows_that_are_missing_are_named() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &[]);
@@ -267,7 +267,7 @@ fn l22_rows_that_are_missing_are_named() {
 }
 
 #[test]
-fn l23_the_folder_of_its_checkpoints_means_the_run() {
+fn the_folder_of_its_checkpoints_means_the_run() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     run_of_ten(folder, &[]);

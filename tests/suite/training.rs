@@ -59,7 +59,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "their orientations differ");
         for row in [&mut seen, &mut other_seen] {
-            Perception::new(Symmetry::Cube, &SPACES).unwrap().turn(row);
+            Perception::new(Symmetry::Cube, &SPACES).unwrap().canonicalize(row);
         }
         // All but the goals: both environments drew the same one, for cubes of different orientation.
         for same in [0..64, 72..157] {

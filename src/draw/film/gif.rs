@@ -51,7 +51,7 @@ impl<W: Write> GifFilm<W> {
     fn writing(&mut self) -> Result<&mut Writing<W>> {
         if let Stage::Gathering { file, frames } = &mut self.stage {
             let file = file.take().ok_or_else(|| anyhow!("the film could not be started"))?;
-            let mut writing = Writing::new(file, self.format, Palette::of(frames))?;
+            let mut writing = Writing::new(file, self.format, Palette::new(frames))?;
             frames.iter().try_for_each(|rgb| writing.write(rgb))?;
             self.stage = Stage::Writing(Box::new(writing));
         }
@@ -151,7 +151,7 @@ struct Palette {
 
 impl Palette {
     /// Chooses a palette for these frames.
-    fn of(frames: &[Vec<u8>]) -> Self {
+    fn new(frames: &[Vec<u8>]) -> Self {
         let pixels: usize = frames.iter().map(|rgb| rgb.len() / 3).sum();
         let every = pixels.div_ceil(PIXELS_FOR_PALETTE).max(1);
         let all = frames.iter().flat_map(|rgb| rgb.chunks_exact(3));

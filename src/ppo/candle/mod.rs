@@ -38,7 +38,7 @@ impl Reference {
         let column = |of| Tensor::from_vec(array(1, of), samples.len(), &Device::Cpu);
         let raw = array(observation_size, |block| &block.observations);
         let mut observations = vec![0.0; raw.len()];
-        policy.reader().read(&raw, &mut observations);
+        policy.input_transform().apply(&raw, &mut observations);
         Ok(Batch {
             observations: rows(observation_size, observations)?,
             actions: rows(action_size, array(action_size, |block| &block.actions))?,

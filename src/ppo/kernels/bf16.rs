@@ -35,7 +35,7 @@ pub(super) const BLOCK: usize = 2 * LINES;
 /// A unit of the processor that multiplies tiles, in use by this thread.
 pub(super) trait MultiplyBlock {
     /// Writes [`BLOCK`] × [`BLOCK`] values of a product, whose rows are `columns` values apart in `out`, or adds them if `add`
-    /// is set. Of each operand these are the tiles along its first sixteen lines, then along the other sixteen.
+    /// is set. `lhs` and `rhs` hold two rows of tiles each: lines 0-15, then 16-31.
     ///
     /// # Panics
     /// Panics if the sizes do not match.

@@ -105,7 +105,7 @@ impl Kernels {
 
 impl GradientBackend for Kernels {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
-        let (reader, size) = (policy.reader(), policy.spaces.observation_size);
+        let (transform, size) = (policy.input_transform(), policy.spaces.observation_size);
         self.seen.resize(rollout.samples() * size, 0.0);
         let (mut rest, mut parts) = (&mut self.seen[..], Vec::new());
         for block in &rollout.blocks {
@@ -113,7 +113,7 @@ impl GradientBackend for Kernels {
             parts.push((seen, block));
             rest = after;
         }
-        parts.into_par_iter().for_each(|(seen, block)| reader.read(block.acted_on(), seen));
+        parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
     }
 
     fn gradient(

@@ -107,5 +107,5 @@ impl Multiplier {
 fn round_into<'a>(room: &'a mut Vec<f32>, matrix: Matrix) -> Matrix<'a> {
     room.clear();
     room.extend(matrix.data().iter().map(|&x| rounded(x)));
-    matrix.of(room)
+    matrix.with_data(room)
 }

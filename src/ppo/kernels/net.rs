@@ -20,7 +20,7 @@ pub(crate) struct Net<'a> {
 struct Dense<'a> {
     weight: &'a [f32],
     /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
-    turned: Option<Vec<f32>>,
+    weight_t: Option<Vec<f32>>,
     /// The weight, transposed and as it is, as products in bf16 read it, if it was packed.
     packed: [Option<Packed>; 2],
     bias: &'a [f32],
@@ -72,7 +72,7 @@ impl<'a> Net<'a> {
     pub(crate) fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
         let layer = |layer: &parameters::Layer| Dense {
             weight: &parameters[layer.weight.clone()],
-            turned: None,
+            weight_t: None,
             packed: [None, None],
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
@@ -85,11 +85,11 @@ impl<'a> Net<'a> {
     /// rearranges the weights, which takes longer than the product if there are few rows. The results are the same, bit for bit.
     pub(crate) fn for_few_rows(mut self) -> Self {
         for layer in &mut self.layers {
-            let mut turned = vec![0.0; layer.weight.len()];
+            let mut weight_t = vec![0.0; layer.weight.len()];
             for (output, row) in layer.weight.chunks_exact(layer.inputs).enumerate() {
-                turned[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
+                weight_t[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
             }
-            layer.turned = Some(turned);
+            layer.weight_t = Some(weight_t);
         }
         self
     }
@@ -126,7 +126,7 @@ impl<'a> Net<'a> {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
-            let weight = Right::new(layer.turned(rows), layer.packed[0].as_ref());
+            let weight = Right::new(layer.weight_t(rows), layer.packed[0].as_ref());
             work.multiplier.product(y, layer.x(x, rows), weight, false);
             if l + 1 == self.layers.len() {
                 add_bias(y, layer.bias);
@@ -172,11 +172,11 @@ impl Dense<'_> {
     }
 
     /// Returns the transposed weight, for a product with `rows` rows.
-    fn turned(&self, rows: usize) -> Matrix<'_> {
+    fn weight_t(&self, rows: usize) -> Matrix<'_> {
         // gemm adds up single rows and small products in an order that depends on how the weight is stored.
         let ordered = rows > 1 && rows * self.outputs > LARGEST_SMALL;
-        match self.turned.as_ref().filter(|_| ordered) {
-            Some(turned) => Matrix::new(turned, self.inputs, self.outputs),
+        match self.weight_t.as_ref().filter(|_| ordered) {
+            Some(weight_t) => Matrix::new(weight_t, self.inputs, self.outputs),
             None => self.weight().transposed(),
         }
     }

@@ -41,7 +41,7 @@ impl<'a> Matrix<'a> {
     }
 
     /// Returns a matrix of other data with the same layout.
-    pub fn of<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
+    pub fn with_data<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
         assert_eq!(data.len(), self.data.len(), "elements of a matrix");
         Matrix { data, size: self.size, strides: self.strides }
     }

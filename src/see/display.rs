@@ -14,7 +14,7 @@ use crate::sim::{Look, Quality, mesh_files};
 ///
 /// # Errors
 /// Fails like [`Task::new`].
-pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
+pub fn task_for_display(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
     let own_scene = config.model_file().is_some();
     let meshes = if shot.plain || own_scene {
         Vec::new()
@@ -26,12 +26,12 @@ pub fn task_to_see(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Qua
     };
     let quality = shot.quality.unwrap_or(quality);
     let mut look = Look { meshes, size: shot.size.unwrap_or(size), camera: shot.camera, quality };
-    Task::new_to_see(config, &look).or_else(|error| {
+    Task::for_display(config, &look).or_else(|error| {
         if look.meshes.is_empty() {
             return Err(error);
         }
         os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
         look.meshes.clear();
-        Task::new_to_see(config, &look)
+        Task::for_display(config, &look)
     })
 }

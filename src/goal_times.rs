@@ -1,4 +1,4 @@
-//! The steps that goals take, and early drops: weaknesses of a policy that its score does not show.
+//! Steps needed per goal, and early drops: weaknesses that the mean score hides.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use crate::env::Env;
 use crate::evaluate::Moment;
 
 /// The goals reached in a set of episodes, and their early drops.
-pub struct Pace {
+pub struct GoalTimes {
     /// Steps within the tolerance that reach a goal.
     hold: u32,
     /// Control steps per second.
@@ -31,8 +31,8 @@ struct Goal {
     angle: f64,
 }
 
-impl Pace {
-    /// Creates an empty `Pace` for episodes with these settings.
+impl GoalTimes {
+    /// Creates an empty `GoalTimes` for episodes with these settings.
     pub fn new(config: &EnvConfig) -> Self {
         let (hold, second) = (config.max_consecutive_successes, (1.0 / config.ctrl_dt).round() as u32);
         Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
@@ -65,7 +65,7 @@ impl Pace {
         let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
         steps.sort_by(f64::total_cmp);
         let known = |value: f64| if steps.is_empty() { f64::NAN } else { value };
-        let at = |share: f64| known(percentile(&steps, share));
+        let at = |fraction: f64| known(percentile(&steps, fraction));
         let to_goal = json!({
             "mean": known(steps.iter().sum::<f64>() / steps.len() as f64),
             "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
@@ -80,9 +80,9 @@ impl Pace {
     }
 }
 
-/// Returns the value below which the fraction `share` of the `sorted` values lies, interpolated linearly.
-fn percentile(sorted: &[f64], share: f64) -> f64 {
-    let place = share * sorted.len().saturating_sub(1) as f64;
+/// Returns the value below which the `fraction` of the `sorted` values lies, interpolated linearly.
+fn percentile(sorted: &[f64], fraction: f64) -> f64 {
+    let place = fraction * sorted.len().saturating_sub(1) as f64;
     let (below, part) = (place as usize, place.fract());
     let [low, high] = [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
     low + part * (high - low)
@@ -109,17 +109,17 @@ mod tests {
     use super::*;
     use crate::config::Config;
 
-    fn pace(reached: &[(u32, f64)]) -> Pace {
-        let mut pace = Pace::new(&Config::resolve(None, &[]).unwrap().env);
-        pace.reached = reached.iter().map(|&(steps, angle)| Goal { steps, angle }).collect();
-        pace
+    fn goal_times(reached: &[(u32, f64)]) -> GoalTimes {
+        let mut goal_times = GoalTimes::new(&Config::resolve(None, &[]).unwrap().env);
+        goal_times.reached = reached.iter().map(|&(steps, angle)| Goal { steps, angle }).collect();
+        goal_times
     }
 
     #[test]
     fn percentiles_lie_between_neighbours_and_the_line_is_the_one_that_was_laid() {
         // 50 steps to hold, 34 to settle, 30 per rad.
         let reached: Vec<(u32, f64)> = (0..=10).map(|i| (84 + 3 * i, 0.1 * f64::from(i))).collect();
-        let named = pace(&reached).named();
+        let named = goal_times(&reached).named();
         assert_eq!(named[0].1, json!({ "mean": 99.0, "p10": 87.0, "p50": 99.0, "p90": 111.0, "p99": 113.7 }));
         let [settle, per_rad] = ["settle", "per_rad"].map(|key| named[2].1[key].as_f64().unwrap());
         assert!((settle - 34.0).abs() < 1e-9 && (per_rad - 30.0).abs() < 1e-9, "{settle} {per_rad}");
@@ -127,9 +127,9 @@ mod tests {
 
     #[test]
     fn of_no_goals_nothing_is_known_and_of_one_no_line() {
-        let none = pace(&[]).named();
+        let none = goal_times(&[]).named();
         assert!(none[0].1["mean"].is_null() && none[0].1["p50"].is_null() && none[1].1.is_null());
-        let one = pace(&[(90, 1.0)]).named();
+        let one = goal_times(&[(90, 1.0)]).named();
         assert_eq!((&one[0].1["p99"], &one[2].1["per_rad"]), (&json!(90.0), &Value::Null));
     }
 }
