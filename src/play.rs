@@ -6,6 +6,8 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+#[cfg(not(all(feature = "video", feature = "viewer")))]
+use anyhow::bail;
 use anyhow::{Context, Result, ensure};
 use serde_json::{Map, Value, json};
 
@@ -17,8 +19,7 @@ use crate::load::Loaded;
 use crate::os::{self, Requests};
 use crate::repose::{Score, Task};
 use crate::robustness::robustness;
-use crate::see::{Film, HAS_WINDOWS, Window, task_for_display};
-use crate::sim::Quality;
+use crate::see;
 use crate::trace::Trace;
 
 /// Plays in a window, as a film, or without either, and prints the score unless it was a window. Returns the exit code of the
@@ -123,12 +124,18 @@ fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
 
 fn wants_window(args: &PlayArgs) -> bool {
     let otherwise = args.robustness || args.headless || args.json || args.trace.is_some() || args.video.is_some();
-    args.window || !otherwise && HAS_WINDOWS && os::has_display()
+    args.window || !otherwise && cfg!(feature = "viewer") && os::has_display()
+}
+
+#[cfg(not(feature = "viewer"))]
+fn show(_: &PlayArgs, _: &EnvConfig, _: Option<&Loaded>) -> Result<bool> {
+    bail!(see::NO_WINDOWS)
 }
 
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
+#[cfg(feature = "viewer")]
 fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
-    let task = task_for_display(config, &args.shot, [1280, 720], Quality::High)?;
+    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
     let (names, actors, first) = match (loaded, args.policy) {
         (Some(loaded), _) => {
             let policy = &loaded.policy;
@@ -140,7 +147,7 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
             (vec!["zero", "random"], vec![Actor::Zero, Actor::Random], first)
         }
     };
-    let window = match Window::open(&task, names, first) {
+    let window = match see::Window::open(&task, names, first) {
         Err(error) if !args.window => {
             os::say(&format!("note: {error:#}\n  Continuing as with --headless."));
             return Ok(false);
@@ -151,7 +158,20 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
     Ok(true)
 }
 
+#[cfg(not(feature = "video"))]
+fn film(
+    _: &Path,
+    _: &EnvConfig,
+    _: &Actor,
+    _: &PlayArgs,
+    _: &Requests,
+    _: &mut dyn FnMut(&Moment),
+) -> Result<Option<Score>> {
+    bail!(see::NO_FILMS)
+}
+
 /// Plays the episodes one after another and films them. If interrupted, it leaves a film of what was played.
+#[cfg(feature = "video")]
 fn film(
     path: &Path,
     config: &EnvConfig,
@@ -160,9 +180,9 @@ fn film(
     requests: &Requests,
     observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
-    let task = task_for_display(config, &args.shot, [640, 480], Quality::Fast)?;
+    let task = see::task_for_display(config, &args.shot, [640, 480], crate::sim::Quality::Fast)?;
     let all = episodes(args, 1);
-    let mut film = Film::create(path, &task, args.fps, all.count as u64)?;
+    let mut film = see::Film::create(path, &task, args.fps, all.count as u64)?;
     // Unlike the other outputs, a film is worth keeping if it is interrupted.
     requests.wait_for_end();
     let mut played = Vec::new();

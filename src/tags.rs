@@ -1,7 +1,7 @@
 //! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Description, Lesson, OfTask, OfTraining, TermList};
+use crate::repose::{Description, Lesson, TaskReward, TrainingReward};
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -75,13 +75,13 @@ pub fn quantity(name: &str) -> Option<Quantity> {
         return Some(Quantity { title: (*title).to_owned(), description: (*description).to_owned() });
     }
     if let Some((group, name)) = name.split_once('/') {
-        let term = |list: Vec<Description>| list.into_iter().find(|term| term.name == name);
-        let mean = |term: Description| format!("{}, mean per step.", term.text.trim_end_matches('.'));
+        let term = |list: Vec<Description>| list.into_iter().find(|term| term.0 == name);
+        let mean = |term: Description| format!("{}, mean per step.", term.1.trim_end_matches('.'));
         let (title, description) = match group {
-            "reward" => (format!("reward: {name}"), term(OfTask::descriptions().collect()).map(mean)),
+            "reward" => (format!("reward: {name}"), term(TaskReward::descriptions()).map(mean)),
             "training" => {
-                let paid = term(OfTraining::descriptions().collect()).map(mean);
-                let of_lesson = term(Lesson::descriptions().collect()).map(|value| value.text.to_owned());
+                let paid = term(TrainingReward::descriptions()).map(mean);
+                let of_lesson = term(Lesson::descriptions().collect()).map(|value| value.1.to_owned());
                 (format!("training: {name}"), paid.or(of_lesson))
             }
             _ => (String::new(), None),

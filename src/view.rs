@@ -1,13 +1,23 @@
 //! Showing the scene without a policy: in a window, or as one picture.
 
-use anyhow::Result;
+use std::path::Path;
+
+#[cfg(not(all(feature = "video", feature = "viewer")))]
+use anyhow::bail;
+use anyhow::{Context, Result};
 
 use crate::cli::{Motion, ViewArgs, usage_error};
-use crate::config::{Config, expect_used, user_file};
+use crate::config::{Config, EnvConfig, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
 use crate::os;
-use crate::see::{Window, screenshot, task_for_display};
-use crate::sim::Quality;
+use crate::see;
+
+/// The actors, and their names in a window.
+const ACTORS: [(Motion, &str, Actor); 3] = [
+    (Motion::Zero, "zero", Actor::Zero),
+    (Motion::Random, "random", Actor::Random),
+    (Motion::Wave, "wave", Actor::Wave),
+];
 
 /// Shows the scene in a window, or writes one picture of it.
 ///
@@ -21,20 +31,36 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
-    let task = task_for_display(&config.env, &args.shot, [1280, 720], Quality::High)?;
-    let actors = [Actor::Zero, Actor::Random, Actor::Wave];
-    let first = match args.actions {
-        Motion::Zero => 0,
-        Motion::Random => 1,
-        Motion::Wave => 2,
-    };
+    let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
     let episodes = Episodes { seed: args.seed, purpose: "score", first: 0, count: usize::MAX };
-    if let Some(path) = &args.screenshot {
-        let [width, height] = screenshot(path, &task, &actors[first], episodes, args.at)?;
-        os::say(&format!("{}: {width}x{height}", path.display()));
-        return Ok(());
+    match &args.screenshot {
+        Some(path) => draw(path, args, &config.env, &ACTORS[first].2, episodes),
+        None => show(args, &config.env, first, episodes),
     }
-    let window = Window::open(&task, vec!["zero", "random", "wave"], first)?;
-    os::say(&window.play(&task, &actors, episodes)?);
+}
+
+#[cfg(feature = "video")]
+fn draw(path: &Path, args: &ViewArgs, config: &EnvConfig, actor: &Actor, episodes: Episodes) -> Result<()> {
+    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    let [width, height] = see::screenshot(path, &task, actor, episodes, args.at)?;
+    os::say(&format!("{}: {width}x{height}", path.display()));
     Ok(())
+}
+
+#[cfg(not(feature = "video"))]
+fn draw(_: &Path, _: &ViewArgs, _: &EnvConfig, _: &Actor, _: Episodes) -> Result<()> {
+    bail!(see::NO_FILMS)
+}
+
+#[cfg(feature = "viewer")]
+fn show(args: &ViewArgs, config: &EnvConfig, first: usize, episodes: Episodes) -> Result<()> {
+    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    let window = see::Window::open(&task, ACTORS.iter().map(|(_, name, _)| *name).collect(), first)?;
+    os::say(&window.play(&task, &ACTORS.map(|(.., actor)| actor), episodes)?);
+    Ok(())
+}
+
+#[cfg(not(feature = "viewer"))]
+fn show(_: &ViewArgs, _: &EnvConfig, _: usize, _: Episodes) -> Result<()> {
+    bail!(see::NO_WINDOWS)
 }

@@ -1,7 +1,6 @@
 //! The lesson: what training changes about the task and adds to its reward at a given step of a run.
 
-use super::reward::{ramped, training_reward, training_weights};
-use super::terms::Description;
+use super::reward::{Description, ramped, training_reward, training_weights};
 use super::{Step, TrainingReward};
 use crate::config::{Config, EnvConfig};
 
@@ -56,20 +55,19 @@ impl Lesson {
 
     fn described(&self) -> Vec<(Description, f64)> {
         let Self { tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
-        let about = |name, text| Description { name, text };
         let mut all = vec![
-            (about("tolerance", "The rotation error, rad, up to which a goal counts in training."), tolerance),
-            (about("hold", "The steps within the tolerance that reach a goal in training."), f64::from(hold)),
-            (about("task_reward", "The weight of the task's reward in training."), task_reward),
+            (Description("tolerance", "The rotation error, rad, up to which a goal counts in training."), tolerance),
+            (Description("hold", "The steps within the tolerance that reach a goal in training."), f64::from(hold)),
+            (Description("task_reward", "The weight of the task's reward in training."), task_reward),
         ];
         all.extend(ramped(weights));
-        all.push((about("randomized", "Probability that an episode that begins is randomised."), randomized));
+        all.push((Description("randomized", "Probability that an episode that begins is randomised."), randomized));
         all
     }
 
     /// Returns the values that change during training, by name.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> {
-        self.described().into_iter().map(|(about, value)| (about.name, value))
+        self.described().into_iter().map(|(about, value)| (about.0, value))
     }
 
     /// Returns the descriptions of these values.

@@ -13,7 +13,6 @@ mod reward;
 mod sensing;
 mod servos;
 mod task;
-mod terms;
 
 pub use divergence::{Diverged, Tail, divergence};
 pub use environment::{Repose, StepDetails};
@@ -23,6 +22,5 @@ pub use lesson::Lesson;
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};
 pub use physics::{Physics, QUANTITIES, Quantity, add_settings};
 pub use randomization::{EpisodePhysics, Randomization};
-pub use reward::{OfTask, OfTraining, Step, TaskReward, TrainingReward, task_reward};
+pub use reward::{Description, Step, TaskReward, Terms, TrainingReward, task_reward};
 pub use task::Task;
-pub use terms::{Description, TermList, Terms};

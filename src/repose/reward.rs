@@ -2,8 +2,13 @@
 //!
 //! A term is one row. Its column in `metrics.csv`, its tag, its sums and its description follow from that row.
 
+use std::fmt;
+use std::ops::{AddAssign, Index};
+
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
 use super::hand::{ACTION_SIZE, JOINTS};
-use super::terms::{Description, TermList, Terms};
 use crate::config::{EnvConfig, Ramp, TrainingConfig};
 use crate::sim::{Pose, Velocity};
 
@@ -34,123 +39,162 @@ pub struct Step {
     pub joint_vel: [f64; JOINTS.len()],
 }
 
-/// A term of the task's reward.
-struct TaskTerm {
-    about: Description,
-    /// Its value in a step.
-    value: fn(&EnvConfig, &Step) -> f64,
-}
+/// What a reader is told about a quantity: its name in columns, tags and JSON, and what it is, in a sentence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Description(pub &'static str, pub &'static str);
 
-/// A term of the reward that training adds: its weight times its value.
-struct TrainingTerm {
-    about: Description,
-    weight: Weight,
-    /// What the weight multiplies, in a step.
-    value: fn(&Step) -> f64,
-}
+/// A term of the task's reward, and its value in a step.
+struct TaskTerm(Description, fn(&EnvConfig, &Step) -> f64);
+
+/// A term of the reward that training adds: its weight times its value in a step.
+struct TrainingTerm(Description, Weight, fn(&Step) -> f64);
 
 /// The setting in `[training]` that holds the weight of a term.
 enum Weight {
     Constant(fn(&TrainingConfig) -> f64),
-    /// Its name and its value.
+    /// What it is called where it is logged, and its value.
     Ramp(Description, fn(&TrainingConfig) -> Ramp),
 }
 
 /// Rotation error, rad, below which coming nearer is hardly paid more than in proportion.
 const NEAR: f64 = 0.1;
 
+#[rustfmt::skip]
 const TASK: [TaskTerm; 5] = [
-    TaskTerm {
-        about: Description { name: "rotation", text: "The task's reward for a small rotation error." },
-        value: |env, step| env.rot_reward_scale / (step.rot_dist + env.rot_eps),
-    },
-    TaskTerm {
-        about: Description { name: "distance", text: "The task's penalty for the cube's distance from its place." },
-        value: |env, step| env.dist_reward_scale * step.goal_dist,
-    },
-    TaskTerm {
-        about: Description { name: "action", text: "The task's penalty for large actions." },
-        value: |env, step| {
-            env.action_penalty_scale * step.action.iter().map(|&a| f64::from(a) * f64::from(a)).sum::<f64>()
-        },
-    },
-    TaskTerm {
-        about: Description { name: "bonus", text: "The task's bonus within the tolerance." },
-        value: |env, step| if step.rot_dist <= env.success_tolerance { env.reach_goal_bonus } else { 0.0 },
-    },
-    TaskTerm {
-        about: Description { name: "fall", text: "The task's penalty for a drop." },
-        value: |env, step| if step.goal_dist >= env.fall_dist { env.fall_penalty } else { 0.0 },
-    },
+    TaskTerm(Description("rotation", "The task's reward for a small rotation error."),
+        |env, step| env.rot_reward_scale / (step.rot_dist + env.rot_eps)),
+    TaskTerm(Description("distance", "The task's penalty for the cube's distance from its place."),
+        |env, step| env.dist_reward_scale * step.goal_dist),
+    TaskTerm(Description("action", "The task's penalty for large actions."),
+        |env, step| env.action_penalty_scale * step.action.iter().map(|&a| f64::from(a) * f64::from(a)).sum::<f64>()),
+    TaskTerm(Description("bonus", "The task's bonus within the tolerance."),
+        |env, step| if step.rot_dist <= env.success_tolerance { env.reach_goal_bonus } else { 0.0 }),
+    TaskTerm(Description("fall", "The task's penalty for a drop."),
+        |env, step| if step.goal_dist >= env.fall_dist { env.fall_penalty } else { 0.0 }),
 ];
 
 // What is paid for turning and approaching is a difference of potentials, so no way of going back and forth earns anything (Ng,
 // Harada and Russell, "Policy invariance under reward transformations", 1999).
+#[rustfmt::skip]
 const TRAINING: [TrainingTerm; 4] = [
-    TrainingTerm {
-        about: Description { name: "progress", text: "The training reward for turning towards the goal." },
-        weight: Weight::Constant(|training| training.progress_reward),
-        value: |step| step.rot_dist_before - step.rot_dist,
-    },
-    TrainingTerm {
-        about: Description { name: "approach", text: "The training reward for coming nearer to the goal by a factor." },
-        weight: Weight::Constant(|training| training.approach_reward),
-        value: |step| ((step.rot_dist_before + NEAR) / (step.rot_dist + NEAR)).ln(),
-    },
-    TrainingTerm {
-        about: Description { name: "within", text: "The training reward for being within the tolerance." },
-        weight: Weight::Constant(|training| training.hold_reward),
-        value: |step| f64::from(u8::from(step.within)),
-    },
-    TrainingTerm {
-        about: Description { name: "drop", text: "The training reward for a drop, which is negative." },
-        weight: Weight::Ramp(
-            Description { name: "drop_reward", text: "The training reward for the step of a drop." },
-            |training| training.drop_reward,
-        ),
-        value: |step| f64::from(u8::from(step.dropped)),
-    },
+    TrainingTerm(Description("progress", "The training reward for turning towards the goal."),
+        Weight::Constant(|training| training.progress_reward),
+        |step| step.rot_dist_before - step.rot_dist),
+    TrainingTerm(Description("approach", "The training reward for coming nearer to the goal by a factor."),
+        Weight::Constant(|training| training.approach_reward),
+        |step| ((step.rot_dist_before + NEAR) / (step.rot_dist + NEAR)).ln()),
+    TrainingTerm(Description("within", "The training reward for being within the tolerance."),
+        Weight::Constant(|training| training.hold_reward),
+        |step| f64::from(u8::from(step.within))),
+    TrainingTerm(Description("drop", "The training reward for a drop, which is negative."),
+        Weight::Ramp(Description("drop_reward", "The training reward for the step of a drop."), |training| training.drop_reward),
+        |step| f64::from(u8::from(step.dropped))),
 ];
 
-/// The list of the task's terms.
-pub struct OfTask;
+/// The list of the task's terms, and the list of the terms that training adds.
+const LISTS: [fn() -> Vec<Description>; 2] =
+    [|| TASK.iter().map(|term| term.0).collect(), || TRAINING.iter().map(|term| term.0).collect()];
 
-/// The list of the terms that training adds.
-pub struct OfTraining;
-
-impl TermList for OfTask {
-    fn descriptions() -> impl Iterator<Item = Description> {
-        TASK.iter().map(|term| term.about)
-    }
-}
-
-impl TermList for OfTraining {
-    fn descriptions() -> impl Iterator<Item = Description> {
-        TRAINING.iter().map(|term| term.about)
-    }
-}
+/// The values of the N terms in a list.
+#[derive(Clone, Copy, PartialEq)]
+pub struct Terms<const LIST: usize, const N: usize>([f64; N]);
 
 /// The task's reward by term.
-pub type TaskReward = Terms<OfTask, { TASK.len() }>;
+pub type TaskReward = Terms<0, { TASK.len() }>;
 
 /// The reward that training adds, by term; or the weights of these terms.
-pub type TrainingReward = Terms<OfTraining, { TRAINING.len() }>;
+pub type TrainingReward = Terms<1, { TRAINING.len() }>;
+
+impl<const LIST: usize, const N: usize> Terms<LIST, N> {
+    /// Returns the terms with these values, in order.
+    pub fn new(values: [f64; N]) -> Self {
+        Self(values)
+    }
+
+    /// Returns the descriptions of the terms, in order.
+    pub fn descriptions() -> Vec<Description> {
+        LISTS[LIST]()
+    }
+
+    /// Returns the values, in order.
+    pub fn values(&self) -> [f64; N] {
+        self.0
+    }
+
+    /// Returns the values by name.
+    pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> + use<LIST, N> {
+        Self::descriptions().into_iter().map(|Description(name, _)| name).zip(self.0)
+    }
+
+    /// Returns the sum of the terms.
+    pub fn total(&self) -> f64 {
+        self.0.iter().sum()
+    }
+
+    /// Applies `f` to each term.
+    pub fn map(self, f: impl Fn(f64) -> f64) -> Self {
+        Self(self.0.map(f))
+    }
+}
+
+impl<const LIST: usize, const N: usize> Index<&str> for Terms<LIST, N> {
+    type Output = f64;
+
+    /// # Panics
+    /// Panics if there is no term of this name.
+    fn index(&self, name: &str) -> &f64 {
+        let place = Self::descriptions().iter().position(|term| term.0 == name);
+        &self.0[place.unwrap_or_else(|| panic!("no term is called {name}"))]
+    }
+}
+
+impl<const LIST: usize, const N: usize> AddAssign for Terms<LIST, N> {
+    fn add_assign(&mut self, other: Self) {
+        self.0.iter_mut().zip(other.0).for_each(|(sum, value)| *sum += value);
+    }
+}
+
+impl<const LIST: usize, const N: usize> Default for Terms<LIST, N> {
+    fn default() -> Self {
+        Self([0.0; N])
+    }
+}
+
+impl<const LIST: usize, const N: usize> fmt::Debug for Terms<LIST, N> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.debug_map().entries(self.named()).finish()
+    }
+}
+
+// serde knows no arrays of any length.
+impl<const LIST: usize, const N: usize> Serialize for Terms<LIST, N> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.0[..].serialize(serializer)
+    }
+}
+
+impl<'de, const LIST: usize, const N: usize> Deserialize<'de> for Terms<LIST, N> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let values = Vec::deserialize(deserializer)?;
+        values.try_into().map(Self).map_err(|_| D::Error::custom("another number of terms"))
+    }
+}
 
 /// Returns the task's reward of a step.
 pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
-    Terms::new(TASK.each_ref().map(|term| (term.value)(env, step)))
+    Terms::new(TASK.each_ref().map(|TaskTerm(_, value)| value(env, step)))
 }
 
 /// Returns the reward that training adds to a step, given the weights of its terms.
 pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
     let mut values = weights.values();
-    values.iter_mut().zip(&TRAINING).for_each(|(value, term)| *value *= (term.value)(step));
+    values.iter_mut().zip(&TRAINING).for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
     Terms::new(values)
 }
 
 /// Returns the weights of the training's terms after `env_steps` control steps of the whole run.
 pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
-    Terms::new(TRAINING.each_ref().map(|term| match &term.weight {
+    Terms::new(TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
         Weight::Ramp(_, ramp) => ramp(training).by_equal_steps(env_steps),
     }))
@@ -158,9 +202,9 @@ pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> Tra
 
 /// Returns the weights that change in the course of a training, with their descriptions.
 pub(super) fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
-    TRAINING.iter().zip(weights.values()).filter_map(|(term, weight)| match term.weight {
+    TRAINING.iter().zip(weights.values()).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
         Weight::Constant(_) => None,
-        Weight::Ramp(setting, _) => Some((setting, weight)),
+        Weight::Ramp(setting, _) => Some((*setting, value)),
     })
 }
 

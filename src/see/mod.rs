@@ -1,14 +1,23 @@
 //! The task on display: in a window, as a film or as a picture.
 //!
-//! Without the feature `viewer` there is no window; without `video` there are no films or pictures. Modules with the same
-//! interface then take their place and fail with a message that says so. Neither feature changes anything else.
+//! Without the feature `viewer` there is no window; without `video` there are no films or pictures. What would show them refuses
+//! with one of the messages below. Neither feature changes anything else.
 
 mod display;
-#[cfg_attr(not(feature = "video"), path = "film_absent.rs")]
+#[cfg(feature = "video")]
 mod film;
-#[cfg_attr(not(feature = "viewer"), path = "window_absent.rs")]
+#[cfg(feature = "viewer")]
 mod window;
 
 pub use display::task_for_display;
+#[cfg(feature = "video")]
 pub use film::{EpisodeFilms, Film, screenshot};
-pub use window::{HAS_WINDOWS, Window};
+#[cfg(feature = "viewer")]
+pub use window::Window;
+
+/// The message of a build without films and pictures.
+pub const NO_FILMS: &str = "this build cannot make films or pictures: it was built without the feature `video`";
+
+/// The message of a build without windows.
+pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`; use `play --headless` to \
+    score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw";

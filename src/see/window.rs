@@ -13,9 +13,6 @@ use crate::os;
 use crate::repose::{ACTION_SIZE, Repose, Step, Task, task_reward};
 use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
-/// Whether this build has windows.
-pub const HAS_WINDOWS: bool = true;
-
 /// The minimum time between two frames.
 const FRAME: Duration = Duration::from_micros(16_667);
 /// The maximum lag, in seconds, of a machine that cannot keep up.

@@ -1,5 +1,6 @@
 //! The training loop: collect, learn, evaluate, report, save.
 
+#[cfg(feature = "video")]
 mod films;
 mod hints;
 mod lockstep;
@@ -12,7 +13,7 @@ mod start;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, Error, Result, anyhow};
 
@@ -27,7 +28,7 @@ use crate::run::{Media, Report, RunFolder};
 use crate::schedule::panic_message;
 use hints::hints;
 use lockstep::follow;
-use log::{Ended, FILM, described, histograms, row, tags};
+use log::{Ended, described, histograms, row, tags};
 use outcome::Outcome;
 use saver::Saver;
 use session::Session;
@@ -157,19 +158,21 @@ impl Session {
 
     /// Returns the histograms and the film that are due after this iteration; `None` if `stop` was set meanwhile. Without a report
     /// there are none.
+    #[cfg_attr(not(feature = "video"), expect(unused_variables, reason = "only a film may be stopped and warn"))]
     fn media(&mut self, stop: &AtomicBool, report: Option<&Report>) -> Option<Media> {
         let mut media = Media::default();
         let Some(report) = report else { return Some(media) };
         if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
             media.histograms = histograms(&self.agent.rollout);
         }
+        #[cfg(feature = "video")]
         if self.films.due(self.agent.iteration) {
             let episodes = self.evaluation_episodes();
             let film = self.films.film(self.agent.ppo.policy(), episodes, stop, report);
-            if stop.load(Ordering::Relaxed) {
+            if stop.load(std::sync::atomic::Ordering::Relaxed) {
                 return None;
             }
-            media.film = film.map(|film| (FILM, film));
+            media.film = film.map(|film| (log::FILM, film));
         }
         Some(media)
     }

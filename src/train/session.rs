@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 
+#[cfg(feature = "video")]
 use super::films::Films;
 use super::saver::Saver;
 use super::start::{Existing, Plan, StartFrom};
@@ -28,6 +29,7 @@ pub(super) struct Session {
     /// The best evaluation so far.
     pub best: Option<Evaluation>,
     /// The films of evaluation episodes.
+    #[cfg(feature = "video")]
     pub films: Films,
     /// The number of steps of this session on which the physics diverged.
     pub diverged: u64,
@@ -81,10 +83,25 @@ impl Session {
             // As it is saved.
             config.run.shards = config.shards();
             let task = Task::new(&config.env)?;
+            #[cfg(feature = "video")]
             let films = if exchange.is_first() { Films::new(&config) } else { Films::none() };
+            #[cfg(not(feature = "video"))]
+            if config.run.film_every > 0 {
+                os::say(&format!("warning: run.film_every: no films in this session: {}", crate::see::NO_FILMS));
+            }
             let agent = Agent::for_task(&task, &config, exchange)?;
-            let (scene, best) = (task.scene().fingerprint(), None);
-            let mut session = Self { config, task, agent, best, films, diverged: 0, warned: false, dumps, scene };
+            let mut session = Self {
+                scene: task.scene().fingerprint(),
+                config,
+                task,
+                agent,
+                best: None,
+                #[cfg(feature = "video")]
+                films,
+                diverged: 0,
+                warned: false,
+                dumps,
+            };
             session.start(from)?;
             Ok(session)
         };

@@ -30,7 +30,7 @@ pub(super) fn imports(src: &Path) -> BTreeMap<PathBuf, BTreeSet<PathBuf>> {
     found
 }
 
-/// Returns the module of a file: a::b for `a/b.rs` and `a/b/mod.rs`, and for the stand-in `a/b_absent.rs`.
+/// Returns the module of a file: a::b for `a/b.rs` and `a/b/mod.rs`.
 fn module_of(file: &Path) -> Module {
     let mut names: Module = file.with_extension("").iter().map(|part| part.to_str().unwrap().to_owned()).collect();
     let last = names.pop().unwrap();
@@ -38,7 +38,7 @@ fn module_of(file: &Path) -> Module {
         "mod" | "lib" => {}
         // It is another crate, which refers to this one by name.
         "main" => names.push("main".into()),
-        _ => names.push(last.trim_end_matches("_absent").to_owned()),
+        _ => names.push(last),
     }
     names
 }
@@ -95,7 +95,7 @@ impl House {
             }
         }
         paths.extend(written.0.into_iter().map(|path| (file.to_owned(), module.to_vec(), path)));
-        // A module and its stand-in have the same path.
+        // Of a module with several cfgs, the first counts.
         self.0.entry(module.to_vec()).or_insert(names);
     }
 
