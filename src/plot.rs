@@ -12,12 +12,12 @@ use crate::run::{self, MetricsTable};
 use crate::tags::quantity;
 
 /// The metrics that are drawn by default: the headline, and what explains it.
-const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "episode/rot_dist", "episode/drop_rate"];
+const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "training/turned", "episode/drop_rate"];
 
-/// What is drawn instead where no run has had an episode of the task itself, because all are randomised.
+/// What is drawn instead where no run has values: no episode of the task itself, because all are randomised; or an older table.
 const INSTEAD: [(&str, &str); 3] = [
     ("episode/goals", "randomized/goals"),
-    ("episode/rot_dist", "randomized/rot_dist"),
+    ("training/turned", "episode/rot_dist"),
     ("episode/drop_rate", "randomized/drop_rate"),
 ];
 
@@ -53,7 +53,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let instead = if args.metric.is_empty() { &INSTEAD[..] } else { &[] };
     let wanted: Vec<&str> = metrics.iter().copied().chain(instead.iter().map(|(_, other)| *other)).collect();
     let runs = runs(args, &wanted)?;
-    expect_columns(&runs, &metrics)?;
+    expect_columns(&runs, &args.metric)?;
     ensure!(!args.seeds || runs.len() > 1, "--seeds: the mean of a single run; give the runs of several seeds");
     let column = |run: &Run, name: &str| {
         let place = wanted.iter().position(|wanted| *wanted == name)?;
@@ -130,7 +130,7 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
 ///
 /// # Errors
 /// Fails on the first column that no run has, and names the nearest ones.
-fn expect_columns(runs: &[Run], metrics: &[&str]) -> Result<()> {
+fn expect_columns(runs: &[Run], metrics: &[String]) -> Result<()> {
     for (i, name) in metrics.iter().enumerate() {
         let lacking: Vec<&str> =
             runs.iter().filter(|run| run.table.wanted[i].is_none()).map(|run| &run.name[..]).collect();

@@ -8,7 +8,6 @@ import shutil
 import statistics
 import subprocess
 import sys
-import tomllib
 
 THIN = pathlib.Path(__file__).resolve().with_name("thin.py")
 # The metrics in tables, with their decimal digits.
@@ -24,8 +23,6 @@ class Log:
         with (path / "metrics.csv").open(newline="") as file:
             self.rows = list(csv.DictReader(file))
         self.steps = [int(row["env_steps"]) for row in self.rows]
-        text = path / "config.toml"
-        self.progress_reward = tomllib.loads(text.read_text())["training"]["progress_reward"]
         seconds = [float(row["time/collect_s"]) + float(row["time/update_s"]) for row in self.rows]
         self.seconds, spent = [], 0.0
         for first in range(0, len(seconds), TIMED):
@@ -38,18 +35,14 @@ class Log:
         """Returns the mean over the `window` steps up to `at`, or the latest evaluation; NaN if the run is not that far yet."""
         if not self.steps or self.steps[-1] < at:
             return math.nan
-        # rad per hundred steps, computed from training/progress, the reward that is paid for it.
-        column, scale = ("training/progress", 100) if metric == "turned" else (metric, 1)
-        if metric == "turned" and self.progress_reward == 0:
-            return math.nan
-        scale = scale / self.progress_reward if metric == "turned" else scale
+        column = "training/turned" if metric == "turned" else metric
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
         rows = zip(self.steps[:end], self.rows)
         known = [(steps, float(row[column])) for steps, row in rows if row.get(column) not in ("", "NaN", None)]
         if metric.startswith("eval/"):
             return known[-1][1] if known else math.nan
         found = [value for steps, value in known if steps > self.steps[end - 1] - window]
-        return scale * statistics.fmean(found) if found else math.nan
+        return statistics.fmean(found) if found else math.nan
 
     def seconds_at(self, steps):
         return next((spent for made, spent in zip(self.steps, self.seconds) if made >= steps), math.nan)
@@ -126,7 +119,7 @@ def tables(experiment):
 
 
 def draw(program, runs, picture, smooth):
-    metrics = [word for column in ("training/progress", "eval/goals", "eval/drop_rate") for word in ("--metric", column)]
+    metrics = [word for column in ("training/turned", "eval/goals", "eval/drop_rate") for word in ("--metric", column)]
     subprocess.run([program, "plot", *runs, "--out", picture, "--smooth", str(smooth), *metrics], check=False)
 
 

@@ -377,7 +377,8 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     };
     succeeded(plot(&[]));
     let svg = fs::read_to_string(folder.path().join("learning.svg")).unwrap();
-    let panels = ["goals per episode, evaluation", "goals per episode, training", "rotation error (rad), training"];
+    let panels =
+        ["goals per episode, evaluation", "goals per episode, training", "turned towards the goal (rad/100 steps)"];
     for part in [&panels[..], &["run", "other", "million control steps"]].concat() {
         assert!(svg.lines().any(|line| line.trim() == part), "{part} is not in\n{svg}");
     }
