@@ -24,9 +24,8 @@
 //! | [`see`] | rendering of the task: window, film, picture | cli, config, draw, env, evaluate, os, repose, run, sim |
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
-//! | [`agent`] | environments, learner and rollout; one iteration of training | collect, config, env, ppo, ranks, repose |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, rng, schedule |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, repose, rng, schedule, sim |
-//! | [`mod@collect`] | collection of rollouts: environments step under the policy | env, ppo, rng, schedule |
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, rng, sim, spaces |
@@ -44,7 +43,7 @@
 //! | [`quat`] | rotations | - |
 //! | [`rng`] | random generators named by (seed, purpose, index) | - |
 //!
-//! `env` and `ppo` do not depend on each other: they meet in `collect`, `evaluate` and the modules above. `run` depends on
+//! `env` and `ppo` do not depend on each other: they meet in `agent`, `evaluate` and the modules above. `run` depends on
 //! neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal) is
 //! confined to one folder, unsafe code to six files.
 //!
@@ -76,7 +75,6 @@
 pub mod agent;
 pub mod bench;
 pub mod cli;
-pub mod collect;
 pub mod config;
 pub mod draw;
 pub mod env;

@@ -130,7 +130,7 @@ impl Loaded {
     /// Loads the policy from `place`, by default from the newest run, or the built-in one if there is no run.
     ///
     /// # Errors
-    /// Fails as [`PolicySource::of`] and [`PolicySource::load`] do, or if the policy's numbers cannot be used.
+    /// Fails as [`PolicySource::find`] and [`PolicySource::load`] do, or if the policy's numbers cannot be used.
     pub fn find(place: Option<&Path>, overrides: &[Override]) -> Result<Self> {
         let origin = match (place, run::newest_run()) {
             (Some(place), _) => PolicySource::find(place)?,

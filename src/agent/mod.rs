@@ -3,18 +3,21 @@
 //! It is separate from the training, which decides how long to train, scores, reports and saves, so that benchmarks and tests
 //! run exactly the same iterations.
 
+mod collect;
+
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 
-use crate::collect::{Scratch, collect};
 use crate::config::{Config, PpoConfig};
 use crate::env::{Env, EnvPool, EnvState, Resumable};
 use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
+use crate::schedule::in_rounds;
+use collect::{Collecting, Scratch};
 
 // The names under which a checkpoint stores the states of the environments.
 const NUMBERS: &str = "envs.numbers";
@@ -28,7 +31,7 @@ pub struct Agent<E: Env> {
     pub ppo: Ppo,
     /// The last rollout; its first observations are the ones to act on next.
     pub rollout: Rollout,
-    scratch: Scratch,
+    scratch: Vec<Scratch>,
     /// The lesson at a given number of control steps.
     lessons: Box<dyn Fn(u64) -> E::Lesson + Send>,
     /// The number of finished iterations.
@@ -101,7 +104,7 @@ impl<E: Env> Agent<E> {
         let mut pool = EnvPool::in_blocks(seed, envs, blocks);
         let ppo = Ppo::new(config, E::SPACES, seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
-        let scratch = Scratch::new(&pool, &ppo);
+        let scratch = Scratch::of_blocks(&pool, &ppo);
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
         Ok(Self {
@@ -134,17 +137,30 @@ impl<E: Env> Agent<E> {
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
     }
 
-    /// Runs the first half of [`Agent::iterate`]: fills the rollout. Returns the lesson, or `None` if `stop` was set meanwhile.
+    /// Runs the first half of [`Agent::iterate`]: steps the environments through a whole rollout with the learner's actions. Returns
+    /// the lesson, or `None` if `stop` was set meanwhile: the blocks may then be at different steps.
     ///
     /// # Errors
-    /// Fails if an environment panics.
+    /// Fails with the environment's number if an environment panics.
     pub fn collect(&mut self, stop: &AtomicBool) -> Result<Option<E::Lesson>> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
         self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
-        let iteration = self.iteration + 1;
-        let whole = collect(&mut self.pool, &self.ppo, &mut self.rollout, iteration, &mut self.scratch, stop)?;
-        Ok(whole.then_some(lesson))
+        let (ppo, iteration, horizon) = (&self.ppo, self.iteration + 1, self.rollout.horizon());
+        let acting = ppo.acting();
+        let parts = self.pool.blocks_mut().iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.scratch);
+        let blocks = parts.map(|((envs, rollout), scratch)| {
+            let noise = ppo.noise(iteration, envs.number());
+            Collecting { envs, rollout, scratch, noise, result: Ok(()) }
+        });
+        let collected = in_rounds(blocks, horizon, |block, t| {
+            if block.result.is_ok() && !stop.load(Ordering::Relaxed) {
+                acting.act(block.rollout, t, &mut block.noise, &mut block.scratch.work);
+                block.result = block.step(&acting, t, t + 1 == horizon);
+            }
+        });
+        collected.into_iter().try_for_each(|block| block.result)?;
+        Ok((!stop.load(Ordering::Relaxed)).then_some(lesson))
     }
 }
 
