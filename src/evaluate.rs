@@ -14,9 +14,10 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use crate::env::{End, Env};
+use crate::os::Bar;
 use crate::ppo::{FrozenPolicy, Workspace};
 use crate::ranks::Exchange;
-use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Task};
+use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Score, Task};
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
 use crate::sim::stepping;
@@ -54,6 +55,13 @@ pub struct Episodes {
     pub count: usize,
 }
 
+impl Episodes {
+    /// Returns the first `count` episodes for a score.
+    pub fn scored(seed: u64, count: usize) -> Self {
+        Self { seed, purpose: "score", first: 0, count }
+    }
+}
+
 /// An observer's view of an episode after a reset or a step.
 pub struct Moment<'a> {
     /// The number of the episode.
@@ -64,6 +72,13 @@ pub struct Moment<'a> {
     pub observation: &'a [f32],
     /// The action as the actor chose it, and the end of the episode if this step ended it; `None` at a reset.
     pub step: Option<(&'a [f32], Option<End>)>,
+}
+
+impl Moment<'_> {
+    /// Returns whether this step ended the episode.
+    pub fn ends(&self) -> bool {
+        self.step.is_some_and(|(_, end)| end.is_some())
+    }
 }
 
 struct Lane {
@@ -98,6 +113,28 @@ pub fn evaluate(
 ) -> Result<Option<Vec<EpisodeStats>>> {
     let played = play(task, actor, episodes, 0..LANES, interrupted, observer)?;
     Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
+}
+
+/// Plays the episodes as [`evaluate`] does, and returns their score. `bar` counts them.
+///
+/// # Errors
+/// Fails with the episode's number if an episode panics.
+pub fn score(
+    task: &Arc<Task>,
+    actor: &Actor,
+    episodes: Episodes,
+    interrupted: &AtomicBool,
+    bar: &Bar,
+    observe: &mut dyn FnMut(&Moment),
+) -> Result<Option<Score>> {
+    let mut observer = |moment: Moment| {
+        observe(&moment);
+        if moment.ends() {
+            bar.count();
+        }
+        Ok(())
+    };
+    Ok(evaluate(task, actor, episodes, interrupted, &mut observer)?.map(|played| Score::of(&played)))
 }
 
 /// Plays the episodes, as far as `exchange` deals them here, and returns all of them, in order. Returns `None` if

@@ -25,7 +25,7 @@
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, rng, schedule |
-//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, ppo, ranks, repose, rng, schedule, sim |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim |
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, rng, sim, spaces |

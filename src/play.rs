@@ -1,19 +1,18 @@
 //! Playing a policy: in a window, as a film, or for its score over whole episodes (a table or one JSON object), with a trace of
 //! the first episodes.
 
-use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
-#[cfg(not(all(feature = "video", feature = "viewer")))]
+#[cfg(not(feature = "video"))]
 use anyhow::bail;
 use anyhow::{Context, Result, ensure};
 use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used};
-use crate::evaluate::{Actor, Episodes, Moment, evaluate};
+#[cfg(feature = "video")]
+use crate::evaluate::evaluate;
+use crate::evaluate::{Actor, Episodes, Moment, score};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
 use crate::os::{self, Requests};
@@ -54,6 +53,9 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if let (Some(loaded), true) = (&loaded, args.robustness) {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
     }
+    #[cfg(not(feature = "viewer"))]
+    ensure!(!wants_window(args), see::NO_WINDOWS);
+    #[cfg(feature = "viewer")]
     if wants_window(args) && show(args, &config, loaded.as_ref())? {
         return Ok(ExitCode::SUCCESS);
     }
@@ -82,9 +84,14 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
         }
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
-        score(&Task::new(config)?, actor, episodes(args, 256), requests.stop(), observe)
+        let (task, episodes) = (Task::new(config)?, episodes(args, 256));
+        let bar = os::Bar::new(episodes.count as u64, "episodes", actor.name());
+        score(&task, actor, episodes, requests.stop(), &bar, observe)
     };
     let played = match &args.video {
+        #[cfg(not(feature = "video"))]
+        Some(_) => bail!(see::NO_FILMS),
+        #[cfg(feature = "video")]
         Some(path) => film(path, config, &actor, args, requests, &mut observe)?,
         None => score(&actor, &mut observe)?,
     };
@@ -127,11 +134,6 @@ fn wants_window(args: &PlayArgs) -> bool {
     args.window || !otherwise && cfg!(feature = "viewer") && os::has_display()
 }
 
-#[cfg(not(feature = "viewer"))]
-fn show(_: &PlayArgs, _: &EnvConfig, _: Option<&Loaded>) -> Result<bool> {
-    bail!(see::NO_WINDOWS)
-}
-
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
 #[cfg(feature = "viewer")]
 fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
@@ -158,22 +160,10 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
     Ok(true)
 }
 
-#[cfg(not(feature = "video"))]
-fn film(
-    _: &Path,
-    _: &EnvConfig,
-    _: &Actor,
-    _: &PlayArgs,
-    _: &Requests,
-    _: &mut dyn FnMut(&Moment),
-) -> Result<Option<Score>> {
-    bail!(see::NO_FILMS)
-}
-
 /// Plays the episodes one after another and films them. If interrupted, it leaves a film of what was played.
 #[cfg(feature = "video")]
 fn film(
-    path: &Path,
+    path: &std::path::Path,
     config: &EnvConfig,
     actor: &Actor,
     args: &PlayArgs,
@@ -205,26 +195,7 @@ fn film(
 /// Returns the requested episodes, or `otherwise` of them if no number was given.
 fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     let count = args.episodes.unwrap_or(otherwise) as usize;
-    Episodes { seed: args.seed, purpose: "score", first: 0, count }
-}
-
-/// Plays the episodes and returns their score, or `None` if interrupted.
-fn score(
-    task: &Arc<Task>,
-    actor: &Actor,
-    episodes: Episodes,
-    interrupted: &AtomicBool,
-    observe: &mut dyn FnMut(&Moment),
-) -> Result<Option<Score>> {
-    let progress = os::Bar::new(episodes.count as u64, "episodes", actor.name());
-    let played = evaluate(task, actor, episodes, interrupted, &mut |moment| {
-        observe(&moment);
-        if moment.step.is_some_and(|(_, end)| end.is_some()) {
-            progress.count();
-        }
-        Ok(())
-    })?;
-    Ok(played.map(|played| Score::of(&played)))
+    Episodes::scored(args.seed, count)
 }
 
 /// Returns one object with all figures; those without a value are null.

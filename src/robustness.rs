@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::cli::PlayArgs;
 use crate::config::{EnvConfig, Override};
 use crate::draw::{self, BarChart, HeatMap, Picture};
-use crate::evaluate::{Actor, Episodes, evaluate};
+use crate::evaluate::{Actor, Episodes, score};
 use crate::load::Loaded;
 use crate::os::{self, Bar, OutputFile, Requests};
 use crate::repose::{Score, Task};
@@ -77,11 +77,11 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
         bar.say(condition.name.clone());
-        let Some(score) =
-            known.map_or_else(|| score(&task, actor, args.seed, count, requests, &bar), |known| Ok(Some(known)))?
-        else {
-            break;
+        let played = match known {
+            Some(known) => Some(known),
+            None => score(&task, actor, Episodes::scored(args.seed, count), requests.stop(), &bar, &mut |_| {})?,
         };
+        let Some(score) = played else { break };
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             os::say(&format!("warning: {}: {warning}", condition.name));
         }
@@ -103,25 +103,6 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         None => {}
     }
     Ok(if interrupted { requests.exit_code() } else { ExitCode::SUCCESS })
-}
-
-/// Plays the episodes of a row; returns `None` if interrupted.
-fn score(
-    task: &Arc<Task>,
-    actor: &Actor,
-    seed: u64,
-    count: usize,
-    requests: &Requests,
-    bar: &Bar,
-) -> Result<Option<Score>> {
-    let episodes = Episodes { seed, purpose: "score", first: 0, count };
-    let played = evaluate(task, actor, episodes, requests.stop(), &mut |moment| {
-        if moment.step.is_some_and(|(_, end)| end.is_some()) {
-            bar.count();
-        }
-        Ok(())
-    })?;
-    Ok(played.map(|played| Score::of(&played)))
 }
 
 /// Returns all rows: the task itself, the single changes, and the grid.

@@ -61,7 +61,7 @@ impl Film {
         }
         ensure!(!self.writer.failed(), "the film cannot be continued");
         let time = f64::from(env.episode().length) * env.config().ctrl_dt;
-        let ended = moment.step.is_some_and(|(_, end)| end.is_some());
+        let ended = moment.ends();
         loop {
             let due = self.frames as f64 / f64::from(self.fps);
             // A frame exactly at the end belongs to what follows.
@@ -136,7 +136,7 @@ impl EpisodeFilms {
         let mut frames = 0;
         let mut observe = |moment: Moment| {
             let time = f64::from(moment.env.episode().length) * ctrl_dt;
-            let over = moment.step.is_some_and(|(_, end)| end.is_some());
+            let over = moment.ends();
             while !over && frames < longest && frames as f64 / f64::from(fps) <= time + 1e-9 {
                 let picture = renderer.draw(moment.env.simulation())?;
                 clip.push(picture, &caption(moment.env, moment.episode, time))?;
