@@ -144,14 +144,14 @@ mod tests {
         let other = EpisodeStats { randomized: true, ..episode(TaskReward::default(), 200, 8) };
         let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], randomizes);
         let evaluation = Score::of(&[episode(TaskReward::default(), 1000, 5), episode(reward, 50, 0)]);
-        let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, \
-            episode/drop_rate 1, episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, \
-            reward/action 22, reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, training/turned 32, \
-            training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, \
-            training/randomized 0, eval/goals 2.5, eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, loss/policy 1, loss/value 2, policy/entropy 4, \
-            policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, \
-            value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, \
-            time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
+        let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, episode/drop_rate 1, \
+            episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
+            reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, \
+            training/drop 27, training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, \
+            training/drop_reward 0, training/randomized 0, eval/goals 2.5, eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, \
+            loss/policy 1, loss/value 2, policy/entropy 4, policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, \
+            policy/std 10, policy/excess 3, value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, \
+            time/collect_s 13, time/update_s 17, time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
         let traffic = Traffic { seconds: 29.0, bytes: 30.0 };
         let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
         let row = |randomizes| {
