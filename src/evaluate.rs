@@ -85,11 +85,12 @@ struct Lane {
     env: Repose,
     noise: Rng,
     running: bool,
+    end: Option<End>,
 }
 
 impl Lane {
     fn new(task: &Arc<Task>) -> Self {
-        Self { env: Repose::new(task), noise: rng::stream(0, "unused", 0), running: false }
+        Self { env: Repose::new(task), noise: rng::stream(0, "unused", 0), running: false, end: None }
     }
 
     fn start(&mut self, episodes: Episodes, episode: usize, observation: &mut [f32]) {
@@ -97,132 +98,112 @@ impl Lane {
         self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
         self.running = true;
     }
+
+    fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Option<End> {
+        self.end = self.env.step(action, observation).end;
+        self.end
+    }
 }
 
-/// Plays the episodes and returns them in order, or `None` if `interrupted` was set meanwhile. The observer sees the steps of
-/// one episode in order, interleaved with those of others.
-///
-/// # Errors
-/// Fails if the observer does, or, with the episode's number, if an episode panics.
-pub fn evaluate(
-    task: &Arc<Task>,
-    actor: &Actor,
-    episodes: Episodes,
-    interrupted: &AtomicBool,
-    observer: &mut dyn FnMut(Moment) -> Result<()>,
-) -> Result<Option<Vec<EpisodeStats>>> {
-    let played = play(task, actor, episodes, 0..LANES, interrupted, observer)?;
-    Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
+/// Episodes of a task that an actor plays.
+#[derive(Clone, Copy)]
+pub struct Trial<'a> {
+    /// The task.
+    pub task: &'a Arc<Task>,
+    /// The source of the actions.
+    pub actor: &'a Actor<'a>,
+    /// The episodes.
+    pub episodes: Episodes,
+    /// A flag that interrupts the trial.
+    pub stop: &'a AtomicBool,
 }
 
-/// Plays the episodes as [`evaluate`] does, and returns their score. `bar` counts them.
-///
-/// # Errors
-/// Fails with the episode's number if an episode panics.
-pub fn score(
-    task: &Arc<Task>,
-    actor: &Actor,
-    episodes: Episodes,
-    interrupted: &AtomicBool,
-    bar: &Bar,
-    observe: &mut dyn FnMut(&Moment),
-) -> Result<Option<Score>> {
-    let mut observer = |moment: Moment| {
-        observe(&moment);
-        if moment.ends() {
-            bar.count();
-        }
-        Ok(())
-    };
-    Ok(evaluate(task, actor, episodes, interrupted, &mut observer)?.map(|played| Score::of(&played)))
-}
+impl Trial<'_> {
+    /// Plays the episodes and returns them in order, or `None` if they were interrupted. The observer sees the steps of one
+    /// episode in order, interleaved with those of others.
+    ///
+    /// # Errors
+    /// Fails if the observer does, or, with the episode's number, if an episode panics.
+    pub fn play(&self, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<Option<Vec<EpisodeStats>>> {
+        let played = self.play_lanes(0..LANES, observer)?;
+        Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
+    }
 
-/// Plays the episodes, as far as `exchange` deals them here, and returns all of them, in order. Returns `None` if
-/// `interrupted` was set meanwhile.
-///
-/// # Errors
-/// Fails with the episode's number if an episode panics.
-pub fn evaluate_together(
-    task: &Arc<Task>,
-    actor: &Actor,
-    episodes: Episodes,
-    exchange: &Exchange,
-    interrupted: &AtomicBool,
-) -> Result<Option<Vec<EpisodeStats>>> {
-    let own = exchange.own(LANES.min(episodes.count));
-    let Some(own) = play(task, actor, episodes, own, interrupted, &mut |_| Ok(()))? else { return Ok(None) };
-    let mut all = exchange.all_gather(own).concat();
-    all.sort_unstable_by_key(|(number, _)| *number);
-    Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
-}
-
-/// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
-/// episode's result does not depend on who plays it.
-fn play(
-    task: &Arc<Task>,
-    actor: &Actor,
-    episodes: Episodes,
-    own: Range<usize>,
-    interrupted: &AtomicBool,
-    observer: &mut dyn FnMut(Moment) -> Result<()>,
-) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
-    let own = own.start.min(episodes.count)..own.end.min(episodes.count);
-    let mut lanes: Vec<Lane> = own.clone().map(|_| Lane::new(task)).collect();
-    let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
-    let mut actions = vec![0.0; LANES * ACTION_SIZE];
-    let mut work = actor.policy().map(|policy| policy.workspace(LANES));
-    let mut results = Vec::with_capacity(episodes.count);
-    for first in episodes.groups() {
-        let started = own.len().min((episodes.end() - first).saturating_sub(own.start));
-        // The number of the first episode of these lanes.
-        let first = first + own.start;
-        let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start);
-        let starting = lanes[..started].par_iter_mut().zip(rows).enumerate();
-        starting.for_each(|(i, (lane, row))| stepping("episode", first + i, || lane.start(episodes, first + i, row)));
-        let mut ends: Vec<Option<End>> = vec![None; lanes.len()];
-        let rows = observations.chunks_exact(OBSERVATION_SIZE).skip(own.start);
-        for (i, observation) in rows.take(started).enumerate() {
-            observer(Moment { episode: first + i, env: &lanes[i].env, observation, step: None })?;
-        }
-        while lanes.iter().any(|lane| lane.running) {
-            if interrupted.load(Ordering::Relaxed) {
-                return Ok(None);
+    /// Plays the episodes and returns their score, or `None` if they were interrupted. `bar` counts them.
+    ///
+    /// # Errors
+    /// Fails with the episode's number if an episode panics.
+    pub fn score(&self, bar: &Bar, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
+        let mut observer = |moment: Moment| {
+            observe(&moment);
+            if moment.ends() {
+                bar.count();
             }
-            actor.choose(&observations, &mut lanes, own.start, &mut actions, work.as_mut());
-            lanes
-                .par_iter_mut()
-                .zip(actions.par_chunks_exact(ACTION_SIZE).skip(own.start))
-                .zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE).skip(own.start))
-                .zip(&mut ends)
-                .enumerate()
-                .filter(|(_, (((lane, _), _), _))| lane.running)
-                .try_for_each(|(i, (((lane, action), row), end))| {
+            Ok(())
+        };
+        Ok(self.play(&mut observer)?.map(|played| Score::of(&played)))
+    }
+
+    /// Plays the episodes that `exchange` deals here, and returns all of them in order, or `None` if they were interrupted.
+    ///
+    /// # Errors
+    /// Fails with the episode's number if an episode panics.
+    pub fn play_together(&self, exchange: &Exchange) -> Result<Option<Vec<EpisodeStats>>> {
+        let own = exchange.own(LANES.min(self.episodes.count));
+        let Some(own) = self.play_lanes(own, &mut |_| Ok(()))? else { return Ok(None) };
+        let mut all = exchange.all_gather(own).concat();
+        all.sort_unstable_by_key(|(number, _)| *number);
+        Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
+    }
+
+    /// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
+    /// episode's result does not depend on who plays it.
+    fn play_lanes(
+        &self,
+        own: Range<usize>,
+        observer: &mut dyn FnMut(Moment) -> Result<()>,
+    ) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
+        let Self { task, actor, episodes, stop } = *self;
+        let end = episodes.first + episodes.count;
+        let mut lanes: Vec<Lane> = (own.start..own.end.min(episodes.count)).map(|_| Lane::new(task)).collect();
+        let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
+        let mut actions = vec![0.0; LANES * ACTION_SIZE];
+        let mut work = actor.policy().map(|policy| policy.workspace(LANES));
+        let mut results = Vec::with_capacity(episodes.count);
+        for first in (episodes.first + own.start..end).step_by(LANES) {
+            let started = lanes.len().min(end - first);
+            let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE);
+            lanes[..started].par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| {
+                stepping("episode", first + i, || lane.start(episodes, first + i, row));
+            });
+            let rows = observations.chunks_exact(OBSERVATION_SIZE);
+            for (i, (lane, observation)) in lanes[..started].iter().zip(rows).enumerate() {
+                observer(Moment { episode: first + i, env: &lane.env, observation, step: None })?;
+            }
+            while lanes.iter().any(|lane| lane.running) {
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(None);
+                }
+                actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+                let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(ACTION_SIZE));
+                let rows = acted.zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE)).enumerate();
+                rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
                     // Unwind safe: a state that a panic left inconsistent is not used again.
-                    let step = || catch_unwind(AssertUnwindSafe(|| *end = lane.env.step(action, row).end));
-                    let stepped = stepping("episode", first + i, step);
+                    let step = || catch_unwind(AssertUnwindSafe(|| lane.step(action, row)));
+                    let stepped = stepping("episode", first + i, step).map(drop);
                     stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
                 })?;
-            for (i, lane) in lanes.iter_mut().enumerate().filter(|(_, lane)| lane.running) {
-                let observation = &observations[(own.start + i) * OBSERVATION_SIZE..][..OBSERVATION_SIZE];
-                let action = &actions[(own.start + i) * ACTION_SIZE..][..ACTION_SIZE];
-                let step = Some((action, ends[i]));
-                observer(Moment { episode: first + i, env: &lane.env, observation, step })?;
-                lane.running = ends[i].is_none();
+                let rows = observations.chunks_exact(OBSERVATION_SIZE).zip(actions.chunks_exact(ACTION_SIZE));
+                let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
+                for (i, (lane, (observation, action))) in running {
+                    let step = Some((action, lane.end));
+                    observer(Moment { episode: first + i, env: &lane.env, observation, step })?;
+                    lane.running = lane.end.is_none();
+                }
             }
+            results.extend((first..).zip(lanes[..started].iter().map(|lane| lane.env.episode())));
         }
-        results.extend((first..).zip(lanes[..started].iter().map(|lane| lane.env.episode())));
-    }
-    Ok(Some(results))
-}
-
-impl Episodes {
-    fn end(&self) -> usize {
-        self.first + self.count
-    }
-
-    /// Returns the first episode of each group that runs together.
-    fn groups(&self) -> impl Iterator<Item = usize> + use<> {
-        (self.first..self.end()).step_by(LANES)
+        Ok(Some(results))
     }
 }
 
@@ -245,20 +226,12 @@ impl Actor<'_> {
         }
     }
 
-    /// Writes the actions `[LANES, A]` of these lanes, the first of which has the row `first_lane`; those of lanes that have ended
-    /// are not used.
-    fn choose(
-        &self,
-        observations: &[f32],
-        lanes: &mut [Lane],
-        first_lane: usize,
-        actions: &mut [f32],
-        work: Option<&mut Workspace>,
-    ) {
+    /// Writes the actions of these lanes, one row each; those of lanes that have ended are not used.
+    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
         }
-        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE).skip(first_lane)) {
+        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
             match self {
                 Actor::Mean(_) => {}
                 Actor::Stochastic(policy) => {
@@ -309,8 +282,8 @@ impl Player {
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
         self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
-        actor.choose(&self.observation, lane, 0, &mut self.action, self.work.as_mut());
-        self.lane.env.step(&self.action, &mut self.observation).end
+        actor.choose(&self.observation, lane, &mut self.action, self.work.as_mut());
+        self.lane.step(&self.action, &mut self.observation)
     }
 
     /// Draws another goal.
@@ -355,7 +328,7 @@ mod tests {
                 }
             }
             let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * ACTION_SIZE]);
-            actor.choose(&observations, &mut lanes, 0, &mut actions, work.as_mut());
+            actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
             let (one, other) = actions.split_at(ACTION_SIZE);
             assert_eq!(one == other, alike, "{symmetry:?}");
         }

@@ -10,12 +10,10 @@ use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used};
-#[cfg(feature = "video")]
-use crate::evaluate::evaluate;
-use crate::evaluate::{Actor, Episodes, Moment, score};
+use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
-use crate::os::{self, Requests};
+use crate::os::{self, Requests, number};
 use crate::repose::{Score, Task};
 use crate::robustness::robustness;
 use crate::see;
@@ -86,7 +84,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
         let (task, episodes) = (Task::new(config)?, episodes(args, 256));
         let bar = os::Bar::new(episodes.count as u64, "episodes", actor.name());
-        score(&task, actor, episodes, requests.stop(), &bar, observe)
+        Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
     };
     let played = match &args.video {
         #[cfg(not(feature = "video"))]
@@ -96,9 +94,9 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
         None => score(&actor, &mut observe)?,
     };
     let Some(played) = played else {
-        output
-            .into_iter()
-            .for_each(|output| os::say(&format!("{}: interrupted, not written", output.path().display())));
+        if let Some(output) = output {
+            os::say(&format!("{}: interrupted, not written", output.path().display()));
+        }
         return Ok(requests.exit_code());
     };
     if let (Some(output), Some(trace)) = (output, trace) {
@@ -114,10 +112,8 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     }
     let mut columns = vec![(actor.name(), played)];
     if loaded.is_some() && args.video.is_none() {
-        columns.push((
-            Actor::Zero.name(),
-            score(&Actor::Zero, &mut |_| {})?.context("these episodes cannot be interrupted")?,
-        ));
+        let zero = score(&Actor::Zero, &mut |_| {})?.context("these episodes cannot be interrupted")?;
+        columns.push((Actor::Zero.name(), zero));
     }
     os::print(&table(&columns))?;
     Ok(ExitCode::SUCCESS)
@@ -177,8 +173,8 @@ fn film(
     requests.wait_for_end();
     let mut played = Vec::new();
     for first in all.first..all.first + all.count {
-        let one = Episodes { first, count: 1, ..all };
-        let result = evaluate(&task, actor, one, requests.stop(), &mut |moment| {
+        let one = Trial { task: &task, actor, episodes: Episodes { first, count: 1, ..all }, stop: requests.stop() };
+        let result = one.play(&mut |moment| {
             observe(&moment);
             film.observe(&moment)
         });
@@ -217,9 +213,7 @@ fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, s
         "checkpoint": checkpoint,
         "seed": seed,
     });
-    for (name, known) in goal_times.named() {
-        value[name] = known;
-    }
+    goal_times.named().into_iter().for_each(|(name, known)| value[name] = known);
     value
 }
 
@@ -237,29 +231,20 @@ fn table(columns: &[(&str, Score)]) -> String {
 
 /// Returns the figures of a score with their labels in the table.
 fn figures(score: &Score) -> Vec<(String, String)> {
-    let number = |value: f64, decimals: usize| match value.is_nan() {
-        true => "-".to_owned(),
-        false => format!("{value:.decimals$}"),
-    };
-    let mut figures = vec![
-        ("episodes".to_owned(), score.episodes.to_string()),
-        ("goals per episode".to_owned(), number(score.goals, 3)),
+    let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
+    let goals = [("episodes", score.episodes.to_string()), ("goals per episode", number(score.goals, 3))];
+    let interval = (score.episodes > 1).then(|| ("  95 % interval", format!("{low} … {high}")));
+    let others = [
+        ("steps in tolerance, %", number(100.0 * score.in_tolerance, 2)),
+        ("rotation error, rad", number(score.rot_dist, 3)),
+        ("steps per goal", number(score.steps_per_goal, 0)),
+        ("drop rate, %", number(100.0 * score.drop_rate, 1)),
+        ("episode length, steps", number(score.length, 1)),
+        ("return", number(score.episode_return, 2)),
     ];
-    if score.episodes > 1 {
-        let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
-        figures.push(("  95 % interval".to_owned(), format!("{low} … {high}")));
-    }
-    figures.extend([
-        ("steps in tolerance, %".to_owned(), number(100.0 * score.in_tolerance, 2)),
-        ("rotation error, rad".to_owned(), number(score.rot_dist, 3)),
-        ("steps per goal".to_owned(), number(score.steps_per_goal, 0)),
-        ("drop rate, %".to_owned(), number(100.0 * score.drop_rate, 1)),
-        ("episode length, steps".to_owned(), number(score.length, 1)),
-        ("return".to_owned(), number(score.episode_return, 2)),
-    ]);
-    figures.extend(score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2))));
-    figures.push(("diverged episodes".to_owned(), score.diverged.to_string()));
-    figures
+    let terms = score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2)));
+    let before = goals.into_iter().chain(interval).chain(others).map(|(label, text)| (label.to_owned(), text));
+    before.chain(terms).chain([("diverged episodes".to_owned(), score.diverged.to_string())]).collect()
 }
 
 #[cfg(test)]

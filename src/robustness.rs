@@ -10,9 +10,9 @@ use serde_json::{Map, Value, json};
 use crate::cli::PlayArgs;
 use crate::config::{EnvConfig, Override};
 use crate::draw::{self, BarChart, HeatMap, Picture};
-use crate::evaluate::{Actor, Episodes, score};
+use crate::evaluate::{Actor, Episodes, Trial};
 use crate::load::Loaded;
-use crate::os::{self, Bar, OutputFile, Requests};
+use crate::os::{self, Bar, OutputFile, Requests, number};
 use crate::repose::{Score, Task};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -42,8 +42,13 @@ const MASSES: [&str; 3] = ["0.5", "1.0", "2.0"];
 struct Condition {
     name: String,
     sets: Vec<Override>,
-    /// Its friction and mass, if it belongs to the grid.
-    cell: Option<[&'static str; 2]>,
+}
+
+impl Condition {
+    /// Returns whether it belongs to the grid of friction and mass.
+    fn is_in_grid(&self) -> bool {
+        self.sets.len() == 2
+    }
 }
 
 /// A row of the table with its score.
@@ -73,13 +78,13 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
     let bar = Bar::new((different * count) as u64, "episodes", "robustness");
-    let mut rows: Vec<Row> = Vec::new();
+    let (mut rows, episodes): (Vec<Row>, _) = (Vec::new(), Episodes::scored(args.seed, count));
     for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
         bar.say(condition.name.clone());
         let played = match known {
             Some(known) => Some(known),
-            None => score(&task, actor, Episodes::scored(args.seed, count), requests.stop(), &bar, &mut |_| {})?,
+            None => Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, &mut |_| {})?,
         };
         let Some(score) = played else { break };
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
@@ -108,7 +113,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
 /// Returns all rows: the task itself, the single changes, and the grid.
 fn conditions() -> Vec<Condition> {
     let set = |key: &str, value: &str| Override { key: key.into(), value: value.into() };
-    let mut conditions = vec![Condition { name: "nominal".into(), sets: Vec::new(), cell: None }];
+    let mut conditions = vec![Condition { name: "nominal".into(), sets: Vec::new() }];
     for (name, key, values) in CHANGES {
         for value in values {
             let name = match *value {
@@ -116,14 +121,13 @@ fn conditions() -> Vec<Condition> {
                 TWICE_THE_NOISE => "twice the noise".to_owned(),
                 value => format!("{name} {}", value.trim_matches('"')),
             };
-            conditions.push(Condition { name, sets: vec![set(key, value)], cell: None });
+            conditions.push(Condition { name, sets: vec![set(key, value)] });
         }
     }
     for friction in FRICTIONS {
         for mass in MASSES {
             let name = format!("friction {friction}, cube mass {mass}");
-            let sets = vec![set(FRICTION, friction), set(MASS, mass)];
-            conditions.push(Condition { name, sets, cell: Some([friction, mass]) });
+            conditions.push(Condition { name, sets: vec![set(FRICTION, friction), set(MASS, mass)] });
         }
     }
     conditions
@@ -131,7 +135,7 @@ fn conditions() -> Vec<Condition> {
 
 /// Returns the mean of what is kept over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Row]) -> f64 {
-    let single = rows.iter().skip(1).filter(|row| row.condition.cell.is_none());
+    let single = rows.iter().skip(1).filter(|row| !row.condition.is_in_grid());
     let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();
     kept.iter().sum::<f64>() / kept.len() as f64
 }
@@ -157,10 +161,6 @@ fn as_json(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> Value 
     })
 }
 
-fn number(value: f64, decimals: usize) -> String {
-    if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") }
-}
-
 fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
     let mut text = format!("checkpoint {checkpoint}\n{episodes} episodes a row, seed {seed}\n\n");
     text += &format!("{:<30} {:>5}  {:<15} {:>7} {:>6}\n", "", "goals", "95 % interval", "drops", "kept");
@@ -174,17 +174,15 @@ fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
 }
 
 fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
-    let bars = rows.iter().filter(|row| row.condition.cell.is_none()).map(|row| {
+    let bars = rows.iter().filter(|row| !row.condition.is_in_grid()).map(|row| {
         let nominal = rows[0].score.goals;
         let note = format!("{:.2} goals, {:.0} % drops", row.score.goals, 100.0 * row.score.drop_rate);
         let interval = row.score.goals_ci95.map(|goals| goals / nominal);
         draw::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
     });
-    let kept = |friction: &str, mass: &str| {
-        let cell = rows.iter().find(|row| row.condition.cell.is_some_and(|[f, m]| [f, m] == [friction, mass]));
-        cell.map_or(f64::NAN, |row| row.kept)
-    };
-    let cells = MASSES.iter().map(|mass| FRICTIONS.iter().map(|friction| kept(friction, mass)).collect()).collect();
+    let grid: Vec<f64> = rows.iter().filter(|row| row.condition.is_in_grid()).map(|row| row.kept).collect();
+    let row = |mass: usize| grid.iter().skip(mass).step_by(MASSES.len()).copied().collect();
+    let cells = (0..MASSES.len()).map(row).collect();
     let named = |name: &str, values: &[&str]| values.iter().map(|value| format!("{name} {value}")).collect();
     BarChart {
         title: format!("Goals kept under a change: {checkpoint}, {episodes} episodes a row"),

@@ -1,7 +1,7 @@
 //! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Description, Lesson, TaskReward, TrainingReward};
+use crate::repose::{Description, FIGURES, Figure, Lesson, TaskReward, TrainingReward};
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -19,35 +19,18 @@ const GROUPS: [(&str, &str, &str); 3] = [
     ("eval/", "evaluation", "Episodes of the task itself with mean actions."),
 ];
 
-/// The figures of a score: name, title, description.
-const SCORES: [(&str, &str, &str); 7] = [
-    ("return", "return", "Sum of the task's rewards of an episode."),
-    ("length", "episode length (steps)", "Control steps of an episode."),
-    ("goals", "goals per episode", "Goals reached and held in an episode."),
-    ("in_tolerance", "share of steps in tolerance", "Fraction of the steps within the task's tolerance."),
-    ("drop_rate", "share of episodes dropped", "Fraction of the episodes that ended with a drop."),
-    ("rot_dist", "rotation error (rad)", "Rotation error, mean over the steps."),
-    ("steps_per_goal", "steps per goal", "Control steps per goal reached."),
-];
-
 /// What is logged besides scores and rewards: name, title, description.
+#[rustfmt::skip]
 const OTHERS: [(&str, &str, &str); 22] = [
-    (
-        "training/turned",
-        "turned towards the goal (rad/100 steps)",
-        "Rotation towards the goal in 100 steps, rad; no weight changes it.",
-    ),
+    ("training/turned", "turned towards the goal (rad/100 steps)",
+        "Rotation towards the goal in 100 steps, rad; no weight changes it."),
     ("loss/policy", "policy loss", "The clipped surrogate, negated, mean over the minibatches."),
     ("loss/value", "value loss", "The squared error of the values, mean over the minibatches."),
     ("policy/entropy", "entropy (nats)", "Entropy of the action distribution."),
     ("policy/kl", "KL divergence (nats)", "KL divergence from the policy that collected; near ppo.desired_kl."),
     ("policy/first_kl", "first KL divergence (nats)", "The same before the first gradient step: 0 up to rounding."),
     ("policy/clip_fraction", "share of samples clipped", "Fraction of the samples whose ratio was clipped."),
-    (
-        "policy/std",
-        "standard deviation of actions",
-        "Standard deviation of the actions; 1 is half an actuator's range.",
-    ),
+    ("policy/std", "standard deviation of actions", "Standard deviation of the actions; 1 is half an actuator's range."),
     ("policy/excess", "excess of mean actions", "Squared distance of the mean actions from [-1, 1]."),
     ("value/explained_variance", "explained variance", "1: the values explain the returns, 0: not at all."),
     ("optim/learning_rate", "learning rate", "Learning rate after the update."),
@@ -55,11 +38,7 @@ const OTHERS: [(&str, &str, &str); 22] = [
     ("time/collect_s", "collecting (s)", "Seconds of collecting in the iteration."),
     ("time/update_s", "learning (s)", "Seconds of learning in the iteration."),
     ("time/steps_per_s", "speed (steps/s)", "Control steps per second of collecting and learning, over all hands."),
-    (
-        "time/exchange_s",
-        "exchange (s)",
-        "Seconds of collecting and learning that the exchange took, waiting included; with MPI only.",
-    ),
+    ("time/exchange_s", "exchange (s)", "Seconds of collecting and learning that the exchange took, waiting included; with MPI only."),
     ("time/exchange_bytes", "exchange (bytes)", "Bytes that were sent while collecting and learning; with MPI only."),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
     ("histogram/actions", "actions", "Actions of the iteration as drawn, before they are clipped to [-1, 1]."),
@@ -74,25 +53,23 @@ pub fn quantity(name: &str) -> Option<Quantity> {
     if let Some((_, title, description)) = other {
         return Some(Quantity { title: (*title).to_owned(), description: (*description).to_owned() });
     }
-    if let Some((group, name)) = name.split_once('/') {
-        let term = |list: Vec<Description>| list.into_iter().find(|term| term.0 == name);
-        let mean = |term: Description| format!("{}, mean per step.", term.1.trim_end_matches('.'));
-        let (title, description) = match group {
-            "reward" => (format!("reward: {name}"), term(TaskReward::descriptions()).map(mean)),
-            "training" => {
-                let paid = term(TrainingReward::descriptions()).map(mean);
-                let of_lesson = term(Lesson::descriptions().collect()).map(|value| value.1.to_owned());
-                (format!("training: {name}"), paid.or(of_lesson))
-            }
-            _ => (String::new(), None),
-        };
-        if let Some(description) = description {
-            return Some(Quantity { title, description });
-        }
+    let (group, part) = name.split_once('/')?;
+    let term = |list: Vec<Description>| {
+        let found = list.into_iter().find(|term| term.0 == part);
+        found.map(|term| format!("{}, mean per step.", term.1.trim_end_matches('.')))
+    };
+    let of_lesson = || Lesson::descriptions().find(|value| value.0 == part).map(|value| value.1.to_owned());
+    let description = match group {
+        "reward" => term(TaskReward::descriptions()),
+        "training" => term(TrainingReward::descriptions()).or_else(of_lesson),
+        _ => None,
+    };
+    if let Some(description) = description {
+        return Some(Quantity { title: format!("{group}: {part}"), description });
     }
     GROUPS.iter().find_map(|(group, of, episodes)| {
         let figure = name.strip_prefix(group)?;
-        let (_, title, description) = SCORES.iter().find(|(known, ..)| *known == figure)?;
+        let Figure(_, title, description, _) = FIGURES.into_iter().find(|known| known.0 == figure)?;
         Some(Quantity { title: format!("{title}, {of}"), description: format!("{description} {episodes}") })
     })
 }

@@ -32,7 +32,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
-    let episodes = Episodes { seed: args.seed, purpose: "score", first: 0, count: usize::MAX };
+    let episodes = Episodes::scored(args.seed, usize::MAX);
     match &args.screenshot {
         Some(path) => draw(path, args, &config.env, &ACTORS[first].2, episodes),
         None => show(args, &config.env, first, episodes),

@@ -18,6 +18,11 @@ pub fn print(text: &str) -> Result<()> {
     }
 }
 
+/// Returns a number with these decimals, or `-` if it is not known (NaN).
+pub fn number(value: f64, decimals: usize) -> String {
+    if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") }
+}
+
 /// What each line of [`say`] begins with.
 static SPEAKER: OnceLock<String> = OnceLock::new();
 

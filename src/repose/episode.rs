@@ -123,6 +123,26 @@ pub struct Score {
     pub diverged: usize,
 }
 
+/// A figure of a score: its name in columns and tags, what it is in a few words (with its unit in brackets), what it is in a
+/// sentence, and its value.
+#[derive(Clone, Copy)]
+pub struct Figure(pub &'static str, pub &'static str, pub &'static str, fn(&Score) -> f64);
+
+/// The figures that a training logs.
+#[rustfmt::skip]
+pub const FIGURES: [Figure; 7] = [
+    Figure("return", "return", "Sum of the task's rewards of an episode.", |score| score.episode_return),
+    Figure("length", "episode length (steps)", "Control steps of an episode.", |score| score.length),
+    Figure("goals", "goals per episode", "Goals reached and held in an episode.", |score| score.goals),
+    Figure("in_tolerance", "share of steps in tolerance", "Fraction of the steps within the task's tolerance.", |score| score.in_tolerance),
+    Figure("drop_rate", "share of episodes dropped", "Fraction of the episodes that ended with a drop.", |score| score.drop_rate),
+    Figure("rot_dist", "rotation error (rad)", "Rotation error, mean over the steps.", |score| score.rot_dist),
+    Figure("steps_per_goal", "steps per goal", "Control steps per goal reached.", |score| score.steps_per_goal),
+];
+
+/// The figures that summarise an evaluation during training.
+const HEADLINE: [&str; 4] = ["goals", "drop_rate", "rot_dist", "return"];
+
 impl Score {
     /// Returns a warning if many of the steps diverged; each such step ended an episode.
     pub fn divergence(&self) -> Option<String> {
@@ -130,26 +150,14 @@ impl Score {
     }
 
     /// Returns all figures by name.
-    pub fn named(&self) -> [(&'static str, f64); 7] {
-        [
-            ("return", self.episode_return),
-            ("length", self.length),
-            ("goals", self.goals),
-            ("in_tolerance", self.in_tolerance),
-            ("drop_rate", self.drop_rate),
-            ("rot_dist", self.rot_dist),
-            ("steps_per_goal", self.steps_per_goal),
-        ]
+    pub fn named(&self) -> [(&'static str, f64); FIGURES.len()] {
+        FIGURES.map(|Figure(name, .., value)| (name, value(self)))
     }
 
     /// Returns the figures, by name, that summarise an evaluation during training.
-    pub fn headline(&self) -> [(&'static str, f64); 4] {
-        [
-            ("goals", self.goals),
-            ("drop_rate", self.drop_rate),
-            ("rot_dist", self.rot_dist),
-            ("return", self.episode_return),
-        ]
+    pub fn headline(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let all = self.named();
+        HEADLINE.into_iter().filter_map(move |wanted| all.into_iter().find(|(name, _)| *name == wanted))
     }
 
     /// Computes the score of `episodes`.

@@ -16,7 +16,7 @@ mod task;
 
 pub use divergence::{Diverged, Tail, divergence};
 pub use environment::{Repose, StepDetails};
-pub use episode::{EpisodeStats, Score, StepSums};
+pub use episode::{EpisodeStats, FIGURES, Figure, Score, StepSums};
 pub use hand::{ACTION_SIZE, ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::Lesson;
 pub use observation::{Group, OBSERVATION, OBSERVATION_SIZE, SPACES};

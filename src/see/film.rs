@@ -11,7 +11,7 @@ use crate::cli::Shot;
 use crate::config::EnvConfig;
 use crate::draw::{self, Clip, FilmFormat, FilmWriter};
 use crate::env::Env;
-use crate::evaluate::{Actor, Episodes, Moment, Player, evaluate};
+use crate::evaluate::{Actor, Episodes, Moment, Player, Trial};
 use crate::os::{Bar, OutputFile};
 use crate::repose::{Repose, Task};
 use crate::run::Animation;
@@ -144,7 +144,7 @@ impl EpisodeFilms {
             }
             Ok(())
         };
-        let played = evaluate(task, actor, Episodes { count: 1, ..episodes }, stop, &mut observe)?;
+        let played = Trial { task, actor, episodes: Episodes { count: 1, ..episodes }, stop }.play(&mut observe)?;
         played.map(|_| Ok(Animation { size, gif: clip.finish()? })).transpose()
     }
 }

@@ -43,7 +43,7 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     put("reward/", &mut steps.task_named());
     put("training/", &mut steps.training_named());
     put("training/", &mut iteration.lesson.named());
-    put("eval/", &mut evaluation.headline().into_iter());
+    put("eval/", &mut evaluation.headline());
     put("", &mut iteration.update.named().into_iter());
     put("time/", &mut iteration.time_named().into_iter());
     put("time/", &mut traffic.named().into_iter());

@@ -19,7 +19,7 @@ use anyhow::{Context, Error, Result, anyhow};
 
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::evaluate::{Actor, Episodes, evaluate_together};
+use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::Evaluation;
 use crate::ranks::{self, Exchange};
@@ -188,7 +188,8 @@ impl Session {
             return Ok(Some(Score::of(&[])));
         }
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
-        let played = evaluate_together(&self.task, &actor, self.evaluation_episodes(), &self.agent.exchange, stop)?;
+        let trial = Trial { task: &self.task, actor: &actor, episodes: self.evaluation_episodes(), stop };
+        let played = trial.play_together(&self.agent.exchange)?;
         let Some(score) = played.map(|played| Score::of(&played)) else { return Ok(None) };
         if let Some(report) = report {
             report.say(&format!(

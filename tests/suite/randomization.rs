@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use serde_json::Value;
 use shadow_repose::config::{Config, Ramp};
 use shadow_repose::env::{Env, EnvState, Resumable};
-use shadow_repose::evaluate::{Actor, Episodes, evaluate};
+use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::load::Loaded;
 use shadow_repose::repose::{EpisodePhysics, Lesson, OBSERVATION_SIZE, Randomization, Repose, Score, Task};
 use shadow_repose::rng;
@@ -387,7 +387,8 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
         let loaded = Loaded::find(Some(&place), &sets).unwrap();
         let episodes = Episodes { seed: 0, purpose: "evaluation", first: 0, count };
         let (task, actor) = (Task::new(&loaded.config).unwrap(), Actor::Mean(loaded.policy.freeze()));
-        let played = evaluate(&task, &actor, episodes, &AtomicBool::new(false), &mut |_| Ok(())).unwrap().unwrap();
+        let trial = Trial { task: &task, actor: &actor, episodes, stop: &AtomicBool::new(false) };
+        let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
         Score::of(&played).rot_dist
     };
     assert_eq!(rot_dist(&[]), logged);

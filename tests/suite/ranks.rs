@@ -7,7 +7,7 @@ use std::sync::{Arc, Barrier, Mutex};
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
 use shadow_repose::env::Env;
-use shadow_repose::evaluate::{Actor, Episodes, evaluate, evaluate_together};
+use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::ppo::{Checkpoint, Ppo};
 use shadow_repose::ranks::{Exchange, Ranks};
 use shadow_repose::repose::{EpisodeStats, Lesson, Repose, SPACES, Task};
@@ -185,13 +185,15 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
     for count in [5, 100] {
         let episodes = Episodes { seed: 3, purpose: "evaluation", first: 10, count };
         let alone = Actor::Mean(ppo.policy().freeze());
-        let alone = evaluate(&task, &alone, episodes, &never, &mut |_| Ok(())).unwrap().unwrap();
+        let alone =
+            Trial { task: &task, actor: &alone, episodes, stop: &never }.play(&mut |_| Ok(())).unwrap().unwrap();
         assert_eq!(alone.len(), count);
         for ranks in [1, 4] {
             let work = |_, exchange: Exchange| {
                 let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
                 let actor = Actor::Mean(ppo.policy().freeze());
-                evaluate_together(&task, &actor, episodes, &exchange, &never).unwrap().unwrap()
+                let trial = Trial { task: &task, actor: &actor, episodes, stop: &never };
+                trial.play_together(&exchange).unwrap().unwrap()
             };
             let mut together = on_ranks(ranks, 4, work);
             assert!(together.swap_remove(0) == alone, "{count} episodes on {ranks} ranks");
