@@ -127,7 +127,7 @@ pub(crate) fn metrics(data: &[u8]) -> [bool; 2] {
     resume_logs(folder.path());
     // Rows are kept whatever their other columns contain.
     if let Ok(kept) = run::read_metrics(folder.path(), &["iteration"], &[]) {
-        assert!(kept.required[0].iter().all(|&iteration| iteration <= 10.0));
+        assert!(kept.columns["iteration"].iter().all(|&iteration| iteration <= 10.0));
     }
     [drawn.is_ok(); 2]
 }

@@ -1,6 +1,7 @@
 //! Learning curves: metrics of one or more runs over control steps or hours. What training logs in each iteration is smoothed,
 //! evaluations are drawn at their own steps.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
@@ -11,14 +12,16 @@ use crate::os::{self, OutputFile, similar};
 use crate::run::{self, MetricsTable};
 use crate::tags::quantity;
 
-/// The metrics that are drawn by default: the headline, and what explains it.
-const DEFAULT: [&str; 4] = ["eval/goals", "episode/goals", "training/turned", "episode/drop_rate"];
+/// A metric, and what is drawn instead where no run has its values.
+type Metric<'a> = (&'a str, Option<&'a str>);
 
-/// What is drawn instead where no run has values: no episode of the task itself, because all are randomised; or an older table.
-const INSTEAD: [(&str, &str); 3] = [
-    ("episode/goals", "randomized/goals"),
-    ("training/turned", "episode/rot_dist"),
-    ("episode/drop_rate", "randomized/drop_rate"),
+/// The metrics that are drawn by default: the headline, and what explains it. They have no values where no episode is of the
+/// task itself, because all are randomised, or in an older table.
+const DEFAULT: [Metric; 4] = [
+    ("eval/goals", None),
+    ("episode/goals", Some("randomized/goals")),
+    ("training/turned", Some("episode/rot_dist")),
+    ("episode/drop_rate", Some("randomized/drop_rate")),
 ];
 
 /// The columns that every run must have: control steps at the end of each iteration, and the seconds of its two parts.
@@ -30,12 +33,14 @@ const EVALUATION: &str = "eval/";
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
-/// A run: its name, its place on the x axis in each row, the lengths of the windows that are smoothed, and its table.
+/// A run: its name, its place on the x axis in each row, the lengths of the windows that are smoothed, the names of all its
+/// columns, and those that were asked for.
 struct Run {
     name: String,
     along: Vec<f64>,
     windows: Vec<usize>,
-    table: MetricsTable,
+    names: Vec<String>,
+    columns: HashMap<String, Vec<f64>>,
 }
 
 /// Draws the curves. Of several runs, those that cannot be drawn are skipped with a warning, e.g. one that was stopped in its
@@ -48,25 +53,18 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let output = OutputFile::create(&args.out)?;
     draw::picture_format(&output)?;
-    let asked: Vec<&str> = args.metric.iter().map(String::as_str).collect();
-    let metrics = if asked.is_empty() { DEFAULT.to_vec() } else { asked };
-    let instead = if args.metric.is_empty() { &INSTEAD[..] } else { &[] };
-    let wanted: Vec<&str> = metrics.iter().copied().chain(instead.iter().map(|(_, other)| *other)).collect();
+    let asked = args.metric.iter().map(|name| (&name[..], None));
+    let metrics: Vec<Metric> = if args.metric.is_empty() { DEFAULT.to_vec() } else { asked.collect() };
+    let wanted: Vec<&str> = metrics.iter().flat_map(|(usual, other)| [*usual].into_iter().chain(*other)).collect();
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &args.metric)?;
     ensure!(!args.seeds || runs.len() > 1, "--seeds: the mean of a single run; give the runs of several seeds");
-    let column = |run: &Run, name: &str| {
-        let place = wanted.iter().position(|wanted| *wanted == name)?;
-        run.table.wanted[place].clone()
-    };
-    let known =
-        |name: &str| runs.iter().any(|run| column(run, name).is_some_and(|all| all.iter().any(|x| !x.is_nan())));
+    let has_values = |run: &Run, name: &str| run.columns.get(name).is_some_and(|all| all.iter().any(|x| !x.is_nan()));
+    let known = |name: &str| runs.iter().any(|run| has_values(run, name));
     let mut panels = Vec::new();
-    for name in metrics {
-        let other = instead.iter().find(|(usual, _)| *usual == name);
-        let name = other.map(|(_, other)| *other).filter(|other| !known(name) && known(other)).unwrap_or(name);
-        let curve = |run: &Run| column(run, name).map_or_else(Curve::default, |values| run.curve(name, &values));
-        let curves: Vec<Curve> = runs.iter().map(curve).collect();
+    for (usual, other) in metrics {
+        let name = other.filter(|other| !known(usual) && known(other)).unwrap_or(usual);
+        let curves: Vec<Curve> = runs.iter().map(|run| run.curve(name)).collect();
         let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
         let mut title = quantity(name).map_or_else(|| name.to_owned(), |known| known.title);
         let curves = if args.seeds {
@@ -102,7 +100,7 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
     let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
     for (i, place) in args.runs.iter().enumerate() {
         let rows = run::read_metrics(place, &ALONG, wanted).and_then(|table| {
-            ensure!(!table.required[0].is_empty(), "{}: no rows yet", place.display());
+            ensure!(!table.columns[ALONG[0]].is_empty(), "{}: no rows yet", place.display());
             Ok(table)
         });
         match rows {
@@ -112,16 +110,17 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
         }
     }
     // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
-    let in_row = tables.iter().filter_map(|(_, table)| Some(table.required[0].get(1)? - table.required[0][0]));
+    let steps = tables.iter().map(|(_, table)| &table.columns[ALONG[0]]);
+    let in_row = steps.filter_map(|steps| Some(steps.get(1)? - steps[0]));
     let window = args.smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
-    let run = |(place, table): (&Path, MetricsTable)| {
-        let [steps, collect_s, update_s] = &table.required[..] else { unreachable!("one for each required column") };
+    let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
+        let [steps, collect_s, update_s] = ALONG.map(|name| &columns[name]);
         let along = match args.along {
             Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
             Along::Hours => hours(collect_s, update_s),
         };
         let windows = lengths_of_windows(steps, window);
-        Run { name: name_of(place), along, windows, table }
+        Run { name: name_of(place), along, windows, names, columns }
     };
     Ok(tables.into_iter().map(run).collect())
 }
@@ -131,11 +130,11 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
 /// # Errors
 /// Fails on the first column that no run has, and names the nearest ones.
 fn expect_columns(runs: &[Run], metrics: &[String]) -> Result<()> {
-    for (i, name) in metrics.iter().enumerate() {
-        let lacking: Vec<&str> =
-            runs.iter().filter(|run| run.table.wanted[i].is_none()).map(|run| &run.name[..]).collect();
+    for name in metrics {
+        let lacking = runs.iter().filter(|run| !run.columns.contains_key(name));
+        let lacking: Vec<&str> = lacking.map(|run| &run.name[..]).collect();
         if lacking.len() == runs.len() {
-            let mut known: Vec<&str> = runs.iter().flat_map(|run| &run.table.names).map(String::as_str).collect();
+            let mut known: Vec<&str> = runs.iter().flat_map(|run| &run.names).map(String::as_str).collect();
             known.sort_unstable();
             known.dedup();
             let mut nearest = similar(name, known.into_iter(), '/');
@@ -155,7 +154,8 @@ fn expect_columns(runs: &[Run], metrics: &[String]) -> Result<()> {
 
 impl Run {
     /// Returns the curve of a metric with these values.
-    fn curve(&self, name: &str, values: &[f64]) -> Curve {
+    fn curve(&self, name: &str) -> Curve {
+        let Some(values) = self.columns.get(name) else { return Curve::default() };
         let dots = name.starts_with(EVALUATION);
         // Each evaluation counts by itself, at the step at which it was made.
         let each = vec![1; values.len()];

@@ -1,10 +1,11 @@
 //! Reading `metrics.csv`, for charts. Any file may be given: sizes are bounded, and messages quote little of it.
 
+use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 
 use super::folder::METRICS;
 use super::metrics::LONGEST_ROW;
@@ -30,10 +31,8 @@ const LONGEST_NAME: usize = 64;
 pub struct MetricsTable {
     /// The names of all its columns.
     pub names: Vec<String>,
-    /// The values of each of the required columns.
-    pub required: Vec<Vec<f64>>,
-    /// The values of each of the other columns that were asked for; `None` if the table does not have it.
-    pub wanted: Vec<Option<Vec<f64>>>,
+    /// The values of those that were asked for and that it has, by name.
+    pub columns: HashMap<String, Vec<f64>>,
 }
 
 /// Reads these columns of a table. A value is `NaN` if its cell is empty or cannot be drawn: infinite, or beyond 1e30. `place`
@@ -53,13 +52,11 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     next(&mut line).with_context(context)?;
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
     let names: Vec<&str> = header.split(',').collect();
-    let places: Vec<Option<usize>> =
-        required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column)).collect();
-    for (column, place) in required.iter().zip(&places) {
-        let has = || format!("{} has no column {column}; it has {}", path.display(), beginning(&header));
-        place.with_context(has)?;
+    if let Some(column) = required.iter().find(|column| !names.contains(column)) {
+        bail!("{} has no column {column}; it has {}", path.display(), beginning(&header));
     }
-    let mut columns: Vec<Option<Vec<f64>>> = places.iter().map(|place| place.map(|_| Vec::new())).collect();
+    let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
+    let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
     let mut row = 0;
     while next(&mut line).with_context(context)? > 0 {
         row += 1;
@@ -67,9 +64,8 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
         let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
         // Skips incomplete rows: the last row of a run in progress may be one.
         if cells.len() == names.len() {
-            for (place, column) in places.iter().zip(&mut columns) {
-                let (Some(place), Some(column)) = (*place, column) else { continue };
-                let cell = String::from_utf8_lossy(cells[place]);
+            for (place, column) in &mut columns {
+                let cell = String::from_utf8_lossy(cells[*place]);
                 let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
                 let number: f64 = number
                     .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), beginning(&cell)))?;
@@ -77,10 +73,9 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
             }
         }
     }
-    let wanted = columns.split_off(required.len());
+    let columns = columns.into_iter().map(|(place, values)| (names[place].to_owned(), values)).collect();
     let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
-    let names = known.map(|name| (*name).to_owned()).collect();
-    Ok(MetricsTable { names, required: columns.into_iter().flatten().collect(), wanted })
+    Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
 }
 
 /// Returns the beginning of a text, short enough for a message.
@@ -102,10 +97,10 @@ mod tests {
         let path = place.path().join(METRICS);
         fs::write(&path, "iteration,loss\n1,0.5\n2,\n3").unwrap();
         let read = read_metrics(&path, &["loss", "iteration"], &["iteration", "goals"]).unwrap();
-        assert!(read.required[0][0] == 0.5 && read.required[0][1].is_nan(), "{read:?}");
-        assert!(read.required[1] == [1.0, 2.0] && read.wanted == [Some(vec![1.0, 2.0]), None], "{read:?}");
+        assert!(read.columns["loss"][0] == 0.5 && read.columns["loss"][1].is_nan(), "{read:?}");
+        assert!(read.columns["iteration"] == [1.0, 2.0] && !read.columns.contains_key("goals"), "{read:?}");
         assert_eq!(read.names, ["iteration", "loss"]);
-        assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().required[0].len(), 2);
+        assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(), 2);
         let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
         assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
     }
@@ -115,7 +110,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(METRICS);
         fs::write(&path, "iteration,loss\n1,1.7e308\r\n2,-inf\n3,7\n").unwrap();
-        let read = &read_metrics(&path, &["loss"], &[]).unwrap().required[0];
+        let read = &read_metrics(&path, &["loss"], &[]).unwrap().columns["loss"];
         assert!(read[0].is_nan() && read[1].is_nan() && read[2] == 7.0, "{read:?}");
         for text in
             [format!("{{{}\n", "\"a\": 1,".repeat(100_000)), format!("iteration,loss\n1,{}\n", "x".repeat(99_999))]
