@@ -71,7 +71,7 @@ impl GoalTimes {
             "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
         });
         let turning = |goal: &Goal| [goal.angle, f64::from(goal.steps) - f64::from(self.hold)];
-        let Line { offset, slope } = line(self.reached.iter().map(turning));
+        let [offset, slope] = line(self.reached.iter().map(turning));
         [
             ("steps_to_goal", to_goal),
             ("drops_first_second", json!(self.early_drops as f64 / self.episodes as f64)),
@@ -88,20 +88,14 @@ fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     low + part * (high - low)
 }
 
-/// A straight line.
-struct Line {
-    offset: f64,
-    slope: f64,
-}
-
-/// Fits the least-squares line y(x); `NaN` for fewer than two distinct x.
-fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> Line {
+/// Fits the least-squares line y(x), and returns its offset and slope; `NaN` for fewer than two distinct x.
+fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
     let count = points.clone().count() as f64;
     let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;
     let [x_mean, y_mean] = [mean(&|[x, _]| x), mean(&|[_, y]| y)];
     let spread = mean(&|[x, _]| (x - x_mean).powi(2));
     let slope = if spread > 0.0 { mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread } else { f64::NAN };
-    Line { offset: y_mean - slope * x_mean, slope }
+    [y_mean - slope * x_mean, slope]
 }
 
 #[cfg(test)]

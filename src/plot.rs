@@ -205,12 +205,11 @@ fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
 
 /// Returns the hours until the end of each iteration of a run.
 fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
-    let mut seconds = 0.0;
-    let until = |(collect, update): (&f64, &f64)| {
-        seconds += collect + update;
-        seconds / 3600.0
+    let add = |seconds: &mut f64, (collect, update): (&f64, &f64)| {
+        *seconds += collect + update;
+        Some(*seconds / 3600.0)
     };
-    collect_s.iter().zip(update_s).map(until).collect()
+    collect_s.iter().zip(update_s).scan(0.0, add).collect()
 }
 
 /// Returns the name of a run, with control characters replaced: that of its folder, or of a table that is kept under a name of

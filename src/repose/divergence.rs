@@ -97,15 +97,13 @@ impl Recorder {
 
     /// Returns the recorded steps; `None` before the first step.
     pub(super) fn tail(&self) -> Option<Tail> {
-        let now = self.now.clone()?;
-        Some(match self.before.clone() {
-            Some(mut tail) => {
-                tail.controls.extend(now.controls);
-                tail.actions.extend(now.actions);
-                tail.pushes.extend(now.pushes);
-                tail
-            }
-            None => now,
-        })
+        let mut parts = [&self.before, &self.now].into_iter().flatten().cloned();
+        let mut tail = parts.next()?;
+        for part in parts {
+            tail.controls.extend(part.controls);
+            tail.actions.extend(part.actions);
+            tail.pushes.extend(part.pushes);
+        }
+        Some(tail)
     }
 }

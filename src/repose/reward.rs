@@ -2,7 +2,6 @@
 //!
 //! A term is one row. Its column in `metrics.csv`, its tag, its sums and its description follow from that row.
 
-use std::fmt;
 use std::ops::{AddAssign, Index};
 
 use serde::de::Error;
@@ -96,7 +95,7 @@ const LISTS: [fn() -> Vec<Description>; 2] =
     [|| TASK.iter().map(|term| term.0).collect(), || TRAINING.iter().map(|term| term.0).collect()];
 
 /// The values of the N terms in a list.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Terms<const LIST: usize, const N: usize>([f64; N]);
 
 /// The task's reward by term.
@@ -160,13 +159,6 @@ impl<const LIST: usize, const N: usize> Default for Terms<LIST, N> {
     }
 }
 
-impl<const LIST: usize, const N: usize> fmt::Debug for Terms<LIST, N> {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.debug_map().entries(self.named()).finish()
-    }
-}
-
-// serde knows no arrays of any length.
 impl<const LIST: usize, const N: usize> Serialize for Terms<LIST, N> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         self.0[..].serialize(serializer)
