@@ -209,9 +209,9 @@ fn everything_solid_can_touch_everything_else() {
 #[test]
 fn a_number_that_is_none_in_an_own_scene_is_named() {
     for (from, to, named) in [
-        ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "position of body `cube`"),
-        ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "friction of geom `cube`"),
-        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "damping of joint `rh_FFJ3`"),
+        ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "body_pos of body `cube`"),
+        ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "geom_friction of geom `cube`"),
+        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "dof_damping of joint `rh_FFJ3`"),
     ] {
         let text = edited(from, to);
         let message = refusal(&text);
