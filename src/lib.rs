@@ -31,8 +31,8 @@
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, quat, rng, sim, spaces |
 //! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, quat, ranks, rng, spaces |
+//! | [`config`] | all settings, their defaults and rules | os, sim |
 //! | [`sim`] | the only interface to MuJoCo | quat, schedule |
-//! | [`config`] | all settings, their defaults and rules | os |
 //! | [`run`] | the folder of a run and its logs | os |
 //! | [`draw`] | charts, films and pictures as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |

@@ -10,7 +10,7 @@ use crate::env::{Env, EnvPool, Transition};
 use crate::repose::{ACTION_SIZE, EpisodePhysics, EpisodeStats, Lesson, Randomization, Repose, Task};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
-use crate::sim::{BareSimulation, FreeJoint, Scene, SimulationState};
+use crate::sim::{FreeJoint, Scene, Simulation, SimulationState};
 use crate::spaces::Spaces;
 
 /// The record of what an environment did in a burst.
@@ -89,7 +89,7 @@ impl Env for RecordingEnv {
 
 /// The physics alone of an environment.
 struct Replay {
-    sim: BareSimulation,
+    sim: Simulation,
     /// What the last episode has drawn, and its scene.
     drawn: (Option<EpisodePhysics>, Scene),
     /// The scenes of the episodes that begin in the next burst.
@@ -98,7 +98,7 @@ struct Replay {
 
 impl Replay {
     fn new(nominal: &Scene) -> Self {
-        Self { sim: BareSimulation::new(nominal), drawn: (None, nominal.clone()), resets: Vec::new() }
+        Self { sim: Simulation::new(nominal), drawn: (None, nominal.clone()), resets: Vec::new() }
     }
 
     /// Prepares what the replay of a burst needs: its first state and its scenes.
@@ -107,7 +107,7 @@ impl Replay {
         if *draw != self.drawn.0 {
             self.drawn = (draw.clone(), scene_of(draw.as_ref()));
         }
-        self.sim.start(state, &self.drawn.1);
+        self.sim.start_replay(state, &self.drawn.1);
         self.resets = recording.resets.iter().map(|(_, _, draw)| scene_of(draw.as_ref())).collect();
         if let (Some((_, _, draw)), Some(scene)) = (recording.resets.last(), self.resets.last()) {
             self.drawn = (draw.clone(), scene.clone());
@@ -118,9 +118,10 @@ impl Replay {
         if let Some(force) = recording.pushes[step] {
             self.sim.push(cube.body, force);
         }
-        self.sim.step(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE], substeps);
+        self.sim.ctrl_mut().copy_from_slice(&recording.ctrl[step * ACTION_SIZE..][..ACTION_SIZE]);
+        self.sim.step_whole(substeps);
         if let Ok(i) = recording.resets.binary_search_by_key(&(step + 1), |&(after, ..)| after) {
-            self.sim.start(&recording.resets[i].1, &self.resets[i]);
+            self.sim.start_replay(&recording.resets[i].1, &self.resets[i]);
         }
     }
 }

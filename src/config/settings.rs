@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::ramp::Ramp;
+use crate::sim::Cone;
 
 /// The value of `env.model` for the built-in scene.
 pub const BUILTIN_MODEL: &str = "builtin";
@@ -46,7 +47,7 @@ pub struct EnvConfig {
     pub frictionloss_scale: f64,
     pub cube_com: [f64; 3],
     pub gravity: [f64; 3],
-    pub cone: ConeSetting,
+    pub cone: Cone,
     pub action_delay: u32,
     pub noise: ByGroup,
     pub bias: ByGroup,
@@ -72,18 +73,6 @@ pub struct EnvConfig {
 
 /// Values by the name of a group of the observation; groups that are not named have 0.
 pub type ByGroup = BTreeMap<String, f64>;
-
-/// The shape of the friction cones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ConeSetting {
-    /// That of the scene.
-    Scene,
-    /// Pyramids.
-    Pyramidal,
-    /// Cones.
-    Elliptic,
-}
 
 /// The effect of a step outside the tolerance on the counter of steps within it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

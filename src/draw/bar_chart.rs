@@ -1,11 +1,11 @@
 //! A chart of values by name, with a map of values over two quantities below it.
 
-use anyhow::{Result, anyhow};
+use anyhow::Result;
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use plotters::style::text_anchor::{HPos, Pos, VPos};
+use plotters::style::text_anchor::HPos;
 
-use super::chart::{COLOURS, GRID, Picture};
+use super::chart::{COLOURS, GRID, Picture, draw_text};
 
 /// A value with its name, its interval and a note.
 pub struct NamedBar {
@@ -57,24 +57,19 @@ const LINES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 const BAR: RGBColor = COLOURS[0];
 
 impl Picture for BarChart {
-    fn size(&self) -> [u32; 2] {
+    fn size(&self) -> Result<[u32; 2]> {
         let map = if self.map.rows.is_empty() { 0 } else { GAP + CELL * (1 + self.map.rows.len() as i32) };
-        [WIDTH as u32, (TITLE + ROW * (1 + self.bars.len() as i32) + map + GAP) as u32]
+        Ok([WIDTH as u32, (TITLE + ROW * (1 + self.bars.len() as i32) + map + GAP) as u32])
     }
 
-    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
-        let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
-        area.fill(&WHITE).map_err(failed)?;
-        let text = |content: &str, at: (i32, i32), across: HPos, size: i32, colour: RGBColor| {
-            let style = ("sans-serif", size).into_font().color(&colour).pos(Pos::new(across, VPos::Center));
-            area.draw(&Text::new(content.to_owned(), at, style)).map_err(failed)
-        };
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+        area.fill(&WHITE)?;
+        let text = |content: &str, at, across, size, colour| draw_text(&area, content, at, (across, size, colour));
         let x = |value: f64| NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32;
         let bottom = TITLE + ROW * self.bars.len() as i32;
         text(&self.title, (WIDTH / 2, TITLE / 2), HPos::Center, 16, BLACK)?;
         for value in LINES {
-            let line = PathElement::new([(x(value), TITLE), (x(value), bottom)], GRID);
-            area.draw(&line).map_err(failed)?;
+            area.draw(&PathElement::new([(x(value), TITLE), (x(value), bottom)], GRID))?;
             text(&format!("{value}"), (x(value), bottom + ROW / 2), HPos::Center, 12, BLACK)?;
         }
         for (i, bar) in self.bars.iter().enumerate() {
@@ -82,9 +77,8 @@ impl Picture for BarChart {
             text(&bar.name, (NAMES - 8, middle), HPos::Right, 13, BLACK)?;
             text(&bar.note, (WIDTH - NOTES + 8, middle), HPos::Left, 12, BLACK)?;
             let corners = [(x(0.0), middle - 7), (x(bar.value), middle + 7)];
-            area.draw(&Rectangle::new(corners, BAR.filled())).map_err(failed)?;
-            let whisker = PathElement::new(bar.interval.map(|value| (x(value), middle)).to_vec(), BLACK);
-            area.draw(&whisker).map_err(failed)?;
+            area.draw(&Rectangle::new(corners, BAR.filled()))?;
+            area.draw(&PathElement::new(bar.interval.map(|value| (x(value), middle)), BLACK))?;
         }
         let top = bottom + ROW + GAP;
         let columns = self.map.columns.len() as i32;
@@ -99,13 +93,13 @@ impl Picture for BarChart {
                 let left = NAMES + width * j as i32;
                 let share = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
                 let corners = [(left, upper), (left + width - 2, upper + CELL - 2)];
-                area.draw(&Rectangle::new(corners, blended(share).filled())).map_err(failed)?;
+                area.draw(&Rectangle::new(corners, blended(share).filled()))?;
                 let colour = if share > 0.6 { WHITE } else { BLACK };
                 let known = if value.is_nan() { "-".to_owned() } else { format!("{value:.2}") };
                 text(&known, (left + width / 2, upper + CELL / 2), HPos::Center, 13, colour)?;
             }
         }
-        area.present().map_err(failed)
+        Ok(area.present()?)
     }
 }
 

@@ -1,6 +1,6 @@
 //! A chart with curves in panels, one above the other, and a legend above them: SVG, or PNG with the feature `video`.
 
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::element::DashedPathElement;
@@ -68,99 +68,107 @@ fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
 /// A picture that is drawn in the same way in each format.
 pub trait Picture {
     /// Returns its width and height in pixels.
-    fn size(&self) -> [u32; 2];
+    ///
+    /// # Errors
+    /// Fails if the picture is too small for what it shows.
+    fn size(&self) -> Result<[u32; 2]>;
 
     /// Draws it.
     ///
     /// # Errors
-    /// Fails if the picture is too small for what it shows.
-    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()>;
+    /// Fails if the font cannot be used.
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()>;
 
     /// Writes the picture in the format given by the extension of its name.
     ///
     /// # Errors
-    /// Fails for any other format than SVG and PNG, if the file cannot be written, or as [`Picture::draw`] does.
+    /// Fails for any other format than SVG and PNG, if the file cannot be written, or as [`Picture::size`] does.
     fn write(&self, output: OutputFile) -> Result<()> {
-        register_font();
-        let [width, height] = self.size();
+        // With the feature `video`, text is measured for SVG too, which needs the font. A second call has no effect.
+        #[cfg(feature = "video")]
+        let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
+        let [width, height] = self.size()?;
         match picture_format(&output)? {
-            Format::Svg => {
-                let mut text = String::new();
-                self.draw(SVGBackend::with_string(&mut text, (width, height)).into_drawing_area())?;
-                output.finish(text.as_bytes())
-            }
             #[cfg(feature = "video")]
-            Format::Png => {
+            "png" => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
-                self.draw(BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area())?;
-                super::film::write_png(output, self.size(), &rgb)
+                let area = BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area();
+                self.draw(area).context("cannot draw the chart")?;
+                super::film::write_png(output, [width, height], &rgb)
+            }
+            _ => {
+                let mut text = String::new();
+                let area = SVGBackend::with_string(&mut text, (width, height)).into_drawing_area();
+                self.draw(area).context("cannot draw the chart")?;
+                output.finish(text.as_bytes())
             }
         }
     }
 }
 
-/// A format of charts.
-pub enum Format {
-    /// SVG.
-    Svg,
-    /// PNG.
-    #[cfg(feature = "video")]
-    Png,
-}
-
-/// Returns the format of a chart that is to be written, so that a wrong name is noticed before the work.
+/// Returns the format of a chart that is to be written, svg or png, so that a wrong name is noticed before the work.
 ///
 /// # Errors
 /// Fails if the name does not end in .svg or .png, and for PNG without the feature `video`.
-pub fn picture_format(output: &OutputFile) -> Result<Format> {
+pub fn picture_format(output: &OutputFile) -> Result<&str> {
     match output.path().extension().and_then(|extension| extension.to_str()) {
-        Some("svg") => Ok(Format::Svg),
-        #[cfg(feature = "video")]
-        Some("png") => Ok(Format::Png),
-        #[cfg(not(feature = "video"))]
-        Some("png") => bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display()),
+        Some("png") if !cfg!(feature = "video") => {
+            bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display())
+        }
+        Some(format @ ("svg" | "png")) => Ok(format),
         _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
     }
 }
 
-/// Makes the font known. With the feature `video`, text is measured for SVG too, which needs it. A second call has no effect.
-fn register_font() {
-    #[cfg(feature = "video")]
-    let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
+/// Draws text in the middle of a line at this height.
+pub(super) fn draw_text<B: DrawingBackend<ErrorType: 'static>>(
+    area: &DrawingArea<B, Shift>,
+    text: &str,
+    at: (i32, i32),
+    (across, size, colour): (HPos, i32, RGBColor),
+) -> Result<()> {
+    let style = ("sans-serif", size).into_font().color(&colour).pos(Pos::new(across, VPos::Center));
+    Ok(area.draw(&Text::new(text, at, style))?)
 }
 
 impl Picture for Chart {
-    fn size(&self) -> [u32; 2] {
-        let [width, panel] = SIZE;
-        let legend = || legend_height(&self.legend_rows(width));
-        self.size.unwrap_or_else(|| [width, legend() + panel * self.panels.len() as u32])
-    }
-
-    fn draw<B: DrawingBackend>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
-        let failed = |error: DrawingAreaErrorKind<B::ErrorType>| anyhow!("cannot draw the chart: {error}");
-        area.fill(&WHITE).map_err(failed)?;
-        let [width, whole] = self.size();
-        let rows = self.legend_rows(width);
-        let height = legend_height(&rows);
+    fn size(&self) -> Result<[u32; 2]> {
+        let panels = self.panels.len() as u32;
+        let legend = |width| legend_height(&self.legend_rows(width));
+        let [width, height] = self.size.unwrap_or_else(|| [WIDTH, legend(WIDTH) + PANEL * panels]);
         ensure!(
-            height + LEAST_PANEL * self.panels.len() as u32 <= whole,
-            "{} panels and the names of {} curves do not fit into {whole} pixels: use a larger --size",
-            self.panels.len(),
+            legend(width) + LEAST_PANEL * panels <= height,
+            "{panels} panels and the names of {} curves do not fit into {height} pixels: use a larger --size",
             self.legend.len(),
         );
-        let (top, below) = area.split_vertically(height);
-        draw_legend(&top, &rows).map_err(failed)?;
+        Ok([width, height])
+    }
+
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+        area.fill(&WHITE)?;
+        let rows = self.legend_rows(area.dim_in_pixel().0);
+        let (top, below) = area.split_vertically(legend_height(&rows));
+        for (i, row) in rows.into_iter().enumerate() {
+            let y = (MARGIN + ROW * i as u32 + ROW / 2) as i32;
+            for (name, (colour, dash), left) in row {
+                top.draw(&DashedPathElement::new([(left, y), (left + LINE, y)], dash, GAP, colour))?;
+                draw_text(&top, name, (left + LINE + MARGIN as i32, y), (HPos::Left, LABEL, BLACK))?;
+            }
+        }
         let last = self.panels.len() - 1;
         let x = range(self.panels.iter().flat_map(|panel| panel.curves.iter().flat_map(Curve::along)));
         for (i, (panel, part)) in self.panels.iter().zip(below.split_evenly((self.panels.len(), 1))).enumerate() {
-            panel.draw(&part, x.clone(), (i == last).then_some(&self.along[..])).map_err(failed)?;
+            panel.draw(&part, x.clone(), (i == last).then_some(&self.along[..]))?;
         }
-        area.present().map_err(failed)
+        Ok(area.present()?)
     }
 }
 
-/// The default width of a chart and height of a panel in pixels.
-const SIZE: [u32; 2] = [800, 260];
+/// The default width of a chart in pixels.
+const WIDTH: u32 = 800;
+
+/// The default height of a panel in pixels.
+const PANEL: u32 = 260;
 
 // Lengths in the legend in pixels: the height of a row, the margins, the length of a line, the space after a name.
 const ROW: u32 = 20;
@@ -174,14 +182,11 @@ const LEAST_PANEL: u32 = 100;
 /// The radius of a dot in pixels.
 const DOT: i32 = 3;
 
-type Failure<B> = DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>;
-
 /// The names in one row of a legend, each with its style and the place of its line.
 type LegendRow<'a> = Vec<(&'a str, (ShapeStyle, i32), i32)>;
 
-fn label() -> TextStyle<'static> {
-    ("sans-serif", 13).into_font().color(&BLACK).pos(Pos::new(HPos::Left, VPos::Center))
-}
+/// The size of the text of labels.
+const LABEL: i32 = 13;
 
 impl Chart {
     /// Arranges the names in rows of a chart of this width.
@@ -190,7 +195,8 @@ impl Chart {
         let (mut rows, mut left) = (vec![Vec::new()], margin);
         for (name, style) in self.legend.iter().zip(styles()) {
             // Without a font, the width of a letter is a guess.
-            let text = label().font.box_size(name).map_or(7 * name.len() as u32, |(width, _)| width);
+            let text =
+                ("sans-serif", LABEL).into_font().box_size(name).map_or(7 * name.len() as u32, |(width, _)| width);
             let length = LINE + MARGIN as i32 + text as i32 + SPACE;
             if left > margin && left + length - SPACE > width as i32 {
                 rows.push(Vec::new());
@@ -207,25 +213,14 @@ fn legend_height(rows: &[LegendRow]) -> u32 {
     ROW * rows.len() as u32 + 2 * MARGIN
 }
 
-fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, rows: &[LegendRow]) -> Result<(), Failure<B>> {
-    for (i, row) in rows.iter().enumerate() {
-        let y = (MARGIN + ROW * i as u32 + ROW / 2) as i32;
-        for &(name, (colour, dash), left) in row {
-            area.draw(&DashedPathElement::new([(left, y), (left + LINE, y)], dash, GAP, colour))?;
-            area.draw(&Text::new(name, (left + LINE + MARGIN as i32, y), label()))?;
-        }
-    }
-    Ok(())
-}
-
 impl Subplot {
     /// Draws the panel into `part`, with a label of the x axis if it is the last.
-    fn draw<B: DrawingBackend>(
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(
         &self,
         part: &DrawingArea<B, Shift>,
         x: std::ops::Range<f64>,
         along: Option<&str>,
-    ) -> Result<(), Failure<B>> {
+    ) -> Result<()> {
         let y = range(self.curves.iter().flat_map(Curve::values));
         let mut chart = ChartBuilder::on(part)
             .caption(&self.title, ("sans-serif", 17))
@@ -234,7 +229,7 @@ impl Subplot {
             .y_label_area_size(56)
             .build_cartesian_2d(x, y)?;
         let mut mesh = chart.configure_mesh();
-        mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", 13));
+        mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", LABEL));
         if let Some(along) = along {
             mesh.x_desc(along);
         }
@@ -244,8 +239,7 @@ impl Subplot {
         }
         if self.curves.iter().all(|curve| curve.points.is_empty()) {
             let (width, height) = part.dim_in_pixel();
-            let style = ("sans-serif", 15).into_font().color(&BLACK).pos(Pos::new(HPos::Center, VPos::Center));
-            part.draw(&Text::new(&self.nothing[..], (width as i32 / 2, height as i32 / 2), style))?;
+            draw_text(part, &self.nothing, (width as i32 / 2, height as i32 / 2), (HPos::Center, 15, BLACK))?;
         }
         Ok(())
     }
@@ -261,11 +255,11 @@ impl Curve {
         self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
     }
 
-    fn draw<B: DrawingBackend>(
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(
         &self,
         chart: &mut ChartContext<B, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
         (colour, dash): (ShapeStyle, i32),
-    ) -> Result<(), Failure<B>> {
+    ) -> Result<()> {
         let points = || self.points.iter().map(|&[x, y]| (x, y));
         if !self.band.is_empty() {
             let edge = |side: usize| self.along().zip(self.band.iter().map(move |band| band[side]));

@@ -8,4 +8,4 @@ mod film;
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
 pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
 #[cfg(feature = "video")]
-pub use film::{Clip, FilmFormat, FilmWriter, write_png};
+pub use film::{FilmFormat, FilmWriter, Frame, gif_of, write_png};

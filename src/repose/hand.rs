@@ -47,7 +47,7 @@ impl Hand {
     /// Finds every name in `scene`, in whatever order they appear in its file.
     ///
     /// # Errors
-    /// Fails with the scene's file and the first name that is missing or belongs to something else.
+    /// Fails with the first name that is missing or belongs to something else.
     pub fn bind(scene: &Scene) -> Result<Self> {
         let joints = each(JOINTS, |joint| scene.hinge(&format!("rh_{joint}")))?;
         let driven = each(ACTUATORS, |actuator| Ok(driven_by(actuator)))?;
@@ -60,8 +60,7 @@ impl Hand {
         })?;
         ensure!(
             scene.controls() == ACTION_SIZE,
-            "{}: has {} controls, but it must have exactly the {ACTION_SIZE} of the hand",
-            scene.file_label(),
+            "has {} controls, but it must have exactly the {ACTION_SIZE} of the hand",
             scene.controls()
         );
         let fingertips = each(FINGERTIPS, |tip| scene.body(tip))?;

@@ -12,7 +12,7 @@ use super::sensing::NoiseStd;
 use super::task::Task;
 use crate::config::RandomizationConfig;
 use crate::rng::{self, Rng};
-use crate::sim::{Scene, Simulation, Variants};
+use crate::sim::{Scene, Simulation, Variants, origin};
 
 /// The random physics, noise and delays of a training.
 pub struct Randomization {
@@ -63,7 +63,8 @@ impl Randomization {
         sizes.push(1.0);
         let scene = |&size: &f64| if size == 1.0 { Ok(nominal.clone()) } else { task.scene_with(size, shifts) };
         let scenes = sizes.iter().map(scene).collect::<Result<_>>().context("randomization.cube_size")?;
-        let (variants, config) = (Variants::new(scenes)?, config.clone());
+        let variants = Variants::new(scenes).with_context(|| origin(task.config.model_file()))?;
+        let config = config.clone();
         Ok(Some(Arc::new(Self { variants, config, nominal, sizes, noise, bias })))
     }
 

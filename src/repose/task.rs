@@ -8,8 +8,8 @@ use super::Hand;
 use super::hand::CUBE;
 use super::physics::Physics;
 use super::sensing::NoiseStd;
-use crate::config::{ConeSetting, EnvConfig};
-use crate::sim::{Compilation, Cone, Look, Scene};
+use crate::config::EnvConfig;
+use crate::sim::{Compilation, Look, Scene, origin};
 
 /// A scene, the hand in it, and the settings.
 pub struct Task {
@@ -41,7 +41,7 @@ impl Task {
     }
 
     fn in_scene(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
-        let hand = Hand::bind(&scene)?;
+        let hand = Hand::bind(&scene).with_context(|| origin(config.model_file()))?;
         let nominal = scene;
         let mut scene = nominal.varied(&Physics::of_task(config).changes(&hand));
         if let Some(look) = look {
@@ -84,11 +84,6 @@ impl Task {
 
 /// Returns how the scene is compiled for a task.
 fn compilation(config: &EnvConfig) -> Compilation {
-    let cone = match config.cone {
-        ConeSetting::Scene => None,
-        ConeSetting::Pyramidal => Some(Cone::Pyramidal),
-        ConeSetting::Elliptic => Some(Cone::Elliptic),
-    };
     let shifts = config.cube_com != [0.0; 3];
-    Compilation { timestep: config.sim_dt, cone, object: CUBE, size: config.cube_size_scale, shifts }
+    Compilation { timestep: config.sim_dt, cone: config.cone, object: CUBE, size: config.cube_size_scale, shifts }
 }

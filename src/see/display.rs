@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Error, Result};
 
 use crate::cli::Shot;
 use crate::config::EnvConfig;
@@ -15,23 +15,18 @@ use crate::sim::{Look, Quality, mesh_files};
 /// # Errors
 /// Fails like [`Task::new`].
 pub fn task_for_display(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
-    let own_scene = config.model_file().is_some();
-    let meshes = if shot.plain || own_scene {
-        Vec::new()
-    } else {
-        os::hand_meshes(&mesh_files()).unwrap_or_else(|error| {
-            os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
-            Vec::new()
-        })
+    let note = |error: &Error| os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
+    let meshes = match shot.plain || config.model_file().is_some() {
+        true => Vec::new(),
+        false => os::hand_meshes(&mesh_files()).inspect_err(note).unwrap_or_default(),
     };
     let quality = shot.quality.unwrap_or(quality);
     let mut look = Look { meshes, size: shot.size.unwrap_or(size), camera: shot.camera, quality };
-    Task::for_display(config, &look).or_else(|error| {
-        if look.meshes.is_empty() {
-            return Err(error);
-        }
-        os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
-        look.meshes.clear();
-        Task::for_display(config, &look)
-    })
+    let task = Task::for_display(config, &look);
+    match &task {
+        Err(error) if !look.meshes.is_empty() => note(error),
+        _ => return task,
+    }
+    look.meshes.clear();
+    Task::for_display(config, &look)
 }

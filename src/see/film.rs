@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 
 use crate::cli::Shot;
 use crate::config::EnvConfig;
-use crate::draw::{self, Clip, FilmFormat, FilmWriter};
+use crate::draw::{FilmFormat, FilmWriter, Frame, gif_of, write_png};
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player, Trial};
 use crate::os::{Bar, OutputFile};
@@ -19,16 +19,42 @@ use crate::sim::{Quality, Renderer};
 
 use super::task_for_display;
 
+/// The frames of episodes: frame k of an episode shows it k / fps seconds after its start.
+struct Frames {
+    renderer: Renderer,
+    fps: u32,
+    /// The most frames of an episode.
+    longest: u64,
+    /// Those of the current episode so far.
+    drawn: u64,
+}
+
+impl Frames {
+    /// Draws the frames that are due at `moment`, each with a caption.
+    ///
+    /// # Errors
+    /// Fails if OpenGL does.
+    fn draw_due(&mut self, moment: &Moment, mut take: impl FnMut(Frame)) -> Result<()> {
+        let env = moment.env;
+        if moment.step.is_none() {
+            self.drawn = 0;
+        }
+        let time = f64::from(env.episode().length) * env.config().ctrl_dt;
+        // A frame exactly at the end belongs to what follows.
+        let until = time + if moment.ends() { -1e-9 } else { 1e-9 };
+        while self.drawn < self.longest && self.drawn as f64 / f64::from(self.fps) <= until {
+            take((self.renderer.draw(env.simulation())?.to_vec(), caption(env, moment.episode, time)));
+            self.drawn += 1;
+        }
+        Ok(())
+    }
+}
+
 /// A film of episodes played one after another.
 pub struct Film {
-    renderer: Renderer,
+    frames: Frames,
     writer: FilmWriter,
-    fps: u32,
-    /// Frames of the current episode.
-    frames: u64,
     all_frames: u64,
-    /// The maximum number of frames of an episode.
-    longest: u64,
     bar: Bar,
     begun: Instant,
 }
@@ -44,46 +70,32 @@ impl Film {
         let longest = ((seconds * f64::from(fps)).ceil() as u64).saturating_add(1);
         let all = episodes.saturating_mul(longest);
         let renderer = Renderer::new(task.scene())?;
-        let format = FilmFormat { size: renderer.size(), fps, longest: all as usize };
-        let writer = FilmWriter::create(path, format)?;
-        let bar = Bar::new(all, "frames", "film");
-        Ok(Self { renderer, writer, fps, frames: 0, all_frames: 0, longest, bar, begun: Instant::now() })
+        let writer = FilmWriter::create(path, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
+        let frames = Frames { renderer, fps, longest, drawn: 0 };
+        Ok(Self { frames, writer, all_frames: 0, bar: Bar::new(all, "frames", "film"), begun: Instant::now() })
     }
 
-    /// Adds the frames that are due at `moment`: frame k of an episode shows it k / fps seconds after its start.
+    /// Adds the frames that are due at `moment`.
     ///
     /// # Errors
     /// Fails if OpenGL, the encoder or the file does; [`Film::abandon`] returns the cause if it was the encoder or the file.
     pub fn observe(&mut self, moment: &Moment) -> Result<()> {
-        let env = moment.env;
-        if moment.step.is_none() {
-            self.frames = 0;
-        }
         ensure!(!self.writer.failed(), "the film cannot be continued");
-        let time = f64::from(env.episode().length) * env.config().ctrl_dt;
-        let ended = moment.ends();
-        loop {
-            let due = self.frames as f64 / f64::from(self.fps);
-            // A frame exactly at the end belongs to what follows.
-            if due > time + 1e-9 || ended && due > time - 1e-9 {
-                break;
-            }
-            let picture = self.renderer.draw(env.simulation())?;
-            self.writer.push(picture, caption(env, moment.episode, time));
-            self.frames += 1;
+        self.frames.draw_due(moment, |frame| {
+            self.writer.push(frame);
             self.all_frames += 1;
             self.bar.count();
-        }
-        if ended {
-            self.bar.shorten(self.longest.saturating_sub(self.frames));
-            self.bar.say(format!("{} goals in episode {}", env.episode().goals, moment.episode));
+        })?;
+        if moment.ends() {
+            self.bar.shorten(self.frames.longest.saturating_sub(self.frames.drawn));
+            self.bar.say(format!("{} goals in episode {}", moment.env.episode().goals, moment.episode));
         }
         Ok(())
     }
 
     /// Discards the film, keeping any existing file. Returns why the film failed, if it did.
     pub fn abandon(self) -> Option<anyhow::Error> {
-        self.writer.abandon()
+        self.writer.finish(false).err()
     }
 
     /// Completes the file and returns a summary to print.
@@ -91,24 +103,21 @@ impl Film {
     /// # Errors
     /// Fails if the encoder or the file does.
     pub fn finish(self) -> Result<String> {
-        self.writer.finish()?;
-        let [width, height] = self.renderer.size();
-        let seconds = self.all_frames as f64 / f64::from(self.fps);
-        let goal_times = self.all_frames as f64 / self.begun.elapsed().as_secs_f64();
-        Ok(format!(
-            "{width}x{height}, {} frames, {seconds:.2} s, rendered at {goal_times:.1} frames/s",
-            self.all_frames
-        ))
+        self.writer.finish(true)?;
+        let ([width, height], frames) = (self.frames.renderer.size(), self.all_frames);
+        let seconds = frames as f64 / f64::from(self.frames.fps);
+        let rate = frames as f64 / self.begun.elapsed().as_secs_f64();
+        Ok(format!("{width}x{height}, {frames} frames, {seconds:.2} s, rendered at {rate:.1} frames/s"))
     }
 }
 
-/// Width, height and frames per second of an animation, and its longest duration, s: it is kept in memory and in a log.
-const ANIMATION: ([u32; 2], u32, f64) = ([320, 240], 10, 20.0);
+/// Width, height and frames per second of an animation, and its most frames, for 20 s: it is kept in memory and in a log.
+const ANIMATION: FilmFormat = FilmFormat { size: [320, 240], fps: 10, longest: 200 };
 
 /// Films single episodes of a task for a log.
 pub struct EpisodeFilms {
     task: Arc<Task>,
-    renderer: Renderer,
+    frames: Frames,
 }
 
 impl EpisodeFilms {
@@ -119,9 +128,10 @@ impl EpisodeFilms {
     pub fn new(config: &EnvConfig) -> Result<Self> {
         // Primitives, since a training should not need the hand's meshes.
         let shot = Shot { size: None, camera: None, quality: None, plain: true };
-        let task = task_for_display(config, &shot, ANIMATION.0, Quality::Fast)?;
+        let task = task_for_display(config, &shot, ANIMATION.size, Quality::Fast)?;
         let renderer = Renderer::new(task.scene())?;
-        Ok(Self { task, renderer })
+        let frames = Frames { renderer, fps: ANIMATION.fps, longest: ANIMATION.longest as u64, drawn: 0 };
+        Ok(Self { task, frames })
     }
 
     /// Plays the first of `episodes` as an evaluation does and returns its first 20 s; `None` if `stop` was set meanwhile.
@@ -129,23 +139,11 @@ impl EpisodeFilms {
     /// # Errors
     /// Fails if OpenGL does.
     pub fn film(&mut self, actor: &Actor, episodes: Episodes, stop: &AtomicBool) -> Result<Option<Animation>> {
-        let (size, fps, seconds) = ANIMATION;
-        let longest = (seconds * f64::from(fps)) as usize;
-        let mut clip = Clip::new(FilmFormat { size, fps, longest });
-        let (task, renderer, ctrl_dt) = (&self.task, &mut self.renderer, self.task.config().ctrl_dt);
-        let mut frames = 0;
-        let mut observe = |moment: Moment| {
-            let time = f64::from(moment.env.episode().length) * ctrl_dt;
-            let over = moment.ends();
-            while !over && frames < longest && frames as f64 / f64::from(fps) <= time + 1e-9 {
-                let picture = renderer.draw(moment.env.simulation())?;
-                clip.push(picture, &caption(moment.env, moment.episode, time))?;
-                frames += 1;
-            }
-            Ok(())
-        };
-        let played = Trial { task, actor, episodes: Episodes { count: 1, ..episodes }, stop }.play(&mut observe)?;
-        played.map(|_| Ok(Animation { size, gif: clip.finish()? })).transpose()
+        let mut frames = Vec::new();
+        let mut observe = |moment: Moment| self.frames.draw_due(&moment, |frame| frames.push(frame));
+        let one = Episodes { count: 1, ..episodes };
+        let played = Trial { task: &self.task, actor, episodes: one, stop }.play(&mut observe)?;
+        played.map(|_| Ok(Animation { size: ANIMATION.size, gif: gif_of(frames, ANIMATION)? })).transpose()
     }
 }
 
@@ -174,6 +172,6 @@ pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episod
     }
     let size = renderer.size();
     let picture = renderer.draw(player.env().simulation())?;
-    draw::write_png(output, size, picture)?;
+    write_png(output, size, picture)?;
     Ok(size)
 }

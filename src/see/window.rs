@@ -1,6 +1,5 @@
 //! The hand in a window: the loop that controls time, and the panel's readout of the task.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -46,21 +45,24 @@ impl Window {
     /// Fails if OpenGL does.
     pub fn play(mut self, task: &Arc<Task>, actors: &[Actor], episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
-        let mut episode = episodes.first;
-        let (mut tally, mut history) = (Tally::default(), History::default());
+        let mut tally = Tally::default();
+        let mut curves = curves(task);
         let mut clock = Clock::new(task.config().ctrl_dt);
+        // Ends the episode and starts the next one, if there is one.
+        let next = |player: &mut Player, tally: &mut Tally, is_complete: bool| {
+            tally.add(player.env(), is_complete);
+            let is_left = tally.episodes < episodes.count;
+            if is_left {
+                player.start(episodes, episodes.first + tally.episodes);
+            }
+            is_left
+        };
         while self.viewer.is_open() {
             let frame = Instant::now();
-            let readout = readout(player.env(), episode, &tally, &history);
+            let readout = readout(player.env(), episodes.first + tally.episodes, &tally, &curves);
             let asked = self.viewer.show(player.env_mut().simulation_mut(), readout)?;
-            if asked.reset {
-                tally.goals += player.env().episode().goals;
-                tally.ended_early += 1;
-                episode += 1;
-                if episode - episodes.first >= episodes.count {
-                    return Ok(tally.to_string());
-                }
-                player.start(episodes, episode);
+            if asked.reset && !next(&mut player, &mut tally, false) {
+                return Ok(tally.summary());
             }
             if asked.new_goal {
                 player.new_goal();
@@ -68,20 +70,15 @@ impl Window {
             for _ in 0..clock.steps_due(&asked) {
                 let end = player.step(&actors[asked.choice]);
                 tally.steps += 1;
-                history.add(player.env(), tally.steps as f64 * task.config().ctrl_dt);
-                if end.is_some() {
-                    tally.add(player.env());
-                    episode += 1;
-                    if episode - episodes.first >= episodes.count {
-                        return Ok(tally.to_string());
-                    }
-                    player.start(episodes, episode);
+                extend(&mut curves, player.env(), tally.steps);
+                if end.is_some() && !next(&mut player, &mut tally, true) {
+                    return Ok(tally.summary());
                 }
             }
             sleep(FRAME.saturating_sub(frame.elapsed()));
         }
-        tally.goals += player.env().episode().goals;
-        Ok(tally.to_string())
+        tally.add(player.env(), false);
+        Ok(tally.summary())
     }
 }
 
@@ -116,63 +113,61 @@ impl Clock {
 #[derive(Default)]
 struct Tally {
     steps: u64,
-    episodes: u32,
+    /// All episodes before the current one.
+    episodes: usize,
+    /// Those that the user did not end.
+    completed: u32,
     drops: u32,
     goals: u32,
-    /// Episodes that the user ended.
-    ended_early: u32,
 }
 
 impl Tally {
-    fn add(&mut self, env: &Repose) {
+    /// Adds an episode.
+    fn add(&mut self, env: &Repose, is_complete: bool) {
         let episode = env.episode();
         self.episodes += 1;
+        self.completed += u32::from(is_complete);
         self.drops += u32::from(episode.dropped);
         self.goals += episode.goals;
     }
-}
 
-impl Tally {
     /// Returns what happened in the episodes before the current one, also in those that the user ended.
     fn before(&self) -> String {
-        match self.episodes + self.ended_early {
+        match self.episodes {
             0 => "nothing yet".to_owned(),
             count => format!("{} goals, {} drops in {count} episodes", self.goals, self.drops),
         }
     }
-}
 
-impl std::fmt::Display for Tally {
-    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-        let Self { steps, episodes, drops, goals, .. } = self;
-        write!(f, "shown: {steps} steps, {episodes} episodes completed, {drops} drops, {goals} goals reached")
+    fn summary(&self) -> String {
+        let Self { steps, completed, drops, goals, .. } = self;
+        format!("shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached")
     }
 }
 
-/// The recent history of the error and the reward.
-#[derive(Default)]
-struct History {
-    /// Rotation error, degrees.
-    error: VecDeque<[f64; 2]>,
-    reward: VecDeque<[f64; 2]>,
+/// Returns the curves of the error and the reward, without points.
+fn curves(task: &Task) -> [Trend; 2] {
+    let level = Some(task.config().success_tolerance.to_degrees());
+    [
+        Trend { name: "rotation error, degrees (line: tolerance)", level, ..Trend::default() },
+        Trend { name: "reward of a step", ..Trend::default() },
+    ]
 }
 
-impl History {
-    fn add(&mut self, env: &Repose, time: f64) {
-        let step = env.last_step();
-        for (curve, value) in [(&mut self.error, step.rot_dist.to_degrees()), (&mut self.reward, step.reward.total())] {
-            curve.push_back([time, value]);
-            if curve.len() > HISTORY {
-                curve.pop_front();
-            }
+/// Adds the last of so many steps to the curves.
+fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
+    let step = env.last_step();
+    for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.total()]) {
+        curve.points.push_back([steps as f64 * env.config().ctrl_dt, value]);
+        if curve.points.len() > HISTORY {
+            curve.points.pop_front();
         }
     }
 }
 
-fn readout(env: &Repose, episode: usize, tally: &Tally, history: &History) -> Readout {
+fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Readout {
     let config = env.config();
     let (stats, reward) = (env.episode(), env.last_step().reward);
-    let tolerance = config.success_tolerance.to_degrees();
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
     let extreme = Step { goal_dist: config.fall_dist, action: [1.0; ACTION_SIZE], ..Step::default() };
@@ -193,14 +188,7 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, history: &History) -> Re
             ("before", tally.before()),
         ],
         bars: vec![("within the tolerance", vec![hold]), ("reward of this step", terms.collect())],
-        curves: vec![
-            Trend {
-                name: "rotation error, degrees (line: tolerance)",
-                points: history.error.clone(),
-                level: Some(tolerance),
-            },
-            Trend { name: "reward of a step", points: history.reward.clone(), level: None },
-        ],
+        curves: curves.to_vec(),
     }
 }
 

@@ -1,17 +1,22 @@
 //! How a scene is compiled: what MuJoCo cannot change in a compiled model, and the options.
 
+use std::fmt::Display;
 use std::path::Path;
 
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
+use serde::{Deserialize, Serialize};
 
 /// The scene built into the program.
 pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
 /// The shape of friction cones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Cone {
+    /// That of the scene.
+    Scene,
     /// Four-sided pyramids inside the cones: faster.
     Pyramidal,
     /// The cones themselves.
@@ -23,8 +28,8 @@ pub enum Cone {
 pub struct Compilation {
     /// The physics timestep, s.
     pub timestep: f64,
-    /// The friction cones, if not those of the scene.
-    pub cone: Option<Cone>,
+    /// The friction cones.
+    pub cone: Cone,
     /// The name of the body that `size` and `shifts` are about.
     pub object: &'static str,
     /// The factor on the lengths of the object: its shapes, and the places of what is attached to it. Its mass stays the same.
@@ -37,66 +42,60 @@ pub struct Compilation {
 impl Compilation {
     /// Returns the compilation that keeps all of a scene but its timestep in s.
     pub fn plain(timestep: f64) -> Self {
-        Self { timestep, cone: None, object: "", size: 1.0, shifts: false }
+        Self { timestep, cone: Cone::Scene, object: "", size: 1.0, shifts: false }
     }
 
     /// Compiles the built-in scene (`None`) or a user's file.
     ///
     /// # Errors
-    /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
+    /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
-        let origin = origin(file);
-        let refused = |error: &dyn std::fmt::Display| anyhow!("{origin}: MuJoCo refuses this scene: {error}");
-        if let Some(path) = file {
-            ensure!(
-                path.is_file(),
-                "{}: env.model must name a MuJoCo scene, but there is no such file",
-                path.display()
-            );
-        }
+        let exists = file.is_none_or(Path::is_file);
+        ensure!(exists, "env.model must name a MuJoCo scene, but there is no such file");
         if self.size == 1.0 && !self.shifts {
-            let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
-            return model.map_err(|error| refused(&error));
+            return file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml).map_err(refused);
         }
-        let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
-        let mut spec = spec.map_err(|error| refused(&error))?;
-        self.edit(&mut spec).map_err(|error| anyhow!("{origin}: {error}"))?;
-        spec.compile().map_err(|error| refused(&error))
+        self.spec(file)?.compile().map_err(refused)
     }
 
-    /// Resizes the object of a scene that is about to be compiled.
+    /// Reads a scene that is about to be compiled, and resizes its object.
     ///
     /// # Errors
-    /// Fails if there is no such body, or if it has a mesh.
-    pub(super) fn edit(&self, spec: &mut MjSpec) -> Result<()> {
+    /// Fails if MuJoCo cannot read the scene, if it has no such body, or if the body has a mesh.
+    pub(super) fn spec(&self, file: Option<&Path>) -> Result<MjSpec> {
+        let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
+        let mut spec = spec.map_err(refused)?;
         if self.size == 1.0 && !self.shifts {
-            return Ok(());
+            return Ok(spec);
         }
         let name = self.object;
-        let body = spec.body_mut(name).ok_or_else(|| anyhow!("has no body `{name}`"))?;
+        let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
         if self.shifts {
             body.set_simple(false);
         }
         if self.size != 1.0 {
-            resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))
-        } else {
-            Ok(())
+            resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))?;
         }
+        Ok(spec)
     }
 
     /// Sets the options of a compiled scene.
     pub(super) fn set_options(&self, model: &mut MjModel) {
         model.opt_mut().timestep = self.timestep;
         match self.cone {
-            None => {}
-            Some(Cone::Pyramidal) => model.opt_mut().cone = MjtCone::mjCONE_PYRAMIDAL as i32,
-            Some(Cone::Elliptic) => model.opt_mut().cone = MjtCone::mjCONE_ELLIPTIC as i32,
+            Cone::Scene => {}
+            Cone::Pyramidal => model.opt_mut().cone = MjtCone::mjCONE_PYRAMIDAL as i32,
+            Cone::Elliptic => model.opt_mut().cone = MjtCone::mjCONE_ELLIPTIC as i32,
         }
     }
 }
 
+fn refused(error: impl Display) -> Error {
+    anyhow!("MuJoCo refuses this scene: {error}")
+}
+
 /// Returns the name of a scene's file, for messages.
-pub(super) fn origin(file: Option<&Path>) -> String {
+pub fn origin(file: Option<&Path>) -> String {
     file.map_or("the built-in scene".into(), |path| path.display().to_string())
 }
 

@@ -4,46 +4,48 @@ use std::fmt::Debug;
 
 use mujoco_rs::prelude::{MjModel, MjtGeomBase};
 
+/// Lists these arrays of a model, or what one geom has in each.
+macro_rules! arrays {
+    ($model:ident: $($array:ident)*) => { &[$(&$model.$array()),*] };
+    ($model:ident[$geom:ident]: $($array:ident)*) => { &[$(&$model.$array()[$geom]),*] };
+}
+
 /// Returns a checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
 /// nothing are left out, and so are sensors, keyframes and plugins.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| parts.iter().for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()));
-    take(&[model.opt(), &model.qpos0(), &model.qpos_spring()]);
-    take(&[&model.body_parentid(), &model.body_mocapid(), &model.body_pos(), &model.body_quat()]);
-    take(&[&model.body_ipos(), &model.body_iquat(), &model.body_mass(), &model.body_inertia(), &model.body_gravcomp()]);
-    take(&[&model.jnt_type(), &model.jnt_bodyid(), &model.jnt_pos(), &model.jnt_axis(), &model.jnt_limited()]);
-    take(&[&model.jnt_range(), &model.jnt_margin(), &model.jnt_stiffness(), &model.jnt_solref(), &model.jnt_solimp()]);
-    take(&[&model.jnt_actfrclimited(), &model.jnt_actfrcrange(), &model.jnt_actgravcomp()]);
-    take(&[&model.dof_armature(), &model.dof_damping(), &model.dof_frictionloss()]);
-    take(&[&model.dof_solref(), &model.dof_solimp()]);
-    for i in (0..model.ngeom() as usize).filter(|&i| model.geom_contype()[i] != 0 || model.geom_conaffinity()[i] != 0) {
-        take(&[&model.geom_type()[i], &model.geom_bodyid()[i], &model.geom_pos()[i], &model.geom_quat()[i]]);
-        take(&[&model.geom_size()[i], &model.geom_contype()[i], &model.geom_conaffinity()[i], &model.geom_condim()[i]]);
-        take(&[&model.geom_priority()[i], &model.geom_friction()[i], &model.geom_solmix()[i], &model.geom_solref()[i]]);
-        take(&[&model.geom_solimp()[i], &model.geom_margin()[i], &model.geom_gap()[i], &model.geom_fluid()[i]]);
-        if model.geom_type()[i] == MjtGeomBase::mjGEOM_MESH {
-            let mesh = model.geom_dataid()[i] as usize;
+    take(arrays! { model:
+        opt qpos0 qpos_spring
+        body_parentid body_mocapid body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp
+        jnt_type jnt_bodyid jnt_pos jnt_axis jnt_limited jnt_range jnt_margin jnt_stiffness jnt_solref jnt_solimp
+        jnt_actfrclimited jnt_actfrcrange jnt_actgravcomp
+        dof_armature dof_damping dof_frictionloss dof_solref dof_solimp
+    });
+    for geom in 0..model.ngeom() as usize {
+        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 {
+            continue;
+        }
+        take(arrays! { model[geom]:
+            geom_type geom_bodyid geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim geom_priority
+            geom_friction geom_solmix geom_solref geom_solimp geom_margin geom_gap geom_fluid
+        });
+        if model.geom_type()[geom] == MjtGeomBase::mjGEOM_MESH {
+            let mesh = model.geom_dataid()[geom] as usize;
             let (first, count) = (model.mesh_vertadr()[mesh] as usize, model.mesh_vertnum()[mesh] as usize);
             take(&[&&model.mesh_vert()[first..first + count]]);
         }
     }
-    take(&[&model.site_bodyid(), &model.site_pos(), &model.site_quat()]);
-    take(&[&model.wrap_type(), &model.wrap_objid(), &model.wrap_prm(), &model.tendon_adr(), &model.tendon_num()]);
-    take(&[&model.tendon_limited(), &model.tendon_range(), &model.tendon_stiffness(), &model.tendon_damping()]);
-    take(&[&model.tendon_frictionloss(), &model.tendon_lengthspring(), &model.tendon_armature()]);
-    take(&[&model.actuator_trntype(), &model.actuator_trnid(), &model.actuator_gear(), &model.actuator_dyntype()]);
-    take(&[
-        &model.actuator_dynprm(),
-        &model.actuator_gaintype(),
-        &model.actuator_gainprm(),
-        &model.actuator_biastype(),
-    ]);
-    take(&[&model.actuator_biasprm(), &model.actuator_ctrllimited(), &model.actuator_ctrlrange()]);
-    take(&[&model.actuator_forcelimited(), &model.actuator_forcerange()]);
-    take(&[&model.eq_type(), &model.eq_obj1id(), &model.eq_obj2id(), &model.eq_active0(), &model.eq_data()]);
-    take(&[&model.eq_solref(), &model.eq_solimp(), &model.exclude_signature(), &model.pair_signature()]);
-    take(&[&model.pair_dim(), &model.pair_friction(), &model.pair_solref(), &model.pair_margin(), &model.pair_gap()]);
+    take(arrays! { model:
+        site_bodyid site_pos site_quat
+        wrap_type wrap_objid wrap_prm tendon_adr tendon_num tendon_limited tendon_range tendon_stiffness tendon_damping
+        tendon_frictionloss tendon_lengthspring tendon_armature
+        actuator_trntype actuator_trnid actuator_gear actuator_dyntype actuator_dynprm actuator_gaintype actuator_gainprm
+        actuator_biastype actuator_biasprm actuator_ctrllimited actuator_ctrlrange actuator_forcelimited
+        actuator_forcerange
+        eq_type eq_obj1id eq_obj2id eq_active0 eq_data eq_solref eq_solimp exclude_signature
+        pair_signature pair_dim pair_friction pair_solref pair_margin pair_gap
+    });
     format!("{:08x}", hasher.finalize())
 }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Result, anyhow};
 use mujoco_rs::mujoco_c::{mjtBuiltin as MjtBuiltin, mjtLightType as MjtLightType};
-use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
+use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_model::MjtTexture;
 
@@ -35,8 +35,7 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
     if !is_dark && !has_no_sky && boxes.is_empty() {
         return Ok(None);
     }
-    let mut spec = MjSpec::from_xml(file).map_err(|error| anyhow!("{error}"))?;
-    compilation.edit(&mut spec)?;
+    let mut spec = compilation.spec(Some(file))?;
     if is_dark {
         let light = spec.world_body_mut().add_light();
         light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(MjtLightType::mjLIGHT_DIRECTIONAL);

@@ -2,12 +2,12 @@
 //!
 //! Nothing here changes the physics: meshes have no mass and collide with nothing, and they come after the existing objects.
 
-use anyhow::{Result, anyhow};
-use mujoco_rs::prelude::{MjModel, MjSpec, MjtGeomBase, MjtObjBase};
+use anyhow::{Context, Result, anyhow};
+use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
-use super::compilation::{BUILTIN, Compilation};
+use super::compilation::Compilation;
 
 /// The group of geoms that are not drawn.
 const HIDDEN: i32 = 3;
@@ -16,38 +16,39 @@ pub(super) const VISUAL: i32 = 2;
 /// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 
-/// The parts of the hand: body, mesh file, material in the built-in scene, height above the body's origin in m. The values
-/// are those of MuJoCo Menagerie's Shadow Hand.
-const PARTS: [(&str, &str, &str, f64); 24] = [
-    ("rh_forearm", "forearm_0.obj", "metal", 0.0),
-    ("rh_forearm", "forearm_1.obj", "shell", 0.0),
-    ("rh_wrist", "wrist.obj", "metal", 0.0),
-    ("rh_palm", "palm.obj", "shell", 0.0),
-    ("rh_ffknuckle", "f_knuckle.obj", "metal", 0.0005),
-    ("rh_ffproximal", "f_proximal.obj", "shell", 0.0),
-    ("rh_ffmiddle", "f_middle.obj", "shell", 0.0),
-    ("rh_ffdistal", "f_distal_pst.obj", "rubber", 0.0),
-    ("rh_mfknuckle", "f_knuckle.obj", "metal", 0.0005),
-    ("rh_mfproximal", "f_proximal.obj", "shell", 0.0),
-    ("rh_mfmiddle", "f_middle.obj", "shell", 0.0),
-    ("rh_mfdistal", "f_distal_pst.obj", "rubber", 0.0),
-    ("rh_rfknuckle", "f_knuckle.obj", "metal", 0.0005),
-    ("rh_rfproximal", "f_proximal.obj", "shell", 0.0),
-    ("rh_rfmiddle", "f_middle.obj", "shell", 0.0),
-    ("rh_rfdistal", "f_distal_pst.obj", "rubber", 0.0),
-    ("rh_lfmetacarpal", "lf_metacarpal.obj", "shell", 0.0),
-    ("rh_lfknuckle", "f_knuckle.obj", "metal", 0.0005),
-    ("rh_lfproximal", "f_proximal.obj", "shell", 0.0),
-    ("rh_lfmiddle", "f_middle.obj", "shell", 0.0),
-    ("rh_lfdistal", "f_distal_pst.obj", "rubber", 0.0),
-    ("rh_thproximal", "th_proximal.obj", "shell", 0.0),
-    ("rh_thmiddle", "th_middle.obj", "shell", 0.0),
-    ("rh_thdistal", "th_distal_pst.obj", "rubber", 0.0),
+/// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
+type Part = (&'static str, &'static str, &'static str, f64);
+
+/// The parts, by the beginning of the bodies' names. The values are those of MuJoCo Menagerie's Shadow Hand.
+const PARTS: [(&str, &[Part]); 5] =
+    [("rh_", &HAND), ("rh_ff", &FINGER), ("rh_mf", &FINGER), ("rh_rf", &FINGER), ("rh_lf", &FINGER)];
+
+const HAND: [Part; 8] = [
+    ("forearm", "forearm_0.obj", "metal", 0.0),
+    ("forearm", "forearm_1.obj", "shell", 0.0),
+    ("wrist", "wrist.obj", "metal", 0.0),
+    ("palm", "palm.obj", "shell", 0.0),
+    ("lfmetacarpal", "lf_metacarpal.obj", "shell", 0.0),
+    ("thproximal", "th_proximal.obj", "shell", 0.0),
+    ("thmiddle", "th_middle.obj", "shell", 0.0),
+    ("thdistal", "th_distal_pst.obj", "rubber", 0.0),
 ];
+
+const FINGER: [Part; 4] = [
+    ("knuckle", "f_knuckle.obj", "metal", 0.0005),
+    ("proximal", "f_proximal.obj", "shell", 0.0),
+    ("middle", "f_middle.obj", "shell", 0.0),
+    ("distal", "f_distal_pst.obj", "rubber", 0.0),
+];
+
+/// Returns each part with the beginning of its body's name.
+fn parts() -> impl Iterator<Item = (&'static str, &'static Part)> {
+    PARTS.into_iter().flat_map(|(prefix, parts)| parts.iter().map(move |part| (prefix, part)))
+}
 
 /// Returns the mesh files of the hand, sorted and without duplicates.
 pub fn mesh_files() -> Vec<&'static str> {
-    let mut files: Vec<&str> = PARTS.iter().map(|(_, file, ..)| *file).collect();
+    let mut files: Vec<&str> = parts().map(|(_, (_, file, ..))| *file).collect();
     files.sort_unstable();
     files.dedup();
     files
@@ -112,24 +113,18 @@ impl Look {
     /// # Errors
     /// Fails if MuJoCo cannot read a file as a mesh.
     pub(super) fn dress(&self, compilation: &Compilation) -> Result<MjModel> {
-        let mut spec = MjSpec::from_xml_string(BUILTIN).map_err(|error| anyhow!("{error}"))?;
-        compilation.edit(&mut spec)?;
+        let mut spec = compilation.spec(None)?;
         let mut files = MjVfs::new();
         for (name, content) in mesh_files().into_iter().zip(&self.meshes) {
             files.add_from_buffer(name, content).map_err(|error| anyhow!("{name}: {error}"))?;
             spec.add_mesh().with_name(name).with_file(name).with_scale([MILLIMETRE; 3]);
         }
-        for (body, mesh, material, height) in PARTS {
-            let body = spec.body_mut(body).ok_or_else(|| anyhow!("there is no body {body} for the mesh {mesh}"))?;
-            body.add_geom()
-                .with_type(MjtGeomBase::mjGEOM_MESH)
-                .with_meshname(mesh)
-                .with_material(material)
-                .with_pos([0.0, 0.0, height])
-                .with_group(VISUAL)
-                .with_contype(0)
-                .with_conaffinity(0)
-                .with_density(0.0);
+        for (prefix, &(part, mesh, material, height)) in parts() {
+            let body = format!("{prefix}{part}");
+            let body = spec.body_mut(&body).with_context(|| format!("there is no body {body} for the mesh {mesh}"))?;
+            let geom = body.add_geom().with_type(MjtGeomBase::mjGEOM_MESH).with_meshname(mesh).with_material(material);
+            geom.with_pos([0.0, 0.0, height]).with_group(VISUAL);
+            geom.with_contype(0).with_conaffinity(0).with_density(0.0);
         }
         let mut model = spec.compile_with_vfs(&files).map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
         hide_primitives(&mut model);

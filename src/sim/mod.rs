@@ -21,12 +21,12 @@ mod variation;
 #[cfg(feature = "viewer")]
 mod viewer;
 
-pub use compilation::{Compilation, Cone};
+pub use compilation::{Compilation, Cone, origin};
 pub use fatal::{before_fatal_error, stepping};
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
-pub use simulation::{BareSimulation, Physics, Pose, Simulation, SimulationState, Velocity};
+pub use simulation::{Physics, Pose, Simulation, SimulationState, Velocity};
 pub use variation::{Change, Variants};
 
 #[cfg(feature = "viewer")]

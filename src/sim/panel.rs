@@ -5,7 +5,10 @@
 use std::collections::VecDeque;
 
 use egui_plot::{HLine, Line, Plot, PlotPoints};
-use mujoco_rs::viewer::egui::{self, Align2, Color32, FontId, Key, Rect, RichText, Sense, Slider, Ui, pos2, vec2};
+use mujoco_rs::viewer::egui::containers::panel::PanelState;
+use mujoco_rs::viewer::egui::{
+    self, Align2, Color32, Event, FontId, Key, Rect, RichText, Sense, Slider, Ui, pos2, vec2,
+};
 
 /// The range of playback speeds, as multiples of real time.
 pub const SPEEDS: std::ops::RangeInclusive<f64> = 0.05..=4.0;
@@ -46,7 +49,7 @@ pub struct Readout {
 }
 
 /// The user's input.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Controls {
     /// Whether time is stopped except for single steps.
     pub paused: bool,
@@ -188,13 +191,8 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
         painter.vline(zero, rect.y_range(), ui.visuals().widgets.noninteractive.fg_stroke);
     }
     let colour = ui.visuals().strong_text_color();
-    painter.text(
-        rect.right_center() - vec2(4.0, 0.0),
-        Align2::RIGHT_CENTER,
-        &gauge.text,
-        FontId::monospace(12.0),
-        colour,
-    );
+    let at = rect.right_center() - vec2(4.0, 0.0);
+    painter.text(at, Align2::RIGHT_CENTER, &gauge.text, FontId::monospace(12.0), colour);
 }
 
 /// Closes MuJoCo's own panel at the left when the window opens: its second reset and its physics options are not of the task,
@@ -202,7 +200,7 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
 /// a user could; the key X opens it again.
 #[derive(Default)]
 pub(super) struct CloseLeftPanel {
-    frame: u32,
+    frame: usize,
 }
 
 impl egui::Plugin for CloseLeftPanel {
@@ -212,27 +210,17 @@ impl egui::Plugin for CloseLeftPanel {
 
     fn input_hook(&mut self, context: &egui::Context, input: &mut egui::RawInput) {
         // The panel is laid out in the first frames.
-        let Some(panel) = egui::containers::panel::PanelState::load(context, egui::Id::new("interface_panel")) else {
-            return;
-        };
+        let Some(panel) = PanelState::load(context, egui::Id::new("interface_panel")) else { return };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
-        let button = |pos, pressed| egui::Event::PointerButton {
-            pos,
-            button: egui::PointerButton::Primary,
-            pressed,
-            modifiers: egui::Modifiers::NONE,
-        };
-        let event = match self.frame {
-            0 => egui::Event::PointerMoved(edge),
-            1 => button(edge, true),
-            2 => egui::Event::PointerMoved(side),
-            3 => button(side, false),
-            4 => egui::Event::PointerGone,
-            _ => return,
-        };
-        self.frame += 1;
-        // Nothing else may come between.
-        input.events = vec![event];
+        let (button, modifiers) = (egui::PointerButton::Primary, egui::Modifiers::NONE);
+        let press = |pos, pressed| Event::PointerButton { pos, button, pressed, modifiers };
+        let moved = Event::PointerMoved;
+        let drag = [moved(edge), press(edge, true), moved(side), press(side, false), Event::PointerGone];
+        if let Some(event) = drag.into_iter().nth(self.frame) {
+            self.frame += 1;
+            // Nothing else may come between.
+            input.events = vec![event];
+        }
     }
 }

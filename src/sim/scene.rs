@@ -1,9 +1,9 @@
-//! A loaded scene and its names. Each lookup returns an index that stays valid, or an error with the file and the name.
+//! A loaded scene and its names. Each lookup returns an index that stays valid, or an error with the name.
 
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use mujoco_rs::prelude::{
     MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
@@ -19,7 +19,6 @@ use super::furnish::furnished;
 #[derive(Clone)]
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
-    pub(super) origin: String,
 }
 
 /// A hinge joint with limits.
@@ -70,7 +69,8 @@ impl Scene {
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
         quieten_mujoco();
-        Self::checked(compilation.compile(file)?, origin(file), compilation)
+        let compiled = compilation.compile(file).and_then(|model| Self::checked(model, compilation));
+        compiled.with_context(|| origin(file))
     }
 
     /// Loads the same scene, with the same physics, and with what is needed for display.
@@ -80,13 +80,13 @@ impl Scene {
     pub fn load_for_display(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
         let mut scene = Self::load(file, compilation)?;
         if file.is_none() && !look.meshes.is_empty() {
-            scene = Self::checked(look.dress(compilation)?, scene.origin, compilation)?;
+            scene = Self::checked(look.dress(compilation)?, compilation)?;
         }
         // A scene that cannot be given more is shown as it is.
         if let Some(file) = file
             && let Ok(Some(model)) = furnished(file, &scene.model, compilation)
         {
-            scene = Self::checked(model, scene.origin, compilation)?;
+            scene = Self::checked(model, compilation)?;
         }
         Ok(scene)
     }
@@ -102,19 +102,16 @@ impl Scene {
         look.set_up(model);
     }
 
-    fn checked(mut model: MjModel, origin: String, compilation: &Compilation) -> Result<Self> {
+    fn checked(mut model: MjModel, compilation: &Compilation) -> Result<Self> {
         if let Some(culprit) = not_finite(&model) {
-            bail!("{origin}: {culprit} is not a finite number");
+            bail!("{culprit} is not a finite number");
         }
         compilation.set_options(&mut model);
-        let scene = Self { model: Arc::new(model), origin };
-        if scene.model.opt().integrator == MjtIntegrator::mjINT_RK4 as i32 {
-            bail!("{}: the RK4 integrator cannot be stepped in halves; use implicitfast", scene.origin);
-        }
-        if scene.model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 != 0 {
-            bail!("{}: sleep is not part of the state that MuJoCo can save; leave sleep switched off", scene.origin);
-        }
-        Ok(scene)
+        let halves = model.opt().integrator != MjtIntegrator::mjINT_RK4 as i32;
+        ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
+        let awake = model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 == 0;
+        ensure!(awake, "sleep is not part of the state that MuJoCo can save; leave sleep switched off");
+        Ok(Self { model: Arc::new(model) })
     }
 
     /// Returns a checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
@@ -144,8 +141,8 @@ impl Scene {
     pub fn hinge(&self, name: &str) -> Result<Hinge> {
         let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
         let kind = self.model.jnt_type()[id];
-        ensure!(kind == MjtJoint::mjJNT_HINGE, "{}: joint `{name}` must be a hinge, but is {kind:?}", self.origin);
-        ensure!(self.model.jnt_limited()[id], "{}: joint `{name}` must have a range", self.origin);
+        ensure!(kind == MjtJoint::mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
+        ensure!(self.model.jnt_limited()[id], "joint `{name}` must have a range");
         Ok(Hinge {
             qpos: self.model.jnt_qposadr()[id] as usize,
             dof: self.model.jnt_dofadr()[id] as usize,
@@ -161,7 +158,7 @@ impl Scene {
         let body = self.body(name)?;
         let joint = usize::try_from(self.model.body_jntadr()[body.0]).ok();
         let free = joint.filter(|&j| self.model.jnt_type()[j] == MjtJoint::mjJNT_FREE);
-        let joint = free.ok_or_else(|| anyhow!("{}: body `{name}` must have a free joint", self.origin))?;
+        let joint = free.with_context(|| format!("body `{name}` must have a free joint"))?;
         let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
         Ok(FreeJoint { body, qpos, dof })
     }
@@ -186,7 +183,7 @@ impl Scene {
     pub fn mocap(&self, name: &str) -> Result<Mocap> {
         let Body(body) = self.body(name)?;
         let id = usize::try_from(self.model.body_mocapid()[body]).ok();
-        Ok(Mocap(id.ok_or_else(|| anyhow!("{}: body `{name}` must have mocap=\"true\"", self.origin))?))
+        Ok(Mocap(id.with_context(|| format!("body `{name}` must have mocap=\"true\""))?))
     }
 
     /// Finds the actuator `name`, which must be a position servo with one limited control. It must drive the joint `target` or,
@@ -196,40 +193,27 @@ impl Scene {
     /// Fails if there is no such actuator or target, or if the actuator is of another kind or drives something else.
     pub fn actuator(&self, name: &str, target: &str, summed: &[String]) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
-        let (kind, transmission) = match summed {
-            [] => (MjtObjBase::mjOBJ_JOINT, MjtTrn::mjTRN_JOINT),
-            _ => (MjtObjBase::mjOBJ_TENDON, MjtTrn::mjTRN_TENDON),
+        let (kind, what, transmission) = match summed {
+            [] => (MjtObjBase::mjOBJ_JOINT, "joint", MjtTrn::mjTRN_JOINT),
+            _ => (MjtObjBase::mjOBJ_TENDON, "tendon", MjtTrn::mjTRN_TENDON),
         };
-        let what = if summed.is_empty() { "joint" } else { "tendon" };
         let target_id = self.find(kind, what, target)?;
         let drives_it =
             self.model.actuator_trntype()[id] == transmission && self.model.actuator_trnid()[id][0] == target_id as i32;
-        ensure!(drives_it, "{}: actuator `{name}` must drive the {what} `{target}`", self.origin);
+        ensure!(drives_it, "actuator `{name}` must drive the {what} `{target}`");
         if !summed.is_empty() {
             self.check_sum(target, target_id, summed)?;
         }
-        ensure!(
-            self.is_position_servo(id),
-            "{}: actuator `{name}` must be a position servo (<position>): its control is an angle",
-            self.origin
-        );
-        let single = self.model.actuator_ctrlnum()[id] == 1;
+        let is_servo = self.is_position_servo(id);
+        ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
         let ctrl = self.model.actuator_ctrladr()[id] as usize;
-        ensure!(
-            single && self.model.actuator_ctrllimited()[ctrl],
-            "{}: actuator `{name}` must have one control with a ctrlrange",
-            self.origin
-        );
+        let one_limited = self.model.actuator_ctrlnum()[id] == 1 && self.model.actuator_ctrllimited()[ctrl];
+        ensure!(one_limited, "actuator `{name}` must have one control with a ctrlrange");
         Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
     }
 
-    /// Returns the scene's file, for messages.
-    pub fn file_label(&self) -> &str {
-        &self.origin
-    }
-
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
-        self.model.name_to_id(kind, name).ok_or_else(|| anyhow!("{}: has no {what} `{name}`", self.origin))
+        self.model.name_to_id(kind, name).with_context(|| format!("has no {what} `{name}`"))
     }
 
     /// Returns whether the force is kp · (control - length), with or without damping.
@@ -248,13 +232,11 @@ impl Scene {
             .filter(|&wrap| self.model.wrap_type()[wrap] == MjtWrap::mjWRAP_JOINT)
             .map(|wrap| (self.model.wrap_objid()[wrap] as usize, self.model.wrap_prm()[wrap]))
             .collect();
-        let mut expected = Vec::new();
-        for joint in joints {
-            expected.push((self.find(MjtObjBase::mjOBJ_JOINT, "joint", joint)?, 1.0));
-        }
+        let part = |joint: &String| Ok((self.find(MjtObjBase::mjOBJ_JOINT, "joint", joint)?, 1.0));
+        let mut expected = joints.iter().map(part).collect::<Result<Vec<_>>>()?;
         parts.sort_by_key(|&(joint, _)| joint);
         expected.sort_by_key(|&(joint, _)| joint);
-        ensure!(parts == expected, "{}: tendon `{tendon}` must be the sum {}", self.origin, joints.join(" + "));
+        ensure!(parts == expected, "tendon `{tendon}` must be the sum {}", joints.join(" + "));
         Ok(())
     }
 }

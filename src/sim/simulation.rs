@@ -90,6 +90,20 @@ impl Simulation {
         Physics::Sound
     }
 
+    /// Begins a replay with [`Simulation::step_whole`] from the state of a simulation of `scene`: that of this one, or a variation.
+    ///
+    /// # Panics
+    /// Panics if the scene or the state is of another kind.
+    pub fn start_replay(&mut self, state: &SimulationState, scene: &Scene) {
+        self.data.swap_model(scene.model.clone());
+        self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
+    }
+
+    /// Takes `substeps` steps of plain `mj_step`: the physics alone, for comparison. The bodies are one substep behind the joints.
+    pub fn step_whole(&mut self, substeps: usize) {
+        (0..substeps).for_each(|_| self.data.step());
+    }
+
     /// Returns whether the state diverged. MuJoCo resets it silently within the step; only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
@@ -193,43 +207,4 @@ pub struct Velocity {
     pub linear: [f64; 3],
     /// Angular velocity, rad/s.
     pub angular: [f64; 3],
-}
-
-/// A world that is only stepped, with plain `mj_step`: the physics alone, for comparison.
-pub struct BareSimulation {
-    data: MjData<Arc<MjModel>>,
-}
-
-impl BareSimulation {
-    /// Creates a world of `scene` in its default state.
-    pub fn new(scene: &Scene) -> Self {
-        Self { data: MjData::new(scene.model.clone()) }
-    }
-
-    /// Starts from the state of a simulation of `scene`: that of this world, or a variation of it.
-    ///
-    /// # Panics
-    /// Panics if the scene or the state is of another kind.
-    pub fn start(&mut self, state: &SimulationState, scene: &Scene) {
-        self.data.swap_model(scene.model.clone());
-        self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
-    }
-
-    /// Applies a force (N, world frame) to the centre of mass of a body in all steps until it is replaced or a state is set.
-    pub fn push(&mut self, Body(id): Body, [x, y, z]: [f64; 3]) {
-        self.data.xfrc_applied_mut()[id] = [x, y, z, 0.0, 0.0, 0.0];
-    }
-
-    /// Takes `substeps` physics steps with the controls `ctrl`.
-    pub fn step(&mut self, ctrl: &[f64], substeps: usize) {
-        self.data.ctrl_mut().copy_from_slice(ctrl);
-        for _ in 0..substeps {
-            self.data.step();
-        }
-    }
-
-    /// Returns the generalised positions.
-    pub fn qpos(&self) -> &[f64] {
-        self.data.qpos()
-    }
 }

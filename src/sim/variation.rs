@@ -78,26 +78,34 @@ impl Change {
 impl Scene {
     /// Returns this scene with these changes.
     pub fn varied(&self, changes: &[Change]) -> Self {
-        let mut model = (*self.model).clone();
-        changes.iter().for_each(|change| change.apply(&mut model));
-        if changes.iter().any(Change::is_structural) {
-            model = with_constants(MjData::new(Box::new(model)));
-        }
-        Self { model: Arc::new(model), origin: self.origin.clone() }
+        Self { model: Arc::new(changed((*self.model).clone(), changes, &Workspaces::default())) }
     }
 }
 
-/// Updates what MuJoCo derives from masses at compile time, and returns the model.
-fn with_constants(mut data: MjData<Box<MjModel>>) -> MjModel {
-    data.set_const();
-    data.model().clone()
+/// Workspaces for updating the constants of a model, one for each thread that has needed one at the same time.
+type Workspaces = Mutex<Vec<MjData<Box<MjModel>>>>;
+
+/// Returns a model with these changes, and with what MuJoCo derives from masses at compile time.
+fn changed(mut model: MjModel, changes: &[Change], workspaces: &Workspaces) -> MjModel {
+    changes.iter().for_each(|change| change.apply(&mut model));
+    if !changes.iter().any(Change::is_structural) {
+        return model;
+    }
+    let mut own = Box::new(model);
+    let free = || workspaces.lock().unwrap_or_else(PoisonError::into_inner);
+    let workspace = free().pop();
+    let mut workspace = workspace.unwrap_or_else(|| MjData::new(own.clone()));
+    own = workspace.swap_model(own);
+    workspace.set_const();
+    own = workspace.swap_model(own);
+    free().push(workspace);
+    *own
 }
 
 /// Scenes that simulations can switch between, each time with other changes.
 pub struct Variants {
     scenes: Vec<Scene>,
-    /// Workspaces for updating the constants of a model, one for each thread that has needed one at the same time.
-    workspaces: Mutex<Vec<MjData<Box<MjModel>>>>,
+    workspaces: Workspaces,
 }
 
 impl Variants {
@@ -107,8 +115,8 @@ impl Variants {
     /// Fails if they differ in their structure.
     pub fn new(scenes: Vec<Scene>) -> Result<Self> {
         let alike = scenes.windows(2).all(|pair| pair[0].model.is_compatible_with_model(&pair[1].model));
-        ensure!(alike, "{}: with another size it has another structure", scenes[0].origin);
-        Ok(Self { scenes, workspaces: Mutex::default() })
+        ensure!(alike, "with another size it has another structure");
+        Ok(Self { scenes, workspaces: Workspaces::default() })
     }
 
     /// Returns a scene (by number) with these changes.
@@ -127,23 +135,7 @@ impl Variants {
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
         // process if they differ; both come from the same scene, so they do not.
         unsafe { mj_copyModel(model.ffi_mut(), scene.ffi()) };
-        changes.iter().for_each(|change| change.apply(&mut model));
-        if changes.iter().any(Change::is_structural) {
-            model = self.update_constants(model);
-        }
-        simulation.set_own_model(model);
-    }
-
-    fn update_constants(&self, model: MjModel) -> MjModel {
-        let mut own = Box::new(model);
-        let free = || self.workspaces.lock().unwrap_or_else(PoisonError::into_inner);
-        let workspace = free().pop();
-        let mut workspace = workspace.unwrap_or_else(|| MjData::new(own.clone()));
-        own = workspace.swap_model(own);
-        workspace.set_const();
-        own = workspace.swap_model(own);
-        free().push(workspace);
-        *own
+        simulation.set_own_model(changed(model, changes, &self.workspaces));
     }
 }
 

@@ -60,10 +60,8 @@ impl Viewer {
         data.step1();
         self.panel.borrow_mut().readout = readout;
         self.viewer.render().map_err(|error| described(&error))?;
-        let mut panel = self.panel.borrow_mut();
-        let mut asked = panel.controls.clone();
-        asked.reset |= was_reset;
-        let controls = &mut panel.controls;
+        let controls = &mut self.panel.borrow_mut().controls;
+        let asked = Controls { reset: controls.reset | was_reset, ..*controls };
         (controls.steps, controls.reset, controls.new_goal) = (0, false, false);
         Ok(asked)
     }

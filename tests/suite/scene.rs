@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use shadow_repose::env::Env;
 use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::sim::{BareSimulation, Compilation, Physics, Scene, Simulation};
+use shadow_repose::sim::{Compilation, Physics, Scene, Simulation};
 
 use crate::support::{SCENE, env_config, started, task};
 
@@ -82,14 +82,15 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
         // Until the cube lies in the hand, so that the steps have contacts.
         let _ = env.step(&[0.3; 20], &mut observation);
     }
-    let mut bare = BareSimulation::new(task.scene());
-    bare.start(&env.simulation().state(), task.scene());
+    let mut bare = Simulation::new(task.scene());
+    bare.start_replay(&env.simulation().state(), task.scene());
     let simulation = env.simulation_mut();
     for step in 0..50 {
         let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();
         simulation.ctrl_mut().copy_from_slice(&ctrl);
         assert_eq!(simulation.step(1), Physics::Sound);
-        bare.step(&ctrl, 1);
+        bare.ctrl_mut().copy_from_slice(&ctrl);
+        bare.step_whole(1);
         assert_eq!(simulation.qpos(), bare.qpos(), "step {step}");
     }
 }
@@ -178,7 +179,7 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
         let message = refusal(&edited(from, to));
         assert!(message.contains(rule) && message.contains("own_scene.xml"), "{rule} is not in: {message}");
     }
-    let missing = Task::new(&env_config(&["env.model=nowhere.xml"])).err().unwrap().to_string();
+    let missing = format!("{:#}", Task::new(&env_config(&["env.model=nowhere.xml"])).err().unwrap());
     assert!(missing.contains("nowhere.xml") && missing.contains("no such file"), "{missing}");
 }
 
@@ -209,9 +210,9 @@ fn everything_solid_can_touch_everything_else() {
 #[test]
 fn a_number_that_is_none_in_an_own_scene_is_named() {
     for (from, to, named) in [
-        ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "position of body `cube`"),
-        ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "friction of geom `cube`"),
-        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "damping of joint `rh_FFJ3`"),
+        ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "body_pos of body `cube`"),
+        ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "geom_friction of geom `cube`"),
+        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "dof_damping of joint `rh_FFJ3`"),
     ] {
         let text = edited(from, to);
         let message = refusal(&text);

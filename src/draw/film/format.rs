@@ -1,9 +1,5 @@
 //! The common interface of the film encoders.
 
-use anyhow::Result;
-
-use crate::os::OutputFile;
-
 /// The parameters of a film file.
 #[derive(Clone, Copy, Debug)]
 pub struct FilmFormat {
@@ -15,11 +11,5 @@ pub struct FilmFormat {
     pub longest: usize,
 }
 
-/// An encoder for one kind of film file.
-pub(super) trait FilmEncoder {
-    /// Adds the next frame `[height, width, 3]`.
-    fn push(&mut self, rgb: &[u8]) -> Result<()>;
-
-    /// Writes what is left and returns the file.
-    fn finish(self: Box<Self>) -> Result<OutputFile>;
-}
+/// Frames `[height, width, 3]` for an encoder, which takes them one by one.
+pub(super) type Frames<'a> = &'a mut dyn Iterator<Item = Vec<u8>>;

@@ -7,8 +7,7 @@ use anyhow::{Result, anyhow};
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
-use super::format::{FilmEncoder, FilmFormat};
-use crate::os::OutputFile;
+use super::format::{FilmFormat, Frames};
 
 /// The number of colours in the palette; the index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
@@ -18,127 +17,53 @@ const BYTES_FOR_PALETTE: usize = 200 << 20;
 /// The most pixels sampled for choosing the palette.
 const PIXELS_FOR_PALETTE: usize = 400_000;
 
-/// A GIF being written.
-pub(super) struct GifFilm<W: Write> {
-    format: FilmFormat,
-    stage: Stage<W>,
-}
-
-enum Stage<W: Write> {
-    /// Frames `[height, width, 3]` that wait for the palette.
-    Gathering {
-        file: Option<W>,
-        frames: Vec<Vec<u8>>,
-    },
-    Writing(Box<Writing<W>>),
-}
-
-struct Writing<W: Write> {
-    encoder: Encoder<BufWriter<W>>,
-    palette: Palette,
-    format: FilmFormat,
-    previous: Vec<u8>,
-    frames: u64,
-}
-
-impl<W: Write> GifFilm<W> {
-    /// Creates a film; writes nothing until the palette is known.
-    pub(super) fn new(file: W, format: FilmFormat) -> Self {
-        Self { format, stage: Stage::Gathering { file: Some(file), frames: Vec::new() } }
-    }
-
-    /// Returns the film with a palette. On the first call, chooses the palette and writes the frames that waited for it.
-    fn writing(&mut self) -> Result<&mut Writing<W>> {
-        if let Stage::Gathering { file, frames } = &mut self.stage {
-            let file = file.take().ok_or_else(|| anyhow!("the film could not be started"))?;
-            let mut writing = Writing::new(file, self.format, Palette::new(frames))?;
-            frames.iter().try_for_each(|rgb| writing.write(rgb))?;
-            self.stage = Stage::Writing(Box::new(writing));
-        }
-        match &mut self.stage {
-            Stage::Writing(writing) => Ok(writing),
-            Stage::Gathering { .. } => unreachable!("the stage was just changed"),
-        }
-    }
-
-    /// Adds the next frame `[height, width, 3]`.
-    pub(super) fn push(&mut self, rgb: &[u8]) -> Result<()> {
-        match &mut self.stage {
-            Stage::Gathering { frames, .. } if (frames.len() + 1) * rgb.len() <= BYTES_FOR_PALETTE => {
-                frames.push(rgb.to_vec());
-                Ok(())
-            }
-            _ => self.writing()?.write(rgb),
-        }
-    }
-
-    /// Writes what is left and returns the writer.
-    pub(super) fn finish(mut self) -> Result<W> {
-        self.writing()?;
-        match self.stage {
-            Stage::Writing(writing) => {
-                let file = writing.encoder.into_inner()?;
-                file.into_inner().map_err(|error| anyhow!("{}", error.error()))
-            }
-            Stage::Gathering { .. } => unreachable!("the stage was just changed"),
-        }
-    }
-}
-
-impl FilmEncoder for GifFilm<OutputFile> {
-    fn push(&mut self, rgb: &[u8]) -> Result<()> {
-        self.push(rgb)
-    }
-
-    fn finish(self: Box<Self>) -> Result<OutputFile> {
-        (*self).finish()
-    }
-}
-
-impl<W: Write> Writing<W> {
-    fn new(file: W, format: FilmFormat, palette: Palette) -> Result<Self> {
-        let [width, height] = [u16::try_from(format.size[0])?, u16::try_from(format.size[1])?];
-        let mut encoder = Encoder::new(BufWriter::new(file), width, height, &palette.colours())?;
-        encoder.set_repeat(Repeat::Infinite)?;
-        Ok(Self { encoder, palette, format, previous: Vec::new(), frames: 0 })
-    }
-
-    fn write(&mut self, rgb: &[u8]) -> Result<()> {
-        let [width, height] = self.format.size.map(|pixels| pixels as usize);
-        let changed = |x: usize, y: usize| {
-            let at = 3 * (y * width + x);
-            self.previous.get(at..at + 3) != Some(&rgb[at..at + 3])
-        };
-        // The smallest rectangle around all changes; one pixel if there are none.
-        let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
-        let (top, bottom) = (rows.first().copied().unwrap_or(0), rows.last().copied().unwrap_or(0));
-        let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
-        let left = (0..width).find(in_column).unwrap_or(0);
-        let right = (left..width).rev().find(in_column).unwrap_or(left);
-        let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
-        for y in top..=bottom {
-            for x in left..=right {
-                let at = 3 * (y * width + x);
-                pixels.push(if changed(x, y) { self.palette.index(&rgb[at..at + 3]) } else { TRANSPARENT });
-            }
-        }
+/// Writes the film and returns the file. Nothing is written until the palette is known.
+///
+/// # Errors
+/// Fails if the pictures are too large for a GIF, or if the file cannot be written.
+pub(super) fn encode<W: Write>(file: W, format: FilmFormat, frames: Frames) -> Result<W> {
+    let [width, height] = format.size.map(|pixels| pixels as usize);
+    let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
+    let mut palette = Palette::new(&waiting);
+    let [columns, rows] = [u16::try_from(width)?, u16::try_from(height)?];
+    let mut encoder = Encoder::new(BufWriter::new(file), columns, rows, &palette.quantizer.color_map_rgb())?;
+    encoder.set_repeat(Repeat::Infinite)?;
+    let mut previous = Vec::new();
+    for (number, rgb) in (0..).zip(waiting.into_iter().chain(frames)) {
         // Rounds times, not delays, to hundredths of a second, so that the film has the right length at any frame rate.
-        let hundredths = |frames: u64| (frames * 100 + u64::from(self.format.fps) / 2) / u64::from(self.format.fps);
-        self.encoder.write_frame(&Frame {
-            delay: (hundredths(self.frames + 1) - hundredths(self.frames)) as u16,
-            dispose: DisposalMethod::Keep,
-            transparent: Some(TRANSPARENT),
-            top: top as u16,
-            left: left as u16,
-            width: (right + 1 - left) as u16,
-            height: (bottom + 1 - top) as u16,
-            buffer: Cow::Owned(pixels),
-            ..Frame::default()
-        })?;
-        self.frames += 1;
-        self.previous.clear();
-        self.previous.extend_from_slice(rgb);
-        Ok(())
+        let hundredths = |frames: u64| (frames * 100 + u64::from(format.fps) / 2) / u64::from(format.fps);
+        let delay = (hundredths(number + 1) - hundredths(number)) as u16;
+        encoder.write_frame(&Frame { delay, ..changes(&mut palette, width, &previous, &rgb) })?;
+        previous = rgb;
+    }
+    encoder.into_inner()?.into_inner().map_err(|error| anyhow!("{}", error.error()))
+}
+
+/// Returns what differs from the previous frame, if there was one: the smallest rectangle around all changes, or one pixel.
+fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> Frame<'static> {
+    let height = rgb.len() / (3 * width);
+    let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
+    let changed = |x: usize, y: usize| previous.get(pixel(x, y)) != rgb.get(pixel(x, y));
+    let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
+    let (top, bottom) = (rows.first().copied().unwrap_or(0), rows.last().copied().unwrap_or(0));
+    let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
+    let left = (0..width).find(in_column).unwrap_or(0);
+    let right = (left..width).rev().find(in_column).unwrap_or(left);
+    let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
+    for y in top..=bottom {
+        for x in left..=right {
+            pixels.push(if changed(x, y) { palette.index(&rgb[pixel(x, y)]) } else { TRANSPARENT });
+        }
+    }
+    Frame {
+        dispose: DisposalMethod::Keep,
+        transparent: Some(TRANSPARENT),
+        top: top as u16,
+        left: left as u16,
+        width: (right + 1 - left) as u16,
+        height: (bottom + 1 - top) as u16,
+        buffer: Cow::Owned(pixels),
+        ..Frame::default()
     }
 }
 
@@ -157,10 +82,6 @@ impl Palette {
         let all = frames.iter().flat_map(|rgb| rgb.chunks_exact(3));
         let sample: Vec<u8> = all.step_by(every).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
         Self { quantizer: NeuQuant::new(10, COLOURS, &sample), known: vec![None; 1 << 18] }
-    }
-
-    fn colours(&self) -> Vec<u8> {
-        self.quantizer.color_map_rgb()
     }
 
     fn index(&mut self, rgb: &[u8]) -> u8 {

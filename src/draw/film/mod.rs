@@ -8,15 +8,12 @@ mod gif;
 mod mp4;
 
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use anyhow::{Context, Result, bail, ensure};
 
-use self::caption::Captions;
-use self::format::FilmEncoder;
-use self::gif::GifFilm;
-use self::mp4::Mp4Film;
+use self::format::Frames;
 use crate::os::OutputFile;
 
 pub use self::format::FilmFormat;
@@ -27,19 +24,14 @@ const WAITING: usize = 4;
 /// The most frames of a film. The index of an MP4 is kept in memory, and space for it is reserved in the file.
 const MOST_FRAMES: usize = 2_000_000;
 
+/// A frame `[height, width, 3]`, and the lines of text in its corner.
+pub type Frame = (Vec<u8>, Vec<String>);
+
 /// A film being written. The file appears once the film is finished.
 pub struct FilmWriter {
     path: PathBuf,
     frames: SyncSender<Frame>,
-    /// Buffers of encoded frames, for reuse.
-    spare: Receiver<Vec<u8>>,
     encoder: JoinHandle<Result<OutputFile>>,
-}
-
-struct Frame {
-    /// `[height, width, 3]`
-    rgb: Vec<u8>,
-    caption: Vec<String>,
 }
 
 impl FilmWriter {
@@ -49,9 +41,9 @@ impl FilmWriter {
     /// Fails for any other extension, for a format that the kind of file does not support, or if the file cannot be written.
     pub fn create(path: &Path, format: FilmFormat) -> Result<Self> {
         let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-        let begin: fn(OutputFile, FilmFormat) -> Result<Box<dyn FilmEncoder>> = match extension.as_str() {
-            "mp4" => |file, format| Ok(Box::new(Mp4Film::new(file, format)?)),
-            "gif" => |file, format| Ok(Box::new(GifFilm::new(file, format))),
+        let encode: fn(OutputFile, FilmFormat, Frames) -> Result<OutputFile> = match extension.as_str() {
+            "mp4" => mp4::encode,
+            "gif" => gif::encode,
             _ => bail!("{}: the name of a film must end in .mp4 or .gif", path.display()),
         };
         let [width, height] = format.size;
@@ -62,29 +54,16 @@ impl FilmWriter {
         let fits = format.longest <= MOST_FRAMES;
         ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes", format.longest);
         let file = OutputFile::create(path)?;
-        let (frames, incoming) = sync_channel::<Frame>(WAITING);
-        let (done, spare) = sync_channel(WAITING + 1);
-        let encode = move || {
-            let mut film = begin(file, format)?;
-            let captions = Captions::new(format.size);
-            for mut frame in incoming {
-                captions.draw(&mut frame.rgb, &frame.caption);
-                film.push(&frame.rgb)?;
-                let _ = done.try_send(frame.rgb);
-            }
-            film.finish()
-        };
+        let (frames, incoming) = sync_channel(WAITING);
+        let encode = move || encode(file, format, &mut captioned(incoming, format));
         let encoder = thread::Builder::new().name("film".into()).spawn(encode).context("cannot start a thread")?;
-        Ok(Self { path: path.to_owned(), frames, spare, encoder })
+        Ok(Self { path: path.to_owned(), frames, encoder })
     }
 
-    /// Adds a frame `[height, width, 3]` with these lines of text in its corner. Does nothing if the encoder has failed:
-    /// [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`] returns the reason.
-    pub fn push(&mut self, rgb: &[u8], caption: Vec<String>) {
-        let mut buffer = self.spare.try_recv().unwrap_or_default();
-        buffer.clear();
-        buffer.extend_from_slice(rgb);
-        let _ = self.frames.send(Frame { rgb: buffer, caption });
+    /// Adds a frame. Does nothing if the encoder has failed: [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`]
+    /// returns the reason.
+    pub fn push(&mut self, frame: Frame) {
+        let _ = self.frames.send(frame);
     }
 
     /// Whether the encoder has stopped early.
@@ -92,53 +71,31 @@ impl FilmWriter {
         self.encoder.is_finished()
     }
 
-    /// Abandons the film and leaves an existing file as it was. Returns why the encoder failed, if it did.
-    pub fn abandon(self) -> Option<anyhow::Error> {
-        drop(self.frames);
-        let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
-        encoded.err().map(|error| error.context(format!("cannot write the film {}", self.path.display())))
-    }
-
-    /// Completes the file.
+    /// Completes the file; unless `keep`, abandons the film and leaves an existing file as it was.
     ///
     /// # Errors
     /// Fails if the encoder or the file failed, on this or an earlier frame.
-    pub fn finish(self) -> Result<()> {
+    pub fn finish(self, keep: bool) -> Result<()> {
         drop(self.frames);
         let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
-        encoded.and_then(OutputFile::complete).with_context(|| format!("cannot write the film {}", self.path.display()))
+        let finished = encoded.and_then(|file| if keep { file.complete() } else { Ok(()) });
+        finished.with_context(|| format!("cannot write the film {}", self.path.display()))
     }
 }
 
-/// A short film in memory, as a GIF.
-pub struct Clip {
-    film: GifFilm<Vec<u8>>,
-    captions: Captions,
+/// Returns a film of these frames in memory, as a GIF.
+///
+/// # Errors
+/// Fails if the pictures are too large for a GIF.
+pub fn gif_of(frames: Vec<Frame>, format: FilmFormat) -> Result<Vec<u8>> {
+    gif::encode(Vec::new(), format, &mut captioned(frames, format))
 }
 
-impl Clip {
-    /// Starts a clip.
-    pub fn new(format: FilmFormat) -> Self {
-        Self { film: GifFilm::new(Vec::new(), format), captions: Captions::new(format.size) }
-    }
-
-    /// Adds a frame `[height, width, 3]` with these lines of text in its corner.
-    ///
-    /// # Errors
-    /// Fails if the picture is too large for a GIF.
-    pub fn push(&mut self, rgb: &[u8], caption: &[String]) -> Result<()> {
-        let mut frame = rgb.to_vec();
-        self.captions.draw(&mut frame, caption);
-        self.film.push(&frame)
-    }
-
-    /// Returns the file.
-    ///
-    /// # Errors
-    /// Fails if the picture is too large for a GIF.
-    pub fn finish(self) -> Result<Vec<u8>> {
-        self.film.finish()
-    }
+fn captioned(frames: impl IntoIterator<Item = Frame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
+    frames.into_iter().map(move |(mut rgb, lines)| {
+        caption::draw(&mut rgb, format.size, &lines).expect("the font is part of the program");
+        rgb
+    })
 }
 
 /// Writes a picture `[height, width, 3]` as PNG.

@@ -16,66 +16,36 @@ use shiguredo_mp4::bitstream::h264::{
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::mux::{Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size};
 
-use super::format::{FilmEncoder, FilmFormat};
+use super::format::{FilmFormat, Frames};
 use crate::os::OutputFile;
 
 /// Seconds between key frames, which are the frames that a player can seek to.
 const KEY_FRAME_EVERY: u32 = 2;
 
-/// An MP4 file being written.
-pub(super) struct Mp4Film {
-    file: BufWriter<OutputFile>,
-    muxer: Mp4FileMuxer,
-    /// The position of the next frame in the file.
-    position: u64,
-    encoder: Encoder,
-    size: (usize, usize),
-    yuv: YUVBuffer,
-    fps: NonZeroU32,
-    /// Whether no frame was written yet. The first one carries the description of the stream.
-    first: bool,
-}
-
-impl Mp4Film {
-    /// Starts the file.
-    pub(super) fn new(file: OutputFile, format: FilmFormat) -> Result<Self> {
-        let size = (format.size[0] as usize, format.size[1] as usize);
-        let config = EncoderConfig::new()
-            .max_frame_rate(FrameRate::from_hz(format.fps as f32))
-            // Constant, fine quantisation: half a megabyte for ten seconds of 640 × 480.
-            .rate_control_mode(RateControlMode::Off)
-            .intra_frame_period(IntraFramePeriod::from_num_frames(KEY_FRAME_EVERY * format.fps))
-            .complexity(Complexity::Low)
-            .skip_frames(false)
-            .num_threads(1)
-            // The colour conversion of `YUVBuffer`.
-            .vui(VuiConfig::bt601());
-        let encoder =
-            Encoder::with_api_config(OpenH264API::from_source(), config).context("cannot start the encoder")?;
-        let options = Mp4FileMuxerOptions {
-            reserved_moov_box_size: estimate_maximum_moov_box_size(&[format.longest]),
-            ..Default::default()
-        };
-        let muxer = Mp4FileMuxer::with_options(options)?;
-        let mut file = BufWriter::new(file);
-        file.write_all(muxer.initial_boxes_bytes())?;
-        let position = muxer.initial_boxes_bytes().len() as u64;
-        let fps = NonZeroU32::new(format.fps).context("the frame rate of a film must not be 0")?;
-        let yuv = YUVBuffer::new(size.0, size.1);
-        Ok(Self { file, muxer, position, encoder, size, yuv, fps, first: true })
-    }
-}
-
-impl FilmEncoder for Mp4Film {
-    fn push(&mut self, rgb: &[u8]) -> Result<()> {
-        self.yuv.read_rgb8(RgbSliceU8::new(rgb, self.size));
-        let stream = self.encoder.encode(&self.yuv).context("cannot encode a frame")?;
+/// Writes the film and returns the file.
+///
+/// # Errors
+/// Fails if the encoder cannot be started or skips a frame, if there are more frames than announced, or if the file cannot be
+/// written.
+pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Result<OutputFile> {
+    let size = (format.size[0] as usize, format.size[1] as usize);
+    let mut encoder = encoder(format.fps)?;
+    let mut yuv = YUVBuffer::new(size.0, size.1);
+    let timescale = NonZeroU32::new(format.fps).context("the frame rate of a film must not be 0")?;
+    let reserved_moov_box_size = estimate_maximum_moov_box_size(&[format.longest]);
+    let mut muxer = Mp4FileMuxer::with_options(Mp4FileMuxerOptions { reserved_moov_box_size, ..Default::default() })?;
+    let mut file = BufWriter::new(file);
+    file.write_all(muxer.initial_boxes_bytes())?;
+    let mut data_offset = muxer.initial_boxes_bytes().len() as u64;
+    for (number, rgb) in frames.enumerate() {
+        yuv.read_rgb8(RgbSliceU8::new(&rgb, size));
+        let stream = encoder.encode(&yuv).context("cannot encode a frame")?;
         let keyframe = matches!(stream.frame_type(), FrameType::IDR | FrameType::I);
         let stream = stream.to_vec();
-        let length_size = LengthSize::FourBytes;
-        let describe = || build_avc1_box_from_annexb(&stream, &H264SampleEntryConfig { length_size });
-        let sample_entry = self.first.then(describe).transpose()?.map(SampleEntry::Avc1);
-        self.first = false;
+        // The first frame carries the description of the stream.
+        let config = H264SampleEntryConfig { length_size: LengthSize::FourBytes };
+        let describe = || build_avc1_box_from_annexb(&stream, &config).map(SampleEntry::Avc1);
+        let sample_entry = (number == 0).then(describe).transpose()?;
         let mut data = Vec::with_capacity(stream.len());
         for unit in parse_annexb_nal_units(&stream)? {
             // The parameter sets go into the index.
@@ -85,28 +55,38 @@ impl FilmEncoder for Mp4Film {
             }
         }
         ensure!(!data.is_empty(), "the encoder skipped a frame");
-        self.file.write_all(&data)?;
-        self.muxer.append_sample(&Sample {
+        file.write_all(&data)?;
+        muxer.append_sample(&Sample {
             track_kind: TrackKind::Video,
             sample_entry,
             keyframe,
-            timescale: self.fps,
+            timescale,
             duration: 1,
             composition_time_offset: None,
-            data_offset: self.position,
+            data_offset,
             data_size: data.len(),
         })?;
-        self.position += data.len() as u64;
-        Ok(())
+        data_offset += data.len() as u64;
     }
+    let boxes = muxer.finalize()?;
+    ensure!(boxes.is_faststart_enabled(), "the film has more frames than announced");
+    for (offset, bytes) in boxes.offset_and_bytes_pairs() {
+        file.seek(SeekFrom::Start(offset))?;
+        file.write_all(bytes)?;
+    }
+    file.into_inner().map_err(|error| anyhow!("{}", error.error()))
+}
 
-    fn finish(mut self: Box<Self>) -> Result<OutputFile> {
-        let boxes = self.muxer.finalize()?;
-        ensure!(boxes.is_faststart_enabled(), "the film has more frames than announced");
-        for (offset, bytes) in boxes.offset_and_bytes_pairs() {
-            self.file.seek(SeekFrom::Start(offset))?;
-            self.file.write_all(bytes)?;
-        }
-        self.file.into_inner().map_err(|error| anyhow!("{}", error.error()))
-    }
+fn encoder(fps: u32) -> Result<Encoder> {
+    let config = EncoderConfig::new()
+        .max_frame_rate(FrameRate::from_hz(fps as f32))
+        // Constant, fine quantisation: half a megabyte for ten seconds of 640 × 480.
+        .rate_control_mode(RateControlMode::Off)
+        .intra_frame_period(IntraFramePeriod::from_num_frames(KEY_FRAME_EVERY * fps))
+        .complexity(Complexity::Low)
+        .skip_frames(false)
+        .num_threads(1)
+        // The colour conversion of `YUVBuffer`.
+        .vui(VuiConfig::bt601());
+    Encoder::with_api_config(OpenH264API::from_source(), config).context("cannot start the encoder")
 }
