@@ -130,7 +130,7 @@ pub fn score(
     let mut observer = |moment: Moment| {
         observe(&moment);
         if moment.ends() {
-            bar.count();
+            bar.inc(1);
         }
         Ok(())
     };

@@ -85,7 +85,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
         let (task, episodes) = (Task::new(config)?, episodes(args, 256));
-        let bar = os::Bar::new(episodes.count as u64, "episodes", actor.name());
+        let bar = os::progress_bar(episodes.count as u64, "episodes", actor.name());
         score(&task, actor, episodes, requests.stop(), &bar, observe)
     };
     let played = match &args.video {
@@ -99,7 +99,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
         output
             .into_iter()
             .for_each(|output| os::say(&format!("{}: interrupted, not written", output.path().display())));
-        return Ok(requests.exit_code());
+        return Ok(os::exit_code(requests.signal()));
     };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;

@@ -23,7 +23,7 @@ pub use output::{
     OUR_PARTIAL, OutputFile, PARTIAL, Unfinished, expect_folder, is_abandoned, make_own, name_also, sync_folder,
     unused_name, write_whole,
 };
-pub use progress::{Bar, Status, StatusLine};
+pub use progress::{Bar, Status, StatusLine, progress_bar};
 pub use similar::similar;
 pub use terminal::{called_as, has_display, print, quoted, quoted_path, say, speak_as};
 pub use threads::start_threads;

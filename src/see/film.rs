@@ -12,7 +12,7 @@ use crate::config::EnvConfig;
 use crate::draw::{self, Clip, FilmFormat, FilmWriter};
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player, evaluate};
-use crate::os::{Bar, OutputFile};
+use crate::os::{Bar, OutputFile, progress_bar};
 use crate::repose::{Repose, Task};
 use crate::run::Animation;
 use crate::sim::{Quality, Renderer};
@@ -46,7 +46,7 @@ impl Film {
         let renderer = Renderer::new(task.scene())?;
         let format = FilmFormat { size: renderer.size(), fps, longest: all as usize };
         let writer = FilmWriter::create(path, format)?;
-        let bar = Bar::new(all, "frames", "film");
+        let bar = progress_bar(all, "frames", "film");
         Ok(Self { renderer, writer, fps, frames: 0, all_frames: 0, longest, bar, begun: Instant::now() })
     }
 
@@ -72,11 +72,11 @@ impl Film {
             self.writer.push(picture, caption(env, moment.episode, time));
             self.frames += 1;
             self.all_frames += 1;
-            self.bar.count();
+            self.bar.inc(1);
         }
         if ended {
-            self.bar.shorten(self.longest.saturating_sub(self.frames));
-            self.bar.say(format!("{} goals in episode {}", env.episode().goals, moment.episode));
+            self.bar.dec_length(self.longest.saturating_sub(self.frames));
+            self.bar.set_message(format!("{} goals in episode {}", env.episode().goals, moment.episode));
         }
         Ok(())
     }
