@@ -158,7 +158,8 @@ impl Source {
     }
 }
 
-/// Returns the base, overlaid with the tables `under` the user's, with that of the user's file, and then with `overrides`.
+/// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error
+/// names the file.
 fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
     let (mut merged, mut problems) = (DEFAULTS.clone(), Vec::new());
     let (file, given) = user.unzip();

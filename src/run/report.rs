@@ -27,9 +27,9 @@ pub struct Report {
     settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
-    /// The iterations of the run that were logged; the first ended where this begins.
+    /// From the iteration before the first one of the run to the last one that was logged.
     iterations: Range<u64>,
-    /// Control steps up to the end of the last one.
+    /// Control steps up to its end.
     env_steps: u64,
     progress: StatusLine,
 }
@@ -73,7 +73,7 @@ impl<W> Log<W> {
         result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
     }
 
-    /// Writes no more, since these iterations are lost; says so unless that is known.
+    /// Stops writing, and counts the iterations that are `lost`; says so unless that is known.
     fn give_up(&mut self, progress: &StatusLine, lost: u64, error: &anyhow::Error) {
         self.lost += lost;
         self.writer = None;
