@@ -137,7 +137,7 @@ impl Trial<'_> {
         let mut observer = |moment: Moment| {
             observe(&moment);
             if moment.ends() {
-                bar.count();
+                bar.inc(1);
             }
             Ok(())
         };

@@ -83,7 +83,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
         let (task, episodes) = (Task::new(config)?, episodes(args, 256));
-        let bar = os::Bar::new(episodes.count as u64, "episodes", actor.name());
+        let bar = os::progress_bar(episodes.count as u64, "episodes", actor.name());
         Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
     };
     let played = match &args.video {
@@ -97,7 +97,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
         if let Some(output) = output {
             os::say(&format!("{}: interrupted, not written", output.path().display()));
         }
-        return Ok(requests.exit_code());
+        return Ok(os::exit_code(requests.signal()));
     };
     if let (Some(output), Some(trace)) = (output, trace) {
         output.finish(trace.finish().as_bytes())?;

@@ -12,7 +12,7 @@ use crate::config::{EnvConfig, Override};
 use crate::draw::{self, BarChart, HeatMap, Picture};
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::load::Loaded;
-use crate::os::{self, Bar, OutputFile, Requests, number};
+use crate::os::{self, OutputFile, Requests, number};
 use crate::repose::{Score, Task};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -77,11 +77,11 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     let tasks: Vec<Arc<Task>> = configs.iter().map(Task::new).collect::<Result<_>>()?;
     let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
-    let bar = Bar::new((different * count) as u64, "episodes", "robustness");
+    let bar = os::progress_bar((different * count) as u64, "episodes", "robustness");
     let (mut rows, episodes): (Vec<Row>, _) = (Vec::new(), Episodes::scored(args.seed, count));
     for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
-        bar.say(condition.name.clone());
+        bar.set_message(condition.name.clone());
         let played = match known {
             Some(known) => Some(known),
             None => Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, &mut |_| {})?,
@@ -107,7 +107,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         Some(output) => picture(&rows, count, &loaded.origin.to_string()).write(output)?,
         None => {}
     }
-    Ok(if interrupted { requests.exit_code() } else { ExitCode::SUCCESS })
+    Ok(if interrupted { os::exit_code(requests.signal()) } else { ExitCode::SUCCESS })
 }
 
 /// Returns all rows: the task itself, the single changes, and the grid.

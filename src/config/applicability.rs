@@ -1,24 +1,9 @@
 //! The commands that use each setting.
 
 use anyhow::{Result, bail};
-use toml::Table;
 
-use super::BASE;
 use super::layers::Override;
-use super::overlay::table_of;
-
-/// The commands that take settings.
-const COMMANDS: [&str; 5] = ["train", "bench", "play", "view", "export"];
-
-/// Settings of `[env]` and `[run]` that are used by fewer commands than the rest of their section.
-const FEWER: [(&str, &[&str]); 6] = [
-    ("env.num_envs", &["train", "bench"]),
-    ("run.total_steps", &["train", "bench"]),
-    ("run.checkpoint_every", &["train"]),
-    ("run.eval_every", &["train"]),
-    ("run.eval_episodes", &["train"]),
-    ("run.film_every", &["train"]),
-];
+use super::overlay::{DEFAULTS, lookup, settings, table_of};
 
 /// Checks that a command uses all of these single settings. A configuration file may hold any setting, because it is shared by
 /// all commands.
@@ -26,28 +11,28 @@ const FEWER: [(&str, &[&str]); 6] = [
 /// # Errors
 /// Fails on the first setting that the command does not use, and names the commands that do.
 pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
-    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
     for Override { key, value } in overrides {
-        let table = table_of(key, value, &base);
-        let in_sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
-        for (section, name) in in_sections.flat_map(|(section, keys)| keys.keys().map(move |name| (section, name))) {
+        for (name, _) in settings(&table_of(key, value, &DEFAULTS)) {
             // Unknown keys are reported elsewhere, with a suggestion.
-            let known = base.get(section).and_then(|keys| keys.get(name)).is_some();
-            let users = users(section, name);
+            let known = lookup(&DEFAULTS, &name).is_some();
+            let users = users(&name);
             if known && !users.contains(&command) {
                 let does = if users.len() == 1 { "does" } else { "do" };
                 let users = users.join("` and `");
-                bail!("--set {key}={value}: `{command}` does not use {section}.{name}; `{users}` {does}");
+                bail!("--set {key}={value}: `{command}` does not use {name}; `{users}` {does}");
             }
         }
     }
     Ok(())
 }
 
-fn users(section: &str, name: &str) -> &'static [&'static str] {
-    let key = format!("{section}.{name}");
-    let fewer = FEWER.iter().find(|(of, _)| *of == key).map(|(_, users)| *users);
-    fewer.unwrap_or(if section == "env" { &COMMANDS } else { &COMMANDS[..2] })
+/// Returns the commands that use a setting.
+fn users(key: &str) -> &'static [&'static str] {
+    match key {
+        "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.film_every" => &["train"],
+        key if key.starts_with("env.") && key != "env.num_envs" => &["train", "bench", "play", "view", "export"],
+        _ => &["train", "bench"],
+    }
 }
 
 #[cfg(test)]

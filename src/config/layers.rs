@@ -1,16 +1,15 @@
 //! The layers of a configuration: the defaults, overlaid with the user's file, overlaid with single settings.
 
-use crate::os;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow, bail};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::BASE;
-use super::overlay::{overlay, table_of, with_the_others};
+use super::overlay::{DEFAULTS, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
+use crate::os;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
@@ -28,12 +27,11 @@ impl std::str::FromStr for Override {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        match text.split_once('=') {
-            Some((key, value)) if !key.trim().is_empty() => {
-                Ok(Self { key: key.trim().into(), value: value.trim().into() })
-            }
-            _ => Err(format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4")),
-        }
+        let parts = text.split_once('=').map(|(key, value)| (key.trim(), value.trim()));
+        let (key, value) = parts
+            .filter(|(key, _)| !key.is_empty())
+            .ok_or_else(|| format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"))?;
+        Ok(Self { key: key.into(), value: value.into() })
     }
 }
 
@@ -60,8 +58,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let file = user.map(|source| source.path.as_path());
-        layered(file, &user.map(Source::table).transpose()?.into_iter().collect::<Vec<_>>(), overrides)
+        layered(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Returns the settings of a training that begins with a policy of this net: as [`Config::resolve`] does, but the base has this
@@ -70,13 +67,8 @@ impl Config {
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let NetConfig { hidden, activation, symmetry } = net;
-        let values = [Value::try_from(hidden), Value::try_from(activation), Value::try_from(symmetry)];
-        let values = values.map(|value| value.expect("a plain value"));
-        let ppo: Table = OF_NETS.map(String::from).into_iter().zip(values).collect();
-        let mut tables = vec![Table::from_iter([("ppo".into(), Value::Table(ppo))])];
-        tables.extend(user.map(Source::table).transpose()?);
-        layered(user.map(|source| source.path.as_path()), &tables, overrides)
+        let ppo = Value::try_from(net).expect("the structure of a net is a table");
+        layered(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
@@ -85,8 +77,7 @@ impl Config {
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
-        let table = Source { path: path.into(), text: text.into() }.table()?;
-        layered(Some(path), &[table], overrides)
+        Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
@@ -97,9 +88,8 @@ impl Config {
     pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let mut own = self.clone();
         (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
-        let mut tables = vec![Table::try_from(own).expect("a configuration is a tree of tables")];
-        tables.extend(user.map(Source::table).transpose()?);
-        let mut changed = layered(user.map(|source| source.path.as_path()), &tables, overrides)?;
+        let own = Table::try_from(own).expect("a configuration is a tree of tables");
+        let mut changed = layered(own, user.map(Source::table).transpose()?, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
         }
@@ -116,12 +106,8 @@ impl Config {
             Table::try_from(same).expect("a configuration is a tree of tables")
         };
         let (own, other) = (table(self), table(other));
-        let keys =
-            own.iter().flat_map(|(section, keys)| keys.as_table().into_iter().flatten().map(move |key| (section, key)));
-        let differing = keys.filter(|(section, (key, value))| other[*section][*key] != **value);
-        differing
-            .map(|(section, (key, value))| format!("{section}.{key} = {}, not {value}", other[section][key]))
-            .collect()
+        let both = settings(&own).zip(settings(&other)).filter(|((_, own), (_, other))| own != other);
+        both.map(|((key, own), (_, other))| format!("{key} = {other}, not {own}")).collect()
     }
 
     /// Returns the whole configuration as TOML.
@@ -144,15 +130,14 @@ impl PolicyConfig {
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
-        let mut table = Source { path: path.into(), text: text.into() }.table()?;
+        let source = Source { path: path.into(), text: text.into() };
+        let (path, mut table) = source.table()?;
         table.retain(|section, _| section == "env" || section == "ppo");
-        if let Some(Value::Table(env)) = table.get_mut("env") {
-            env.retain(|key, _| key != "num_envs");
+        for (section, keys) in &mut table {
+            let is_used = |key: &str| if section == "env" { key != "num_envs" } else { OF_NETS.contains(&key) };
+            keys.as_table_mut().into_iter().for_each(|keys| keys.retain(|key, _| is_used(key)));
         }
-        if let Some(Value::Table(ppo)) = table.get_mut("ppo") {
-            ppo.retain(|key, _| OF_NETS.contains(&key));
-        }
-        let Config { env, ppo, .. } = layered(Some(path), &[table], overrides)?;
+        let Config { env, ppo, .. } = layered(Table::new(), Some((path, table)), overrides)?;
         Ok(Self { env, net: ppo.net() })
     }
 }
@@ -167,32 +152,33 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 }
 
 impl Source {
-    fn table(&self) -> Result<Table> {
-        self.text.parse().map_err(|error| anyhow!("{}: not a TOML file: {error}", self.path.display()))
+    fn table(&self) -> Result<(&Path, Table)> {
+        let table = self.text.parse().map_err(|error| anyhow!("{}: not a TOML file: {error}", self.path.display()))?;
+        Ok((&self.path, table))
     }
 }
 
-/// Returns the base, overlaid with `tables` and then with `overrides`. The error message names `file`.
-fn layered(file: Option<&Path>, tables: &[Table], overrides: &[Override]) -> Result<Config> {
-    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
-    let (mut merged, mut problems) = (base.clone(), Vec::new());
-    for table in tables {
-        overlay(&mut merged, table, &base, "", &mut problems);
+/// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error
+/// names the file.
+fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
+    let (mut merged, mut problems) = (DEFAULTS.clone(), Vec::new());
+    let (file, given) = user.unzip();
+    for table in [Some(under), given].into_iter().flatten() {
+        overlay(&mut merged, &table, &DEFAULTS, "", &mut problems);
     }
     for Override { key, value } in overrides {
-        let single = with_the_others(table_of(key, value, &base), key, &merged, &base);
-        overlay(&mut merged, &single, &base, "", &mut problems);
+        let single = table_of(key, value, &merged);
+        overlay(&mut merged, &single, &DEFAULTS, "", &mut problems);
     }
     // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
     // replaced by its default, so that the other rules can be checked.
-    for (section, keys) in &base {
-        for (key, default) in keys.as_table().into_iter().flatten() {
-            let mut alone = base.clone();
-            alone[section][key] = merged[section][key].clone();
-            if let Err(error) = Config::deserialize(Value::Table(alone)) {
-                problems.push(format!("{section}.{key} = {}: {}", merged[section][key], error.message().trim()));
-                merged[section][key] = default.clone();
-            }
+    for (name, default) in settings(&DEFAULTS) {
+        let (section, key) = name.split_once('.').expect("a key is in a section");
+        let mut alone = DEFAULTS.clone();
+        alone[section][key] = merged[section][key].clone();
+        if let Err(error) = Config::deserialize(Value::Table(alone)) {
+            problems.push(format!("{name} = {}: {}", merged[section][key], error.message().trim()));
+            merged[section][key] = default.clone();
         }
     }
     let config = Config::deserialize(Value::Table(merged))?;

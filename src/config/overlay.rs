@@ -1,52 +1,60 @@
 //! Overlaying one table of settings with another: keys and types are those of the base; what does not fit is reported.
 
-use std::borrow::Cow;
+use std::sync::LazyLock;
 
 use toml::{Table, Value};
 
 use super::BASE;
-use super::ramp::Ramp;
 use crate::os::similar;
 
-/// Returns the table with this one value. Text that is not a TOML value becomes a string, as does any text for a string key.
-pub(super) fn table_of(key: &str, text: &str, base: &Table) -> Table {
+/// The base as tables.
+pub(super) static DEFAULTS: LazyLock<Table> =
+    LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
+
+/// Returns the settings of all sections of a table, each with its dotted key.
+pub(super) fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
+    let sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
+    sections.flat_map(|(section, keys)| keys.iter().map(move |(key, value)| (format!("{section}.{key}"), value)))
+}
+
+/// Returns the value with this dotted key.
+pub(super) fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
+    let (section, rest) = key.split_once('.').unwrap_or((key, ""));
+    rest.split_terminator('.').try_fold(table.get(section)?, |value, part| value.get(part))
+}
+
+/// Returns a number, whole or not.
+pub(super) fn number(value: &Value) -> Option<f64> {
+    value.as_float().or(value.as_integer().map(|x| x as f64))
+}
+
+/// Returns whether a table of the base is a ramp, rather than a section or values by group.
+pub(super) fn is_ramp(table: &Table) -> bool {
+    table.contains_key("from")
+}
+
+/// Returns the table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
+/// for a string key.
+pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     let parsed = format!("value = {text}").parse::<Table>();
     let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
-    let wants_text = lookup(base, key).is_some_and(Value::is_str);
+    let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
     let mut value = match parsed {
         Some(value) if !wants_text || value.is_str() => value,
         _ => Value::String(text.to_owned()),
     };
     // The deepest level is a part of a ramp in a section; anything deeper belongs to an unknown name.
     let parts: Vec<&str> = key.splitn(3, '.').collect();
-    for part in parts[1..].iter().rev() {
-        value = Table::from_iter([((*part).to_owned(), value)]).into();
+    for depth in (1..parts.len()).rev() {
+        let whole = parts[..depth].join(".");
+        // `env.noise.joint_pos` changes one value of `env.noise`, so the others come along.
+        let by_group = lookup(&DEFAULTS, &whole).and_then(Value::as_table).is_some_and(Table::is_empty);
+        let others = lookup(merged, &whole).and_then(Value::as_table).filter(|_| by_group);
+        let mut table = others.cloned().unwrap_or_default();
+        table.insert(parts[depth].to_owned(), value);
+        value = table.into();
     }
     Table::from_iter([(parts[0].to_owned(), value)])
-}
-
-/// Returns `table`, which sets `key` alone, with the other values of the free table in which it is, if it is in one:
-/// `env.noise.joint_pos` changes one value of `env.noise`.
-pub(super) fn with_the_others(mut table: Table, key: &str, merged: &Table, base: &Table) -> Table {
-    let whole = key.rsplit_once('.').map(|(whole, _)| whole);
-    let of = |table: &Table| whole.and_then(|whole| lookup(table, whole)).and_then(Value::as_table).cloned();
-    if of(base).is_some_and(|free| free.is_empty())
-        && let (Some(others), Some((section, name))) = (of(merged), whole.and_then(|whole| whole.split_once('.')))
-        && let Some(Value::Table(own)) = table.get_mut(section).and_then(|section| section.get_mut(name))
-    {
-        let given = std::mem::replace(own, others);
-        own.extend(given);
-    }
-    table
-}
-
-fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
-    let (first, rest) = key.split_once('.').unwrap_or((key, ""));
-    match (table.get(first)?, rest) {
-        (value, "") => Some(value),
-        (Value::Table(inner), rest) => lookup(inner, rest),
-        _ => None,
-    }
 }
 
 /// The maximum number of problems to report; the first ones are enough to start with.
@@ -59,74 +67,50 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             return;
         }
         let name = format!("{prefix}{key}");
-        match (base.get(key), value) {
-            (None, _) => problems.push(unknown(&name)),
-            // A plain number in place of a ramp is a constant.
-            (Some(expected), Value::Integer(_) | Value::Float(_)) if is_ramp(expected) => {
-                let parts = ["from", "to"].map(|part| (part.to_owned(), value.clone()));
-                let zeros = ["steps", AFTER].map(|part| (part.to_owned(), Value::Integer(0)));
-                let constant = Table::from_iter(parts.into_iter().chain(zeros));
-                overlay(merged, &Table::from_iter([(key.clone(), constant.into())]), base, prefix, problems);
+        let Some(expected) = base.get(key) else {
+            problems.push(unknown(&name));
+            continue;
+        };
+        if let Value::Table(expected) = expected
+            && let Some(given) = inner(expected, value)
+        {
+            let mut expected = expected.clone();
+            if is_ramp(&expected) {
+                expected.insert("after".into(), 0.into());
+            } else if expected.is_empty() {
+                // Values by names that are checked elsewhere replace the ones before.
+                merged[key] = Table::new().into();
+                expected = given.keys().map(|name| (name.clone(), 0.0.into())).collect();
             }
-            // A table of values by names that are checked elsewhere replaces the one before.
-            (Some(Value::Table(expected)), Value::Table(inner)) if expected.is_empty() => {
-                let zeros = Table::from_iter(inner.keys().map(|name| (name.clone(), Value::Float(0.0))));
-                merged.insert(key.clone(), Table::new().into());
-                let Some(Value::Table(target)) = merged.get_mut(key) else {
-                    unreachable!("the merged tables are those of the base")
-                };
-                overlay(target, inner, &zeros, &format!("{name}."), problems);
-            }
-            // A complete ramp without `after` starts at step 0, even if the default has an `after`; `to_text` relies on this.
-            (Some(of), Value::Table(whole))
-                if is_ramp(of)
-                    && !whole.contains_key(AFTER)
-                    && ["from", "to", "steps"].iter().all(|part| whole.contains_key(*part)) =>
-            {
-                let mut whole = whole.clone();
-                whole.insert(AFTER.to_owned(), Value::Integer(0));
-                overlay(merged, &Table::from_iter([(key.clone(), whole.into())]), base, prefix, problems);
-            }
-            (Some(of), Value::Table(inner)) if let Value::Table(expected) = with_all_parts(of).as_ref() => {
-                let Some(Value::Table(target)) = merged.get_mut(key) else {
-                    unreachable!("the merged tables are those of the base")
-                };
-                overlay(target, inner, expected, &format!("{name}."), problems);
-            }
-            (Some(expected), value) => match typed(expected, value) {
-                Ok(value) => drop(merged.insert(key.clone(), value)),
-                Err(rule) => problems.push(format!("{name} = {value}: must be {rule}")),
-            },
+            let target = merged[key].as_table_mut().expect("the merged tables are those of the base");
+            overlay(target, &given, &expected, &format!("{name}."), problems);
+            continue;
+        }
+        match typed(expected, value) {
+            Ok(value) => drop(merged.insert(key.clone(), value)),
+            Err(rule) => problems.push(format!("{name} = {value}: must be {rule}")),
         }
     }
 }
 
-/// The part of a ramp that the base may leave out.
-const AFTER: &str = "after";
-
-/// Returns a value of the base; a ramp with all its parts.
-fn with_all_parts(base: &Value) -> Cow<'_, Value> {
-    let mut base = Cow::Borrowed(base);
-    if is_ramp(&base)
-        && let Value::Table(ramp) = base.to_mut()
-    {
-        ramp.entry(AFTER).or_insert(Value::Integer(0));
+/// Returns what a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
+fn inner(expected: &Table, value: &Value) -> Option<Table> {
+    let constant = [("from", value.clone()), ("to", value.clone()), ("steps", 0.into())];
+    let constant = constant.into_iter().map(|(part, value)| (part.to_owned(), value)).collect();
+    let constant = number(value).filter(|_| is_ramp(expected)).map(|_| constant);
+    let mut given = value.as_table().cloned().or(constant)?;
+    // A complete ramp without `after` starts at step 0, even if the default has an `after`; `to_text` relies on this.
+    if is_ramp(expected) && ["from", "to", "steps"].iter().all(|part| given.contains_key(*part)) {
+        given.entry("after").or_insert(0.into());
     }
-    base
-}
-
-/// Returns whether this value of the base is a ramp.
-fn is_ramp(base: &Value) -> bool {
-    base.clone().try_into::<Ramp>().is_ok()
+    Some(given)
 }
 
 /// Converts `value` to the type of the base's value, or returns a description of that type.
 fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     match (expected, value) {
         (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
-        (Value::Float(_), Value::Float(_))
-        | (Value::String(_), Value::String(_))
-        | (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
+        (Value::Float(_), Value::Float(_)) | (Value::String(_), Value::String(_)) => Ok(value.clone()),
         (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(*i as f64)),
         (Value::Integer(_), Value::Integer(i)) if *i >= 0 => Ok(value.clone()),
         // Users write large numbers of steps as 1e8.
@@ -140,9 +124,10 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::Float(_), _) => Err("a number".into()),
         (Value::Integer(_), _) => Err("a whole number, not negative".into()),
         (Value::String(_), _) => Err("a string".into()),
-        (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Array(_), _) => Err(format!("an array, e.g. {expected}")),
-        (ramp, _) if is_ramp(ramp) => Err("a number, or { from = …, to = …, steps = …, after = … }".into()),
+        (Value::Table(table), _) if is_ramp(table) => {
+            Err("a number, or { from = …, to = …, steps = …, after = … }".into())
+        }
         (Value::Table(table), _) if table.is_empty() => {
             Err("a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }".into())
         }
@@ -155,22 +140,12 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
 const LONGEST_SHOWN: usize = 64;
 
 fn unknown(name: &str) -> String {
-    if name.len() > LONGEST_SHOWN {
-        let start: String = name.chars().take(LONGEST_SHOWN).collect();
-        return format!("{start}…: unknown key; configs/repose.toml lists all of them");
-    }
-    let base: Table = BASE.parse().expect("the built-in configuration is TOML");
-    let mut known = Vec::new();
-    for (section, keys) in &base {
-        known.push(section.clone());
-        if let Value::Table(keys) = keys {
-            known.extend(keys.keys().map(|key| format!("{section}.{key}")));
-        }
-    }
     // A section is never suggested for a setting.
-    let alike = known.iter().map(String::as_str).filter(|candidate| candidate.contains('.') || !name.contains('.'));
-    match similar(name, alike, '.').first() {
-        Some(nearest) => format!("{name}: unknown key; did you mean {nearest}?"),
-        None => format!("{name}: unknown key; configs/repose.toml lists all of them"),
-    }
+    let sections = DEFAULTS.keys().filter(|_| !name.contains('.')).cloned();
+    let known: Vec<String> = sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect();
+    let nearest = similar(name, known.iter().map(String::as_str), '.').into_iter().next();
+    let hint = nearest.map(|nearest| format!("did you mean {nearest}?"));
+    let hint = hint.unwrap_or_else(|| "configs/repose.toml lists all of them".into());
+    let cut = if name.len() > LONGEST_SHOWN { "…" } else { "" };
+    format!("{}{cut}: unknown key; {hint}", name.chars().take(LONGEST_SHOWN).collect::<String>())
 }

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 /// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. It
 /// may begin after the first step. A plain number in the settings is a constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Ramp {
     /// The value at the first step, and until the ramp begins.
     pub from: f64,

@@ -4,9 +4,10 @@ use std::f64::consts::PI;
 
 use toml::{Table, Value};
 
+use super::overlay::{is_ramp, lookup, number, settings};
 use super::settings::{Backend, Config, Precision};
 
-// The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule.
+// The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule, and so must all values by group.
 
 /// Settings that must be above 0.
 const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_eps env.success_tolerance \
@@ -14,6 +15,7 @@ const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_ep
 
 /// Settings that must be at least 0.
 const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
+    env.noise env.bias randomization.noise randomization.bias \
     randomization.cube_com randomization.gravity randomization.push training.task_reward \
     ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.away_std";
 
@@ -63,21 +65,18 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     for (key, only) in FIXED {
         rules.number(&table, key, |x| x == *only, &format!("be {only}, fixed by the layout of the task"));
     }
-    for (section, keys) in
-        table.iter().filter(|(section, _)| ["env", "training", "randomization"].contains(&section.as_str()))
-    {
-        for (key, value) in keys.as_table().into_iter().flatten() {
-            let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
-            if let Some(x) = too_large.filter(|_| key != "hold") {
-                rules.check(false, &format!("{section}.{key}"), x, &format!("be at most {LARGEST} in magnitude"));
-            }
+    let limited = ["env.", "training.", "randomization."];
+    for (key, value) in settings(&table).filter(|(key, _)| limited.iter().any(|section| key.starts_with(section))) {
+        let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
+        if let Some(x) = too_large.filter(|_| key != "training.hold") {
+            rules.check(false, &key, x, &format!("be at most {LARGEST} in magnitude"));
         }
     }
     env(config, &mut rules);
-    randomization(config, &mut rules);
+    randomization(config, &table, &mut rules);
     nets(config, &mut rules);
     learning(config, &mut rules);
-    rules.broken
+    rules.0
 }
 
 /// Returns the values of a setting that are not counts.
@@ -105,23 +104,20 @@ fn env(config: &Config, rules: &mut Rules) {
     rules.check((1.0..=1e9).contains(&steps), "env.max_episode_seconds", env.max_episode_seconds, rule);
 }
 
-fn randomization(config: &Config, rules: &mut Rules) {
-    let drawn = &config.randomization;
+fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
+    let (env, drawn) = (&config.env, &config.randomization);
     // A factor that is drawn from a range has a setting in [env], too.
-    let [all, task] =
-        [Table::try_from(drawn), Table::try_from(&config.env)].map(|of| of.expect("settings are a table"));
-    for (key, value) in &all {
+    for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice) else { continue };
         let (name, range) = (format!("randomization.{key}"), format!("[{low}, {high}]"));
         rules.check(0.0 < *low && low <= high, &name, range, "be [low, high] with 0 < low <= high");
         let scale = format!("{key}_scale");
-        let factor = task[&scale].as_float().expect("a factor");
+        let factor = table["env"][&scale].as_float().expect("a factor");
         rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
     }
     let [low, high] = drawn.delay;
     let range = format!("[{low}, {high}]");
     rules.check(low <= high, "randomization.delay", &range, "be [low, high] with low <= high");
-    let env = &config.env;
     let steps = if env.max_episode_seconds >= env.ctrl_dt { env.max_episode_steps() } else { u32::MAX };
     let rule = format!("be shorter than an episode, which lasts {steps} steps");
     rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, &rule);
@@ -130,15 +126,6 @@ fn randomization(config: &Config, rules: &mut Rules) {
     rules.check(high == 0 || longest < steps, "randomization.delay", &range, &rule);
     let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
     rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, &rule);
-    let tables = [("env", &env.noise, &env.bias), ("randomization", &drawn.noise, &drawn.bias)];
-    for (section, noise, bias) in tables {
-        for (name, table) in [("noise", noise), ("bias", bias)] {
-            let negative = table.iter().find(|(_, value)| **value < 0.0);
-            if let Some((group, value)) = negative {
-                rules.check(false, &format!("{section}.{name}.{group}"), value, "not be negative");
-            }
-        }
-    }
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
@@ -164,8 +151,7 @@ fn learning(config: &Config, rules: &mut Rules) {
     let (key, parts) =
         if by_size { ("ppo.minibatch_size", ppo.minibatch_size) } else { ("ppo.minibatches", ppo.minibatches) };
     let divides = parts == 0 || samples.is_multiple_of(parts);
-    let rule = format!("divide num_envs * horizon = {samples}");
-    rules.check(divides, key, parts, &rule);
+    rules.check(divides, key, parts, &format!("divide num_envs * horizon = {samples}"));
     let shards = config.run.shards;
     let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
@@ -183,39 +169,36 @@ fn learning(config: &Config, rules: &mut Rules) {
     rules.check(within, "ppo.learning_rate", ppo.learning_rate, &rule);
     rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "be [low, high] with 0 < low <= high");
     let [near, far] = ppo.away_range;
-    rules.check(
-        0.0 <= near && near < far,
-        "ppo.away_range",
-        format!("[{near}, {far}]"),
-        "be [near, far] with 0 <= near < far",
-    );
+    let range = format!("[{near}, {far}]");
+    rules.check(0.0 <= near && near < far, "ppo.away_range", range, "be [near, far] with 0 <= near < far");
 }
 
 /// The rules that were broken.
 #[derive(Default)]
-struct Rules {
-    broken: Vec<String>,
-}
+struct Rules(Vec<String>);
 
 impl Rules {
     fn check(&mut self, holds: bool, key: &str, value: impl std::fmt::Display, rule: &str) {
         if !holds {
-            self.broken.push(format!("{key} = {value}: must {rule}"));
+            self.0.push(format!("{key} = {value}: must {rule}"));
         }
     }
 
-    /// Checks a number, or both ends of a ramp; a constant is checked once.
+    /// Checks a number, both ends of a ramp, or the numbers of all groups; a ramp that is constant is checked once.
     fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: &str) {
-        let (section, name) = key.split_once('.').expect("a key is in a section");
-        let value = &table[section][name];
-        let number = |value: &Value| value.as_float().or(value.as_integer().map(|x| x as f64)).expect("a number");
-        let ends = match value.as_table() {
-            Some(ramp) if ramp["from"] == ramp["to"] => vec![(key.to_owned(), &ramp["to"])],
-            Some(ramp) => ["from", "to"].map(|end| (format!("{key}.{end}"), &ramp[end])).into(),
+        let value = lookup(table, key).expect("a setting");
+        let numbers = match value.as_table() {
+            Some(ramp) if is_ramp(ramp) && ramp.get("to") == ramp.get("from") => vec![(key.to_owned(), &ramp["to"])],
+            // The other parts of a ramp are counts of steps.
+            Some(parts) => {
+                let parts = parts.iter().filter(|(_, value)| value.is_float());
+                parts.map(|(part, value)| (format!("{key}.{part}"), value)).collect()
+            }
             None => vec![(key.to_owned(), value)],
         };
-        for (name, value) in ends {
-            self.check(holds(number(value)), &name, number(value), rule);
+        for (name, value) in numbers {
+            let x = number(value).expect("a number");
+            self.check(holds(x), &name, x, rule);
         }
     }
 }

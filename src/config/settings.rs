@@ -1,5 +1,7 @@
 //! The settings as types; `configs/repose.toml` documents the meaning and the unit of each key.
 
+#![expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
+
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -13,7 +15,6 @@ pub const BUILTIN_MODEL: &str = "builtin";
 
 /// The whole configuration of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Config {
     /// The task and its physics.
     pub env: EnvConfig,
@@ -28,9 +29,7 @@ pub struct Config {
 }
 
 /// The task.
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct EnvConfig {
     pub num_envs: usize,
     pub model: String,
@@ -85,9 +84,7 @@ pub enum SuccessHold {
 }
 
 /// Settings that only training uses.
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct TrainingConfig {
     pub task_reward: Ramp,
     pub progress_reward: f64,
@@ -100,9 +97,7 @@ pub struct TrainingConfig {
 }
 
 /// Random physics, noise and delays of a share of the episodes of a training. Intervals are [low, high].
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct RandomizationConfig {
     pub share: Ramp,
     pub each: f64,
@@ -123,9 +118,7 @@ pub struct RandomizationConfig {
 }
 
 /// The learner.
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct PpoConfig {
     pub horizon: Ramp,
     pub epochs: usize,
@@ -153,7 +146,6 @@ pub struct PpoConfig {
 }
 
 /// The activation function after each hidden layer.
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
@@ -195,9 +187,7 @@ pub enum Precision {
 }
 
 /// The run: length, checkpoints, evaluations, seed, threads.
-#[expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct RunConfig {
     pub total_steps: u64,
     pub checkpoint_every: u64,
@@ -210,7 +200,7 @@ pub struct RunConfig {
 }
 
 /// The settings of a learner that its policy keeps for life.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct NetConfig {
     /// The sizes of the hidden layers, the same for actor and critic.
     pub hidden: Vec<usize>,

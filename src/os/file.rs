@@ -1,7 +1,7 @@
 //! Reading whole files, and checking which file a path names.
 
 use std::fs::{self, File};
-use std::io::Read;
+use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
@@ -13,15 +13,29 @@ const LARGEST_TEXT: u64 = 1 << 20;
 /// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 hands take less.
 const LARGEST_BYTES: u64 = 1 << 30;
 
+/// An operation on a file or folder, whose error says what could not be done.
+pub trait Cannot<T> {
+    /// Says that one cannot `do_what` with `path`.
+    ///
+    /// # Errors
+    /// Fails if the operation has failed.
+    fn cannot(self, do_what: &str, path: &Path) -> Result<T>;
+}
+
+impl<T> Cannot<T> for io::Result<T> {
+    fn cannot(self, do_what: &str, path: &Path) -> Result<T> {
+        self.with_context(|| format!("cannot {do_what} {}", path.display()))
+    }
+}
+
 /// Reads the text of a file.
 ///
 /// # Errors
 /// Fails if the file cannot be read, is not UTF-8, or is too large for a configuration.
 pub fn read_text(path: &Path) -> Result<String> {
-    let context = || format!("cannot read {}", path.display());
     let mut text = String::new();
-    let file = File::open(path).with_context(context)?;
-    file.take(LARGEST_TEXT + 1).read_to_string(&mut text).with_context(context)?;
+    let file = File::open(path).cannot("read", path)?;
+    file.take(LARGEST_TEXT + 1).read_to_string(&mut text).cannot("read", path)?;
     ensure!(text.len() as u64 <= LARGEST_TEXT, "{}: larger than {LARGEST_TEXT} bytes", path.display());
     Ok(text)
 }
@@ -31,13 +45,12 @@ pub fn read_text(path: &Path) -> Result<String> {
 /// # Errors
 /// Fails if the file cannot be read, is not a regular file, or is larger than any file of this program.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    let context = || format!("cannot read {}", path.display());
-    let facts = fs::metadata(path).with_context(context)?;
+    let facts = fs::metadata(path).cannot("read", path)?;
     ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
     let size = facts.len();
     ensure!(size <= LARGEST_BYTES, "{}: {size} bytes is larger than any file of this program", path.display());
     let mut bytes = Vec::with_capacity(size as usize);
-    File::open(path).and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes)).with_context(context)?;
+    File::open(path).and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes)).cannot("read", path)?;
     Ok(bytes)
 }
 
@@ -46,8 +59,7 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
 /// # Errors
 /// Fails if it does not.
 pub fn expect_named(path: &Path, file: &File) -> Result<()> {
-    let context = || format!("cannot find {}", path.display());
-    let [named, held] = [fs::metadata(path).with_context(context)?, file.metadata().with_context(context)?];
+    let [named, held] = [fs::metadata(path).cannot("find", path)?, file.metadata().cannot("find", path)?];
     let same = (named.dev(), named.ino()) == (held.dev(), held.ino());
     ensure!(same, "{} has been replaced", path.display());
     Ok(())

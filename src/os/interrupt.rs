@@ -12,6 +12,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGXFSZ};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::{emulate_default_handler, exit};
 
+use super::machine::process_status;
 use super::output::remove_unfinished;
 use super::pip;
 
@@ -50,10 +51,10 @@ impl Requests {
     /// Fails if the system refuses a handler or a thread.
     pub fn listen(saves: bool) -> Result<Self> {
         let requests = Self::none();
-        let mut caught = vec![SIGINT, SIGTERM, SIGHUP];
-        caught.extend(saves.then_some(SIGUSR1));
-        let ignored = ignored();
-        caught.retain(|signal| ignored >> (signal - 1) & 1 == 0);
+        // The bits of the signals that were ignored when the program started.
+        let ignored = u64::from_str_radix(&process_status("SigIgn:"), 16).unwrap_or(0);
+        let caught = [SIGINT, SIGTERM, SIGHUP].into_iter().chain(saves.then_some(SIGUSR1));
+        let caught = caught.filter(|signal| ignored >> (signal - 1) & 1 == 0);
         signal_hook::flag::register(SIGXFSZ, Arc::default()).context("cannot catch signals")?;
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
@@ -103,11 +104,6 @@ impl Requests {
         self.signal.load(Ordering::Relaxed)
     }
 
-    /// Returns the exit code for the cause of the stop.
-    pub fn exit_code(&self) -> ExitCode {
-        exit_code(self.signal())
-    }
-
     /// Requests a stop when the program has listened for this time.
     ///
     /// # Errors
@@ -130,11 +126,4 @@ impl Requests {
 /// Returns the exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.
 pub fn exit_code(signal: i32) -> ExitCode {
     if signal == 0 { ExitCode::SUCCESS } else { ExitCode::from(128 + signal as u8) }
-}
-
-/// Returns the signals that were ignored when the program started, as bits. They stay ignored, as the caller intended.
-fn ignored() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0)
 }

@@ -5,9 +5,9 @@ use std::io::Read;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 
-use super::file::expect_named;
+use super::file::{Cannot, expect_named};
 use super::output::Unfinished;
 
 /// The name of the lock file.
@@ -28,20 +28,14 @@ impl Locked {
     /// Fails if another training process uses the folder, or if it cannot be written to.
     pub fn acquire(folder: &Path) -> Result<Self> {
         let path = folder.join(LOCK);
-        let context = || format!("cannot write {}", path.display());
-        fs::create_dir_all(folder).with_context(context)?;
-        let file =
-            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).with_context(context)?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let mut holder = String::new();
-                let _ = file.take(100).read_to_string(&mut holder);
-                bail!("{} is being trained in by another program{holder}", folder.display());
-            }
-            // Some network file systems do not support locks. The folder is then used without one.
-            Err(TryLockError::Error(_)) => {}
+        let open = |()| OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
+        let file = fs::create_dir_all(folder).and_then(open).cannot("write", &path)?;
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+            let mut holder = String::new();
+            let _ = file.take(100).read_to_string(&mut holder);
+            bail!("{} is being trained in by another program{holder}", folder.display());
         }
+        // Some network file systems do not support locks. The folder is then used without one.
         Ok(Self { path, file })
     }
 
@@ -52,12 +46,10 @@ impl Locked {
     /// Fails if the folder cannot be written to.
     pub fn sign(mut self) -> Result<Self> {
         if self.file.metadata().is_ok_and(|facts| facts.nlink() > 1) {
-            let context = || format!("cannot write {}", self.path.display());
             let own = Unfinished::beside(&self.path);
-            let file =
-                OpenOptions::new().read(true).write(true).create_new(true).open(own.path()).with_context(context)?;
+            let file = File::create_new(&own.path).cannot("write", &self.path)?;
             let _ = file.try_lock();
-            fs::rename(own.path(), &self.path).with_context(context)?;
+            fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
         // Best effort: tells others who holds the lock.

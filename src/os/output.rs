@@ -4,23 +4,20 @@
 
 use std::collections::BTreeSet;
 use std::collections::hash_map::RandomState;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, DirEntry, File, OpenOptions};
 use std::hash::{BuildHasher, Hasher};
 use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Result, bail, ensure};
 
-use super::file::read_bytes;
+use super::file::{Cannot, expect_named, read_bytes};
 use super::quoted_path;
 
-/// The extension of a file that is not complete yet.
-pub const PARTIAL: &str = "partial";
-
-/// The prefix of its name, followed by the process id.
+/// The prefix of the name of a file that is not complete yet, followed by the process id.
 pub const OUR_PARTIAL: &str = ".shadow-repose-";
 
 /// The most consecutive symbolic links that are followed.
@@ -31,27 +28,18 @@ static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
 /// A file or folder that is removed when this is dropped or when a signal ends the program, unless it has been renamed by then.
 #[derive(Debug)]
-pub struct Unfinished {
-    path: PathBuf,
+pub(super) struct Unfinished {
+    pub(super) path: PathBuf,
 }
 
 impl Unfinished {
-    /// Registers a path where something is about to be created.
-    pub fn new(path: PathBuf) -> Self {
-        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
-        Self { path }
-    }
-
-    /// Registers a unique name in the same folder as the final `path`.
-    pub fn beside(path: &Path) -> Self {
+    /// Registers a unique name in the same folder as the final `path`, where something is about to be created.
+    pub(super) fn beside(path: &Path) -> Self {
         // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
-        Self::new(folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.{PARTIAL}", std::process::id())))
-    }
-
-    /// Returns its path.
-    pub fn path(&self) -> &Path {
-        &self.path
+        let path = folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.partial", std::process::id()));
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
+        Self { path }
     }
 }
 
@@ -75,10 +63,11 @@ fn remove(path: &Path) {
     let _ = fs::remove_dir_all(path);
 }
 
-/// Whether a name is that of an unfinished file whose process has ended.
-pub fn is_abandoned(name: &str) -> bool {
-    let rest = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
-    rest.is_some_and(|(process, _)| !Path::new("/proc").join(process).exists())
+/// Whether a file or folder is an unfinished one whose process has ended.
+pub fn is_abandoned(entry: &DirEntry) -> bool {
+    let name = entry.file_name().to_string_lossy().into_owned();
+    let process = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
+    process.is_some_and(|(id, rest)| rest.ends_with(".partial") && !Path::new("/proc").join(id).exists())
 }
 
 /// A file to be written, at a path that is known to be writable. Devices and pipes are written to directly.
@@ -98,25 +87,23 @@ impl OutputFile {
     /// # Errors
     /// Fails if the path cannot be written to. If its folder does not exist, the message says how to create it.
     pub fn create(path: &Path) -> Result<Self> {
-        let context = || format!("cannot write {}", path.display());
         let direct = |file: File| Self { path: path.to_owned(), file, names: None };
         match fs::metadata(path) {
             Ok(facts) if facts.is_dir() => bail!("cannot write {}: it is a folder", path.display()),
             Ok(facts) if !facts.is_file() => {
-                return OpenOptions::new().write(true).open(path).map(direct).with_context(context);
+                return OpenOptions::new().write(true).open(path).map(direct).cannot("write", path);
             }
             // A link to a stream of this process, such as /dev/stdout: both share a file offset, so neither overwrites the other.
-            Ok(facts) if path.is_symlink() => {
-                let (out, err) = (io::stdout(), io::stderr());
-                for stream in [out.as_fd(), err.as_fd()] {
-                    if is_open(stream, &facts) {
-                        return stream.try_clone_to_owned().map(|file| direct(file.into())).with_context(context);
-                    }
+            Ok(_) if path.is_symlink() => {
+                let streams = [io::stdout().as_fd().try_clone_to_owned(), io::stderr().as_fd().try_clone_to_owned()];
+                let mut streams = streams.into_iter().flatten().map(File::from);
+                if let Some(stream) = streams.find(|stream| expect_named(path, stream).is_ok()) {
+                    return Ok(direct(stream));
                 }
             }
             _ => {}
         }
-        Self::named(path, end_of_links(path).with_context(context)?)
+        Self::named(path, end_of_links(path).cannot("write", path)?)
     }
 
     /// Opens a path of the program's own. Whatever has this name is replaced, even a symbolic link.
@@ -130,7 +117,7 @@ impl OutputFile {
     fn named(path: &Path, target: PathBuf) -> Result<Self> {
         expect_folder(&target)?;
         let unfinished = Unfinished::beside(&target);
-        let file = File::create_new(unfinished.path()).with_context(|| format!("cannot write {}", path.display()))?;
+        let file = File::create_new(&unfinished.path).cannot("write", path)?;
         Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) })
     }
 
@@ -139,8 +126,7 @@ impl OutputFile {
     /// # Errors
     /// Fails if the file cannot be written.
     pub fn finish(mut self, bytes: &[u8]) -> Result<()> {
-        let written = self.file.write_all(bytes);
-        written.with_context(|| format!("cannot write {}", self.path.display()))?;
+        self.file.write_all(bytes).cannot("write", &self.path)?;
         self.complete()
     }
 
@@ -149,15 +135,9 @@ impl OutputFile {
     /// # Errors
     /// Fails if the file cannot be written.
     pub fn complete(self) -> Result<()> {
-        let complete = || {
-            if let Some((unfinished, target)) = &self.names {
-                self.file.sync_all()?;
-                fs::rename(unfinished.path(), target)?;
-                sync_folder(target)?;
-            }
-            Ok::<(), io::Error>(())
-        };
-        complete().with_context(|| format!("cannot write {}", self.path.display()))
+        let Some((unfinished, target)) = &self.names else { return Ok(()) };
+        let named = self.file.sync_all().and_then(|()| fs::rename(&unfinished.path, target));
+        named.and_then(|()| sync_folder(target)).cannot("write", &self.path)
     }
 
     /// Returns the path as the user gave it.
@@ -190,11 +170,11 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
 /// Fails if the second name cannot be created.
 pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     let unfinished = Unfinished::beside(name);
-    if fs::hard_link(path, unfinished.path()).is_err() {
+    if fs::hard_link(path, &unfinished.path).is_err() {
         return write_whole(name, &read_bytes(path)?);
     }
-    let named = fs::rename(unfinished.path(), name).and_then(|()| sync_folder(name));
-    named.with_context(|| format!("cannot write {}", name.display()))
+    let named = fs::rename(&unfinished.path, name).and_then(|()| sync_folder(name));
+    named.cannot("write", name)
 }
 
 /// Syncs the folder of a new file: the name of the file is on the disk only once its folder is.
@@ -209,8 +189,17 @@ pub fn sync_folder(path: &Path) -> io::Result<()> {
     }
 }
 
+/// Gives a file another extension, and a number before it if that name is taken; returns the new path.
+///
+/// # Errors
+/// Fails if the file cannot be renamed.
+pub fn put_aside(path: &Path, extension: &str) -> io::Result<PathBuf> {
+    let aside = unused_name(&path.with_extension(extension));
+    fs::rename(path, &aside).map(|()| aside)
+}
+
 /// Returns `path`, or a numbered variant of it, that does not exist yet.
-pub fn unused_name(path: &Path) -> PathBuf {
+fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
     let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
@@ -225,9 +214,9 @@ pub fn unused_name(path: &Path) -> PathBuf {
 pub fn make_own(path: &Path) -> io::Result<()> {
     if fs::metadata(path).is_ok_and(|facts| facts.nlink() > 1) {
         let copy = Unfinished::beside(path);
-        fs::copy(path, copy.path())?;
-        File::open(copy.path())?.sync_all()?;
-        fs::rename(copy.path(), path)?;
+        fs::copy(path, &copy.path)?;
+        File::open(&copy.path)?.sync_all()?;
+        fs::rename(&copy.path, path)?;
     }
     Ok(())
 }
@@ -262,12 +251,6 @@ fn end_of_links(path: &Path) -> io::Result<PathBuf> {
         }
     }
     Err(io::Error::other("too many levels of symbolic links"))
-}
-
-/// Whether a stream of this process writes to the file with this metadata.
-fn is_open(stream: BorrowedFd, facts: &fs::Metadata) -> bool {
-    let open = stream.try_clone_to_owned().and_then(|own| File::from(own).metadata());
-    open.is_ok_and(|open| (open.dev(), open.ino()) == (facts.dev(), facts.ino()))
 }
 
 impl Write for OutputFile {
@@ -395,9 +378,14 @@ mod tests {
 
     #[test]
     fn what_a_process_left_unfinished_is_known_once_it_has_ended() {
-        assert!(is_abandoned(".shadow-repose-999999999-0.partial"));
-        assert!(!is_abandoned(&format!(".shadow-repose-{}-0.partial", std::process::id())));
-        assert!(!is_abandoned("film.gif.partial"));
+        let place = tempfile::tempdir().unwrap();
+        let living = format!(".shadow-repose-{}-0.partial", std::process::id());
+        for name in [".shadow-repose-999999999-0.partial", &living, "film.gif.partial", ".shadow-repose-999999999-0"] {
+            fs::write(place.path().join(name), "").unwrap();
+        }
+        let abandoned = fs::read_dir(place.path()).unwrap().flatten().filter(is_abandoned);
+        let names: Vec<_> = abandoned.map(|entry| entry.file_name()).collect();
+        assert_eq!(names, [".shadow-repose-999999999-0.partial"]);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Fetches wheels with pip, by package name and hash. The build script includes this file too, so it uses only the standard
 //! library.
 
+use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -21,22 +22,12 @@ pub(crate) fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder
     let requirement = folder.join("requirement.txt");
     fs::write(&requirement, format!("{package} --hash=sha256:{hash}\n")).map_err(told)?;
     let pip = "-m pip download --quiet --disable-pip-version-check --retries 2 --no-deps --only-binary=:all: --require-hashes";
-    python(
-        Command::new("python3")
-            .args(pip.split_whitespace())
-            .args(selection)
-            .arg("-r")
-            .arg(&requirement)
-            .arg("-d")
-            .arg(folder),
-    )?;
-    let wheel = fs::read_dir(folder)
-        .map_err(told)?
-        .flatten()
-        .map(|entry| entry.path())
-        .find(|path| path.extension().is_some_and(|e| e == "whl"))
-        .ok_or("pip reported success but left no wheel")?;
-    python(Command::new("python3").args(["-m", "zipfile", "-e"]).arg(&wheel).arg(folder))
+    let places = ["-r".as_ref(), requirement.as_os_str(), "-d".as_ref(), folder.as_os_str()];
+    python(pip.split_whitespace().chain(selection.iter().copied()).map(OsStr::new).chain(places))?;
+    let mut found = fs::read_dir(folder).map_err(told)?.flatten().map(|entry| entry.path());
+    let wheel = found.find(|path| path.extension().is_some_and(|e| e == "whl"));
+    let wheel = wheel.ok_or("pip reported success but left no wheel")?;
+    python(["-m".as_ref(), "zipfile".as_ref(), "-e".as_ref(), wheel.as_os_str(), folder.as_os_str()])
 }
 
 /// The id of the running process, or 0. It leads its own process group, since python3 may be a script that starts another one.
@@ -51,9 +42,11 @@ pub(crate) fn stop() {
     }
 }
 
-fn python(command: &mut Command) -> Result<(), String> {
+/// Runs python3 with these arguments.
+fn python<'a>(args: impl IntoIterator<Item = &'a OsStr>) -> Result<(), String> {
     let told = |e: io::Error| format!("python3 could not be started ({e})");
-    let child = command
+    let child = Command::new("python3")
+        .args(args)
         .process_group(0)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -68,7 +61,6 @@ fn python(command: &mut Command) -> Result<(), String> {
         return Ok(());
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let last: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).rev().take(3).collect();
-    let last: Vec<&str> = last.into_iter().rev().collect();
-    Err(format!("python3 failed: {}", last.join(" / ")))
+    let lines: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).collect();
+    Err(format!("python3 failed: {}", lines[lines.len().saturating_sub(3)..].join(" / ")))
 }

@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use console::Term;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
 use super::say;
 
@@ -49,7 +49,10 @@ pub struct StatusLine {
 impl StatusLine {
     /// Creates the line of a training run that has made `env_steps` of its steps. If `quiet`, no progress is shown.
     pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
-        let bar = (!quiet && is_drawn_on()).then(|| {
+        // A line can be redrawn in place on a terminal that is wide enough.
+        let dumb = std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb");
+        let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
+        let bar = (!quiet && std::io::stderr().is_terminal() && !dumb && wide).then(|| {
             // Cuts off what does not fit, even after the terminal is resized.
             let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
             let bar = ProgressBar::no_length().with_style(style);
@@ -93,6 +96,11 @@ impl StatusLine {
         }
     }
 
+    /// Prints a warning above the progress line.
+    pub fn warn(&self, text: &str) {
+        self.say(&format!("warning: {text}"));
+    }
+
     /// Ends the line and leaves it on the terminal.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
@@ -101,13 +109,6 @@ impl StatusLine {
             say("");
         }
     }
-}
-
-/// Whether stderr is a terminal on which a line can be redrawn in place.
-fn is_drawn_on() -> bool {
-    let dumb = std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb");
-    let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
-    std::io::stderr().is_terminal() && !dumb && wide
 }
 
 impl Status {
@@ -159,39 +160,15 @@ impl Status {
     }
 }
 
-/// The progress bar of a job with many items; shown on a terminal only.
-pub struct Bar {
-    bar: ProgressBar,
-}
+/// The progress bar of a job with many items.
+pub type Bar = ProgressBar;
 
-impl Bar {
-    /// Creates a bar at zero of `total` items, e.g. frames; `job` says which of several it is, e.g. which policy plays.
-    pub fn new(total: u64, items: &str, job: &str) -> Self {
-        let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");
-        let style = ProgressStyle::with_template(&style).expect("the template is valid");
-        Self { bar: ProgressBar::new(total).with_style(style.progress_chars("=> ")) }
-    }
-
-    /// Counts one item.
-    pub fn count(&self) {
-        self.bar.inc(1);
-    }
-
-    /// Reduces the total by the number of items that will not come.
-    pub fn shorten(&self, by: u64) {
-        self.bar.dec_length(by);
-    }
-
-    /// Shows a message beside the bar.
-    pub fn say(&self, message: String) {
-        self.bar.set_message(message);
-    }
-}
-
-impl Drop for Bar {
-    fn drop(&mut self) {
-        self.bar.finish_and_clear();
-    }
+/// Returns the progress bar of a job, at zero of `total` items, e.g. frames. It is shown on a terminal only, until it is dropped.
+/// `job` says which of several it is, e.g. which policy plays.
+pub fn progress_bar(total: u64, items: &str, job: &str) -> Bar {
+    let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");
+    let style = ProgressStyle::with_template(&style).expect("the template is valid").progress_chars("=> ");
+    ProgressBar::new(total).with_style(style).with_finish(ProgressFinish::AndClear)
 }
 
 #[cfg(test)]

@@ -3,20 +3,11 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 
-use crate::os::same_file;
-use crate::os::{name_also, sync_folder, unused_name, write_whole};
-
-const LATEST: &str = "latest.safetensors";
-const BEST: &str = "best.safetensors";
-
-/// The extension of a later checkpoint that was set aside.
-const LATER: &str = "later";
-
-/// The extension of a damaged best checkpoint that was set aside.
-const DAMAGED: &str = "damaged";
+use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
 
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
@@ -36,12 +27,12 @@ impl Checkpoints {
 
     /// Returns the path of the newest checkpoint.
     pub fn latest(&self) -> PathBuf {
-        self.folder.join(LATEST)
+        self.folder.join("latest.safetensors")
     }
 
     /// Returns the path of the checkpoint that scored best.
     pub fn best(&self) -> PathBuf {
-        self.folder.join(BEST)
+        self.folder.join("best.safetensors")
     }
 
     fn path_of(&self, iteration: u64) -> PathBuf {
@@ -60,15 +51,9 @@ impl Checkpoints {
         // Later checkpoints exist if the run was resumed from an earlier one. They must not be resumed from, since the logs
         // continue from here, but users who gave the wrong file can still recover them.
         let (later, earlier): (Vec<_>, Vec<_>) = self.numbered().into_iter().partition(|(of, _)| *of > iteration);
-        for (_, path) in earlier.into_iter().skip(keep) {
-            // Best effort: one checkpoint too many is harmless.
-            let _ = fs::remove_file(path);
-        }
-        for (_, path) in later {
-            let aside = unused_name(&path.with_extension(LATER));
-            fs::rename(&path, &aside).with_context(|| format!("cannot rename {}", path.display()))?;
-        }
-        Ok(())
+        // Best effort: one checkpoint too many is harmless.
+        earlier.iter().skip(keep).for_each(|(_, path)| drop(fs::remove_file(path)));
+        later.iter().try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
     }
 
     /// Writes the checkpoint that scored best.
@@ -85,14 +70,11 @@ impl Checkpoints {
     /// # Errors
     /// Fails if the file cannot be renamed.
     pub fn put_best_aside(&self) -> Result<PathBuf> {
-        let aside = unused_name(&self.best().with_extension(DAMAGED));
-        fs::rename(self.best(), &aside).with_context(|| format!("cannot rename {}", self.best().display()))?;
-        Ok(aside)
+        put_aside(&self.best(), "damaged").cannot("rename", &self.best())
     }
 
     pub(super) fn create_folder(&self) -> Result<()> {
-        let created = fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder));
-        created.with_context(|| format!("cannot create {}", self.folder.display()))
+        fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder)).cannot("create", &self.folder)
     }
 
     /// Returns all checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
@@ -102,8 +84,7 @@ impl Checkpoints {
         let mut found: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
         let latest = self.latest();
         if latest.exists() && !found.iter().any(|path| same_file(path, &latest)) {
-            let written = |path: &PathBuf| fs::metadata(path).and_then(|facts| facts.modified()).ok();
-            let newer = found.first().is_none_or(|newest| written(&latest) >= written(newest));
+            let newer = found.first().is_none_or(|newest| modified(&latest) >= modified(newest));
             found.insert(if newer { 0 } else { found.len() }, latest);
         }
         found
@@ -132,6 +113,11 @@ impl Checkpoints {
     pub(super) fn begun(&self) -> bool {
         self.best().exists() || !self.newest_first().is_empty()
     }
+}
+
+/// Returns the time when a file was written, if it is there.
+pub(super) fn modified(path: &Path) -> Option<SystemTime> {
+    fs::metadata(path).and_then(|facts| facts.modified()).ok()
 }
 
 #[cfg(test)]

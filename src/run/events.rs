@@ -1,20 +1,19 @@
 //! TensorBoard event files, written with those parts of tensorboard-rs that return errors.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{BufReader, BufWriter, ErrorKind};
+use std::io::{BufReader, BufWriter};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use protobuf::Message;
-use tensorboard_proto::event::{Event, SessionLog, SessionLog_SessionStatus};
-use tensorboard_proto::summary::Summary;
+use tensorboard_proto::event::{Event, Event_oneof_what as What, SessionLog, SessionLog_SessionStatus};
+use tensorboard_proto::summary::{Summary, Summary_Value_oneof_value as Content};
 use tensorboard_rs::record_writer::RecordWriter;
 
 use super::records::length_up_to;
-use super::summary::{Media, Summaries, Tag};
-use crate::os::expect_named;
-use crate::os::{make_own, sync_folder};
+use super::summary::{Descriptions, Media, image, markdown, value};
+use crate::os::{Cannot, expect_named, make_own, sync_folder};
 
 /// The prefix and the suffix of the names of event files.
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
@@ -22,10 +21,9 @@ const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
 /// An event file being written.
 pub(super) struct EventFile {
     path: PathBuf,
-    /// The file that `writer` writes to.
     file: File,
-    writer: RecordWriter<BufWriter<File>>,
-    summaries: Summaries,
+    /// The descriptions of the tags that have no value in the file yet.
+    undescribed: Descriptions,
 }
 
 /// The tag of the settings.
@@ -37,42 +35,23 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn create(folder: &Path, first_step: u64, tags: &[Tag], settings: &str) -> Result<Self> {
+    pub(super) fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
-        let mut seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
-        let (path, file) = loop {
-            let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
-            match File::create_new(&path) {
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => seconds += 1,
-                file => break (path.clone(), file.with_context(|| format!("cannot create {}", path.display()))?),
-            }
-        };
-        let writer = RecordWriter::new(BufWriter::new(file.try_clone()?));
-        let mut events = Self { path, file, writer, summaries: Summaries::new(tags) };
-        match events.begin(first_step, settings).and_then(|()| Ok(sync_folder(&events.path)?)) {
-            Ok(()) => Ok(events),
-            Err(error) => {
-                let _ = fs::remove_file(&events.path);
-                Err(error)
-            }
-        }
+        let seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
+        let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
+        let file = File::create_new(&path).cannot("create", &path)?;
+        let mut events = Self { path, file, undescribed: tags.clone() };
+        let begun = events.begin(first_step, settings).and_then(|()| Ok(sync_folder(&events.path)?));
+        begun.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
     }
 
     fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
-        let mut version = Event::new();
-        version.set_file_version("brain.Event:2".into());
-        self.write(version, 0)?;
-        let mut start = Event::new();
-        let mut session = SessionLog::new();
-        session.set_status(SessionLog_SessionStatus::START);
-        start.set_session_log(session);
-        self.write(start, first_step)?;
-        if settings.is_empty() {
-            return Ok(());
-        }
-        let settings = self.summaries.of_text(SETTINGS, &format!("```\n{settings}\n```\n"));
-        self.summary(settings, first_step)
+        self.write(What::file_version("brain.Event:2".into()), 0)?;
+        let session = SessionLog { status: SessionLog_SessionStatus::START, ..SessionLog::default() };
+        self.write(What::session_log(session), first_step)?;
+        let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
+        self.summary([(SETTINGS, settings)].into_iter(), first_step)
     }
 
     /// Adds the values of one step and flushes. `NaN` values are left out.
@@ -80,22 +59,22 @@ impl EventFile {
     /// # Errors
     /// Fails if the file cannot be written.
     pub(super) fn iteration(&mut self, step: u64, values: &[(impl AsRef<str>, f64)], figures: &Media) -> Result<()> {
-        let summary = self.summaries.of_iteration(values, figures);
-        self.summary(summary, step)
+        let numbers = values.iter().filter(|(_, number)| !number.is_nan());
+        let numbers = numbers.map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
+        let histograms = figures.histograms.iter().map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
+        let film = figures.film.iter().map(|(tag, film)| (*tag, Content::image(image(film))));
+        self.summary(numbers.chain(histograms).chain(film), step)
     }
 
-    fn summary(&mut self, summary: Summary, step: u64) -> Result<()> {
-        let mut event = Event::new();
-        event.set_summary(summary);
-        self.write(event, step)
+    fn summary<'a>(&mut self, values: impl Iterator<Item = (&'a str, Content)>, step: u64) -> Result<()> {
+        let value = values.map(|(tag, content)| value(tag, content, self.undescribed.remove(tag))).collect();
+        self.write(What::summary(Summary { value, ..Summary::default() }), step)
     }
 
-    fn write(&mut self, mut event: Event, step: u64) -> Result<()> {
-        event.set_wall_time(now());
-        event.set_step(step as i64);
-        let bytes = event.write_to_bytes()?;
-        let written = self.writer.write(&bytes).and_then(|()| self.writer.flush());
-        written.with_context(|| format!("cannot write {}", self.path.display()))
+    fn write(&self, what: What, step: u64) -> Result<()> {
+        let event = Event { wall_time: now(), step: step as i64, what: Some(what), ..Event::default() };
+        let (bytes, mut writer) = (event.write_to_bytes()?, RecordWriter::new(BufWriter::new(&self.file)));
+        writer.write(&bytes).and_then(|()| writer.flush()).cannot("write", &self.path)
     }
 
     /// Ensures that all events are on the disk, in a file that still has its name.
@@ -104,7 +83,7 @@ impl EventFile {
     /// Fails if the file cannot be written, or was deleted.
     pub(super) fn sync(&self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
-        self.file.sync_data().with_context(|| format!("cannot write {}", self.path.display()))
+        self.file.sync_data().cannot("write", &self.path)
     }
 }
 
@@ -124,7 +103,7 @@ pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
             make_own(&path)?;
             OpenOptions::new().write(true).open(&path)?.set_len(kept)
         };
-        cut().with_context(|| format!("cannot shorten {}", path.display()))?;
+        cut().cannot("shorten", &path)?;
     }
     Ok(())
 }
@@ -132,7 +111,7 @@ pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 /// Returns this program's event files in `folder`, each with the seconds in its name.
 fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
-    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+    let entries = fs::read_dir(folder).cannot("read", folder)?;
     let ours = entries.flatten().filter_map(|entry| {
         let name = entry.file_name();
         let (seconds, _) = name.to_str()?.strip_prefix(begin)?.strip_suffix(end)?.split_once('.')?;
@@ -152,7 +131,7 @@ fn now() -> f64 {
 mod tests {
     use tensorboard_proto::summary::Summary_Value;
 
-    use super::super::{Animation, Histogram};
+    use super::super::{Animation, histogram};
     use super::*;
 
     fn read(path: &Path) -> Vec<Event> {
@@ -167,9 +146,9 @@ mod tests {
     }
 
     fn create(folder: &Path, first_step: u64) -> EventFile {
-        let tags = ["reward/fall", "histogram/std", "eval/film"]
-            .map(|name| Tag { name: name.into(), description: format!("of {name}") });
-        EventFile::create(folder, first_step, &tags, "[run]\nseed = 3\n").unwrap()
+        let tags = ["reward/fall", "histogram/std", "eval/film", SETTINGS];
+        let tags = tags.map(|name| (name.to_owned(), format!("of {name}")));
+        EventFile::create(folder, first_step, &tags.into(), "[run]\nseed = 3\n").unwrap()
     }
 
     #[test]
@@ -198,7 +177,7 @@ mod tests {
     fn an_event_file_holds_its_version_the_settings_and_the_values_that_are_known_each_tag_described_once() {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 7);
-        let histograms = vec![("histogram/std", Histogram::new([0.5_f32, 1.5].iter()))];
+        let histograms = vec![("histogram/std", histogram([0.5_f32, 1.5].iter()))];
         let film = Some(("eval/film", Animation { size: [3, 2], gif: vec![1, 2] }));
         let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
         events.iteration(9, &values, &Media { histograms, film }).unwrap();

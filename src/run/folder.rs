@@ -1,17 +1,14 @@
 //! The folder of a run and its files.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, DirEntry};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::checkpoints::Checkpoints;
-use crate::os::{LOCK, Locked};
-use crate::os::{OUR_PARTIAL, PARTIAL, is_abandoned, sync_folder, write_whole};
-use crate::os::{read_text, same_file};
+use super::checkpoints::{Checkpoints, modified};
+use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";
@@ -23,17 +20,8 @@ const DIVERGED: &str = "diverged";
 /// A file with this name asks the training to stop.
 const STOP: &str = "stop";
 /// The prefixes of the names of a run's files.
-const OURS: [&[u8]; 9] = [
-    b"config.toml",
-    b"version.txt",
-    b"policy.safetensors",
-    b"run.lock",
-    b"metrics.csv",
-    b"metrics.before-",
-    b"events.out.",
-    b"checkpoints",
-    b"diverged",
-];
+const OURS: [&str; 10] =
+    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", "checkpoints", OUR_PARTIAL];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
@@ -51,14 +39,10 @@ impl RunFolder {
     /// # Errors
     /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
-        let path = match path {
-            Some(path) => path.to_owned(),
-            None => create_unused(name)?,
-        };
-        let run = Self { path };
+        let run = Self { path: path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))? };
         run.expect_free(None)?;
         let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
-        created.with_context(|| format!("cannot create the run folder {}", run.path.display()))?;
+        created.cannot("create the run folder", &run.path)?;
         let lock = run.lock()?;
         // Another training run may have started and ended in the meantime.
         run.expect_free(Some(LOCK))?;
@@ -79,7 +63,7 @@ impl RunFolder {
                 name.to_string_lossy()
             );
         }
-        let whole = std::path::absolute(&self.path).with_context(|| format!("cannot find {}", self.path.display()))?;
+        let whole = std::path::absolute(&self.path).cannot("find", &self.path)?;
         let there = whole.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self { path: path.to_owned() }) {
@@ -95,8 +79,7 @@ impl RunFolder {
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        let context = || format!("cannot create a folder in {}", std::env::temp_dir().display());
-        Ok(Self { path: folder.with_context(context)?.keep() })
+        Ok(Self { path: folder.cannot("create a folder in", &std::env::temp_dir())?.keep() })
     }
 
     /// Removes the files of a run that could not start, and its folder if nothing else is in it.
@@ -121,17 +104,14 @@ impl RunFolder {
     /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
         ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
-        let path = if place.is_dir() {
-            run_of(place)
-        } else {
-            let place = place.canonicalize().with_context(|| format!("cannot read {}", place.display()))?;
-            let run = place.parent().and_then(Path::parent);
-            match run.map(|run| (run, Checkpoints::new(run))) {
-                Some((run, checkpoints)) if place.parent() == Some(checkpoints.folder()) => run.to_owned(),
-                _ => bail!("{} does not lie in the checkpoints folder of a run", place.display()),
-            }
-        };
-        Ok(Self { path })
+        let whole = place.canonicalize().cannot("read", place)?;
+        let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
+        let run = folder.and_then(Path::parent).filter(|run| Some(Checkpoints::new(run).folder()) == folder);
+        match run {
+            Some(run) => Ok(Self { path: run.to_owned() }),
+            None if place.is_dir() => Ok(Self { path: place.to_owned() }),
+            None => bail!("{} does not lie in the checkpoints folder of a run", whole.display()),
+        }
     }
 
     /// Locks the folder against other training processes for as long as the result lives. Creates the lock file if it is
@@ -150,10 +130,8 @@ impl RunFolder {
     /// Fails if the folder cannot be written to.
     pub fn claim(&self, lock: Locked) -> Result<Locked> {
         for entry in self.entries()? {
-            let (path, name) = (entry.path(), entry.file_name());
-            let left = path.extension().is_some_and(|extension| extension == PARTIAL);
-            if left && is_abandoned(&name.to_string_lossy()) {
-                fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+            if is_abandoned(&entry) {
+                fs::remove_file(entry.path()).cannot("remove", &entry.path())?;
             }
         }
         lock.sign()
@@ -163,7 +141,7 @@ impl RunFolder {
     fn expect_plain(&self) -> Result<()> {
         for entry in self.entries()? {
             let path = entry.path();
-            let kind = entry.file_type().with_context(|| format!("cannot read {}", path.display()))?;
+            let kind = entry.file_type().cannot("read", &path)?;
             ensure!(
                 kind.is_file() || kind.is_dir(),
                 "{}: neither a file nor a folder; links in a run folder are not followed",
@@ -176,22 +154,16 @@ impl RunFolder {
     /// Returns the files of the run: those with the names of a run's files, and all in `checkpoints` and `diverged`. Other files
     /// in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
-        let begins: Vec<&[u8]> = OURS.into_iter().chain([OUR_PARTIAL.as_bytes()]).collect();
         let mut found = Vec::new();
-        for folder in [&self.path, self.checkpoints().folder(), &self.path.join(DIVERGED)] {
-            if folder.exists() {
-                let context = || format!("cannot read {}", folder.display());
-                for entry in fs::read_dir(folder).with_context(context)? {
-                    found.push(entry.with_context(context)?);
-                }
+        let folders = [self.path.clone(), self.checkpoints().folder().to_owned(), self.path.join(DIVERGED)];
+        for folder in folders.iter().filter(|folder| folder.exists()) {
+            for entry in fs::read_dir(folder).cannot("read", folder)? {
+                found.push(entry.cannot("read", folder)?);
             }
         }
-        let ours = |entry: &DirEntry| {
-            let name = entry.file_name();
-            entry.path().parent() != Some(&self.path)
-                || begins.iter().any(|begin| name.as_encoded_bytes().starts_with(begin))
-        };
-        found.retain(ours);
+        let begins = |name: &OsStr, begin: &str| name.as_encoded_bytes().starts_with(begin.as_bytes());
+        let ours = |name: &OsStr| OURS.iter().any(|begin| begins(name, begin));
+        found.retain(|entry| entry.path().parent() != Some(&self.path) || ours(&entry.file_name()));
         Ok(found)
     }
 
@@ -221,7 +193,7 @@ impl RunFolder {
     /// Fails if the folder cannot be written to.
     pub fn dump(&self, name: &str, text: &str) -> Result<()> {
         let folder = self.path.join(DIVERGED);
-        fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        fs::create_dir_all(&folder).cannot("create", &folder)?;
         if fs::read_dir(&folder).is_ok_and(|entries| entries.count() >= MOST_DUMPS) {
             return Ok(());
         }
@@ -267,13 +239,6 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
-/// Returns the run folder: `folder` itself, or its parent if `folder` is the checkpoints folder of a run.
-fn run_of(folder: &Path) -> PathBuf {
-    let run = folder.canonicalize().ok().and_then(|whole| Some(whole.parent()?.to_owned()));
-    let inside = run.filter(|run| same_file(Checkpoints::new(run).folder(), folder));
-    inside.unwrap_or_else(|| folder.to_owned())
-}
-
 /// Returns the folder of the newest run that has a checkpoint, if any.
 pub fn newest_run() -> Option<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
@@ -281,16 +246,12 @@ pub fn newest_run() -> Option<PathBuf> {
     runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, run.path))).max().map(|(_, path)| path)
 }
 
-fn modified(path: &Path) -> Option<SystemTime> {
-    fs::metadata(path).and_then(|facts| facts.modified()).ok()
-}
-
 /// Creates a run folder in the default folder of runs, under a name from the current time that no other run has.
 fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     let plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     let name = name.unwrap_or_default();
     ensure!(name.chars().all(plain), "--name {name}: may contain only letters, digits, `-`, `_` and `.`");
-    fs::create_dir_all(RUNS).with_context(|| format!("cannot create the folder of runs {RUNS}"))?;
+    fs::create_dir_all(RUNS).cannot("create the folder of runs", Path::new(RUNS))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
     let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
     for attempt in 1.. {
@@ -298,10 +259,7 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
         let path = Path::new(RUNS).join(format!("{time}{suffix}{again}"));
         match fs::create_dir(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
-            result => {
-                result.with_context(|| format!("cannot create the run folder {}", path.display()))?;
-                return Ok(path);
-            }
+            created => return created.cannot("create the run folder", &path).map(|()| path),
         }
     }
     unreachable!("the number of attempts is unlimited")
@@ -310,6 +268,7 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::os::same_file;
 
     #[test]
     fn a_folder_that_holds_a_run_is_not_taken_again() {

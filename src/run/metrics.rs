@@ -2,20 +2,18 @@
 //!
 //! Rows after the checkpoint that is resumed from are cut off, so that no row is missing or duplicated.
 
-use std::borrow::Cow;
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 
 use super::folder::METRICS;
-use crate::os::expect_named;
-use crate::os::{make_own, sync_folder, unused_name};
+use crate::os::{Cannot, expect_named, make_own, put_aside, sync_folder};
 
 /// The most bytes of a row. This program writes none that is longer, and the rest of a longer one is not a row either.
-pub(super) const LONGEST_ROW: u64 = 1 << 20;
+const LONGEST_ROW: u64 = 1 << 20;
 
 /// The table being written.
 pub(super) struct Metrics {
@@ -23,42 +21,29 @@ pub(super) struct Metrics {
     file: File,
     /// Bytes of the header and of whole rows.
     length: u64,
-    /// The indices of the columns that the table has, in a table that was begun when there were fewer.
-    columns: Option<Vec<usize>>,
 }
 
 impl Metrics {
     /// Opens or creates the table with this header, to continue after the rows of these iterations. Also returns notes about rows
-    /// that are cut off or missing. A table that lacks some of the columns continues without them; one with a different header is
-    /// kept under another name.
+    /// that are cut off or missing. A table with a different header is kept under another name.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
     pub(super) fn open(path: &Path, header: &str, iterations: Range<u64>) -> Result<(Self, Vec<String>)> {
-        let context = || format!("cannot write {}", path.display());
-        let (mut found, mut notes) = (Rows::default(), Vec::new());
-        let mut expected = iterations.end - iterations.start;
-        match File::open(path) {
-            Ok(file) => match rows(file, header, iterations.end).with_context(context)? {
-                Some(rows) => found = rows,
-                None => {
-                    let aside = unused_name(&path.with_extension(format!("before-{}.csv", iterations.end)));
-                    fs::rename(path, &aside).with_context(context)?;
-                    notes.push(format!(
-                        "{METRICS} has a different header from the one this program writes; it was renamed to {}",
-                        aside.display()
-                    ));
-                    expected = 0;
-                }
-            },
-            Err(error) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => return Err(error).with_context(context),
+        let found = match File::open(path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
+            file => file.and_then(|file| rows(file, header, iterations.end)).cannot("write", path)?,
+        };
+        let (mut notes, mut expected) = (Vec::new(), iterations.end - iterations.start);
+        if found.is_none() {
+            let aside = put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
+            let aside = aside.display();
+            notes.push(format!(
+                "{METRICS} has a different header from the one this program writes; it was renamed to {aside}"
+            ));
+            expected = 0;
         }
-        if let Some(columns) = &found.columns {
-            let lacking = header.split(',').enumerate().filter(|(place, _)| !columns.contains(place));
-            let lacking: Vec<&str> = lacking.map(|(_, name)| name).collect();
-            notes.push(format!("{METRICS} was begun without these columns and continues so: {}", lacking.join(", ")));
-        }
+        let found = found.unwrap_or_default();
         if found.dropped > 0 {
             notes.push(format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
         }
@@ -66,28 +51,23 @@ impl Metrics {
             let lacking = expected - found.kept;
             notes.push(format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
         }
-        make_own(path).with_context(context)?;
-        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).with_context(context)?;
-        let mut metrics = Self { path: path.to_owned(), file, length: found.length, columns: found.columns };
-        metrics.repair().with_context(context)?;
+        make_own(path).cannot("write", path)?;
+        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).cannot("write", path)?;
+        let mut metrics = Self { path: path.to_owned(), file, length: found.length };
+        metrics.repair().cannot("write", path)?;
         if found.length == 0 {
             metrics.row(&format!("{header}\n"))?;
-            sync_folder(path).with_context(context)?;
+            sync_folder(path).cannot("write", path)?;
         }
         Ok((metrics, notes))
     }
 
-    /// Adds a row of all columns, which ends with a line feed.
+    /// Adds a row, which ends with a line feed.
     ///
     /// # Errors
     /// Fails if the file cannot be written; [`Metrics::repair`] must succeed before the next row.
     pub(super) fn row(&mut self, row: &str) -> Result<()> {
-        let mut row = Cow::from(row);
-        if let Some(columns) = &self.columns {
-            let cells: Vec<&str> = row.trim_end().split(',').collect();
-            row = (columns.iter().map(|&i| cells[i]).collect::<Vec<_>>().join(",") + "\n").into();
-        }
-        self.file.write_all(row.as_bytes()).with_context(|| format!("cannot write {}", self.path.display()))?;
+        self.file.write_all(row.as_bytes()).cannot("write", &self.path)?;
         self.length += row.len() as u64;
         Ok(())
     }
@@ -106,8 +86,7 @@ impl Metrics {
     /// Fails if the file cannot be written, or was deleted.
     pub(super) fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
-        let synced = self.repair().and_then(|()| self.file.sync_data());
-        synced.with_context(|| format!("cannot write {}", self.path.display()))
+        self.repair().and_then(|()| self.file.sync_data()).cannot("write", &self.path)
     }
 }
 
@@ -120,8 +99,6 @@ struct Rows {
     kept: u64,
     /// The number of rows after them.
     dropped: u64,
-    /// The indices of its columns among the expected ones, if it has fewer.
-    columns: Option<Vec<usize>>,
 }
 
 /// Counts the rows of a table up to an iteration and after it; returns `None` if the header is different.
@@ -131,31 +108,21 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
         return Ok(Some(Rows::default()));
     }
     let (mut reader, mut line) = (BufReader::new(file), Vec::new());
-    let mut next = |line: &mut Vec<u8>| {
-        line.clear();
-        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
-    };
-    if next(&mut line)? == 0 {
+    let length = next_row(&mut reader, &mut line)?;
+    // The header may have been written only in part, e.g. on a full disk.
+    if !line.ends_with(b"\n") && header.as_bytes().starts_with(&line) {
         return Ok(Some(Rows::default()));
     }
-    let mut columns = None;
-    match line.strip_suffix(b"\n") {
-        Some(found) if found == header.as_bytes() => {}
-        // A header that was written only in part, e.g. on a full disk.
-        None if header.as_bytes().starts_with(&line) => return Ok(Some(Rows::default())),
-        found => match found.and_then(|found| among(found, header)) {
-            Some(places) => columns = Some(places),
-            None => return Ok(None),
-        },
+    if line.strip_suffix(b"\n") != Some(header.as_bytes()) {
+        return Ok(None);
     }
-    let commas = line.iter().filter(|&&byte| byte == b',').count();
-    let mut found = Rows { length: line.len() as u64, columns, ..Rows::default() };
-    while next(&mut line)? > 0 {
-        let number =
-            line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse::<u64>().ok());
-        let whole = line.ends_with(b"\n") && line.iter().filter(|&&byte| byte == b',').count() == commas;
-        if found.dropped == 0 && whole && number.is_some_and(|number| number <= iterations) {
-            (found.length, found.kept) = (found.length + line.len() as u64, found.kept + 1);
+    let commas = |line: &[u8]| line.iter().filter(|&&byte| byte == b',').count();
+    let (columns, mut found) = (commas(&line), Rows { length, ..Rows::default() });
+    while let read @ 1.. = next_row(&mut reader, &mut line)? {
+        let number = line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse().ok());
+        let whole = line.ends_with(b"\n") && commas(&line) == columns;
+        if found.dropped == 0 && whole && number.is_some_and(|number: u64| number <= iterations) {
+            (found.length, found.kept) = (found.length + read, found.kept + 1);
         } else {
             found.dropped += 1;
         }
@@ -163,11 +130,11 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     Ok(Some(found))
 }
 
-/// Returns the indices of these columns among the expected ones; `None` if one is not among them, or if the order differs.
-fn among(columns: &[u8], expected: &str) -> Option<Vec<usize>> {
-    let mut places = expected.split(',').enumerate();
-    let place = |column: &[u8]| places.find(|(_, name)| name.as_bytes() == column).map(|(place, _)| place);
-    columns.split(|&byte| byte == b',').map(place).collect()
+/// Reads the next row into `row`, with its line feed, and returns its length; 0 at the end. The rest of a row that is too long
+/// is read as another one.
+pub(super) fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io::Result<u64> {
+    row.clear();
+    reader.take(LONGEST_ROW).read_until(b'\n', row).map(|length| length as u64)
 }
 
 #[cfg(test)]
@@ -212,17 +179,6 @@ mod tests {
         let old = ["metrics.before-1.csv", "metrics.before-1-2.csv"];
         let old = old.map(|name| fs::read_to_string(place.path().join(name)).unwrap());
         assert_eq!(old, ["iteration,loss\n1,0.5\n", "iteration,return\n"]);
-    }
-
-    #[test]
-    fn a_table_that_was_begun_with_fewer_columns_continues_without_the_new_ones() {
-        let (place, path) = table("1,0.5\n2,0.25\n");
-        let (mut metrics, notes) = Metrics::open(&path, "iteration,speed,loss,drops", 0..1).unwrap();
-        assert!(notes.len() == 2 && notes[0].contains("speed, drops") && notes[1].contains("1 rows"), "{notes:?}");
-        metrics.row("2,9,0.125,\n").unwrap();
-        metrics.sync().unwrap();
-        assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n1,0.5\n2,0.125\n");
-        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
     }
 
     #[test]

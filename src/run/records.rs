@@ -2,10 +2,12 @@
 //!
 //! A file is a sequence of records: length (8 bytes, little endian), its checksum, an event, its checksum (TFRecord, from
 //! TensorFlow's record_writer.h). An event is a protobuf message, of which only the step, field 2, is read. Files are untrusted:
-//! sizes are bounded, and no more is allocated than there is.
+//! sizes are bounded.
 
 use std::io::{BufRead, ErrorKind, Read, Result};
 
+use protobuf::CodedInputStream;
+use protobuf::wire_format::WireType;
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
 /// The most bytes of an event. This program writes none that is larger; a record that claims to be is damaged.
@@ -50,37 +52,15 @@ fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
 
 /// Returns the step of an event, or 0 if it has none; `None` if it is not a protobuf message.
 fn step_of(event: &[u8]) -> Option<i64> {
-    let (mut rest, mut step) = (event, 0);
-    while !rest.is_empty() {
-        let key = varint(&mut rest)?;
-        let skipped = match key & 7 {
-            0 => {
-                let value = varint(&mut rest)?;
-                step = if key >> 3 == 2 { value as i64 } else { step };
-                0
-            }
-            1 => 8,
-            2 => varint(&mut rest)?,
-            5 => 4,
-            _ => return None,
-        };
-        rest = rest.get(usize::try_from(skipped).ok()?..)?;
-    }
-    Some(step)
-}
-
-/// Reads a protobuf varint: seven bits per byte, the lowest first; the eighth bit is clear in the last byte only.
-fn varint(rest: &mut &[u8]) -> Option<u64> {
-    let mut value = 0;
-    for shift in (0..64).step_by(7) {
-        let (&byte, behind) = rest.split_first()?;
-        *rest = behind;
-        value |= u64::from(byte & 0x7f) << shift;
-        if byte < 0x80 {
-            return Some(value);
+    let (mut stream, mut step) = (CodedInputStream::from_bytes(event), 0);
+    while !stream.eof().ok()? {
+        match stream.read_tag_unpack().ok()? {
+            (2, WireType::WireTypeVarint) => step = stream.read_int64().ok()?,
+            // Refuses groups, which could be nested without end.
+            (_, kind) => stream.skip_field(kind).ok()?,
         }
     }
-    None
+    Some(step)
 }
 
 #[cfg(test)]

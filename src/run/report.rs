@@ -12,7 +12,7 @@ use anyhow::Result;
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::metrics::Metrics;
-use super::summary::{Media, Tag};
+use super::summary::{Descriptions, Media};
 use crate::os::{Status, StatusLine};
 
 /// The columns before the tags.
@@ -22,15 +22,13 @@ const FIXED: [&str; 2] = ["iteration", "env_steps"];
 pub struct Report {
     folder: PathBuf,
     header: String,
-    tags: Vec<Tag>,
+    descriptions: Descriptions,
     /// The settings of the run, TOML.
     settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
-    /// The iteration before the first one of the run.
-    first: u64,
-    /// The last iteration that was logged.
-    iteration: u64,
+    /// From the iteration before the first one of the run to the last one that was logged.
+    iterations: Range<u64>,
     /// Control steps up to its end.
     env_steps: u64,
     progress: StatusLine,
@@ -53,34 +51,35 @@ impl<W> Log<W> {
         Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
     }
 
-    /// Writes an iteration if possible; returns a warning if the log fails or recovers.
-    fn write(&mut self, write: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
-        let Some(writer) = &mut self.writer else {
-            self.lost += 1;
-            return None;
-        };
-        if let Err(error) = write(writer) {
-            self.lost += 1;
-            return self.give_up(&error);
+    /// Writes an iteration if possible; says so if the log fails or recovers.
+    fn write(&mut self, progress: &StatusLine, write: impl FnOnce(&mut W) -> Result<()>) {
+        match self.writer.as_mut().map(write) {
+            Some(Ok(())) => {
+                self.unsynced += 1;
+                if std::mem::take(&mut self.failing) {
+                    let (name, lost) = (self.name, self.lost);
+                    progress.warn(&format!("logging to {name} has resumed; it lacks {lost} iterations so far"));
+                }
+            }
+            Some(Err(error)) => self.give_up(progress, 1, &error),
+            None => self.lost += 1,
         }
-        self.unsynced += 1;
-        let again = std::mem::take(&mut self.failing);
-        again.then(|| format!("logging to {} has resumed; it lacks {} iterations so far", self.name, self.lost))
     }
 
-    /// Ensures that everything is on the disk; returns a warning if it is not.
-    fn sync(&mut self, sync: impl FnOnce(&mut W) -> Result<()>) -> Option<String> {
-        let result = sync(self.writer.as_mut()?);
+    /// Ensures that everything is on the disk; says so if it is not.
+    fn sync(&mut self, progress: &StatusLine, sync: impl FnOnce(&mut W) -> Result<()>) {
+        let Some(result) = self.writer.as_mut().map(sync) else { return };
         let unsynced = std::mem::take(&mut self.unsynced);
-        let error = result.err()?;
-        self.lost += unsynced;
-        self.give_up(&error)
+        result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
     }
 
-    fn give_up(&mut self, error: &anyhow::Error) -> Option<String> {
+    /// Stops writing, and counts the iterations that are `lost`; says so unless that is known.
+    fn give_up(&mut self, progress: &StatusLine, lost: u64, error: &anyhow::Error) {
+        self.lost += lost;
         self.writer = None;
-        let known = std::mem::replace(&mut self.failing, true);
-        (!known).then(|| format!("logging to {} is suspended: {error:#}", self.name))
+        if !std::mem::replace(&mut self.failing, true) {
+            progress.warn(&format!("logging to {} is suspended: {error:#}", self.name));
+        }
     }
 }
 
@@ -91,12 +90,11 @@ impl Report {
         Self {
             folder: folder.to_owned(),
             header: columns.join(","),
-            tags: Vec::new(),
+            descriptions: Descriptions::new(),
             settings: String::new(),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
-            first: 0,
-            iteration: 0,
+            iterations: 0..0,
             env_steps: 0,
             progress,
         }
@@ -104,64 +102,57 @@ impl Report {
 
     /// Adds descriptions of all that is logged, and the settings of the run (TOML), for TensorBoard.
     #[must_use]
-    pub fn described(self, tags: Vec<Tag>, settings: String) -> Self {
-        Self { tags, settings, ..self }
+    pub fn described(self, descriptions: Descriptions, settings: String) -> Self {
+        Self { descriptions, settings, ..self }
     }
 
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
     pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
-        (self.first, self.iteration, self.env_steps) = (iterations.start, iterations.end, env_steps);
+        (self.iterations, self.env_steps) = (iterations, env_steps);
         // A session that ended before its next checkpoint may have logged later steps; these are made again.
         match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
             Ok(events) => self.events.writer = Some(events),
-            Err(error) => self.events.give_up(&error).into_iter().for_each(|warning| self.warn(&warning)),
+            Err(error) => self.events.give_up(&self.progress, 0, &error),
         }
         match self.open_metrics() {
             Ok((metrics, notes)) => {
                 self.metrics.writer = Some(metrics);
                 notes.iter().for_each(|note| self.say(note));
             }
-            Err(error) => self.metrics.give_up(&error).into_iter().for_each(|warning| self.warn(&warning)),
+            Err(error) => self.metrics.give_up(&self.progress, 0, &error),
         }
     }
 
     fn open_events(&self) -> Result<EventFile> {
-        let first_step = self.env_steps + u64::from(self.iteration > 0);
-        EventFile::create(&self.folder, first_step, &self.tags, &self.settings)
+        let first_step = self.env_steps + u64::from(self.iterations.end > 0);
+        EventFile::create(&self.folder, first_step, &self.descriptions, &self.settings)
     }
 
     fn open_metrics(&self) -> Result<(Metrics, Vec<String>)> {
-        Metrics::open(&self.folder.join(METRICS), &self.header, self.first..self.iteration)
+        Metrics::open(&self.folder.join(METRICS), &self.header, self.iterations.clone())
     }
 
     /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
     pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], figures: &Media, status: &Status) {
-        (self.iteration, self.env_steps) = (iteration, status.env_steps);
+        (self.iterations.end, self.env_steps) = (iteration, status.env_steps);
         let names = values.iter().map(|(name, _)| name.as_ref());
         assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
         let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };
         let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
-        let warnings = [
-            self.events.write(|events| events.iteration(status.env_steps, values, figures)),
-            self.metrics.write(|metrics| metrics.row(&row)),
-        ];
-        warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
+        self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, figures));
+        self.metrics.write(&self.progress, |metrics| metrics.row(&row));
         self.progress.show(status);
     }
 
     /// Brings everything that was logged onto the disk, before a checkpoint relies on it. Reopens logs that could not be written.
     pub fn sync(&mut self) {
-        let warnings = [self.metrics.sync(Metrics::sync), self.events.sync(|events| events.sync())];
-        warnings.into_iter().flatten().for_each(|warning| self.warn(&warning));
+        self.metrics.sync(&self.progress, Metrics::sync);
+        self.events.sync(&self.progress, |events| events.sync());
         // The whole folder may have been deleted.
         let _ = fs::create_dir_all(&self.folder);
-        if self.metrics.writer.is_none() {
-            self.metrics.writer = self.open_metrics().ok().map(|(metrics, _)| metrics);
-        }
-        if self.events.writer.is_none() {
-            self.events.writer = self.open_events().ok();
-        }
+        self.metrics.writer = self.metrics.writer.take().or_else(|| Some(self.open_metrics().ok()?.0));
+        self.events.writer = self.events.writer.take().or_else(|| self.open_events().ok());
     }
 
     /// Ends the progress line, and reports the iterations that the logs lack.
@@ -169,9 +160,7 @@ impl Report {
         self.progress.end();
         for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
             if lost > 0 {
-                self.say(&format!(
-                    "warning: {name} lacks {lost} iterations of this session, which could not be written"
-                ));
+                self.warn(&format!("{name} lacks {lost} iterations of this session, which could not be written"));
             }
         }
     }
@@ -183,7 +172,7 @@ impl Report {
 
     /// Prints a warning above the progress line.
     pub fn warn(&self, text: &str) {
-        self.say(&format!("warning: {text}"));
+        self.progress.warn(text);
     }
 }
 

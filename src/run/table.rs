@@ -2,13 +2,14 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 
 use super::folder::METRICS;
-use super::metrics::LONGEST_ROW;
+use super::metrics::next_row;
+use crate::os::Cannot;
 
 /// The most bytes that are read of a table; a million rows take half of this.
 const LARGEST_TABLE: u64 = 1 << 30;
@@ -42,14 +43,9 @@ pub struct MetricsTable {
 /// Fails if the file cannot be read, lacks a required column, has too many rows, or contains anything but numbers.
 pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<MetricsTable> {
     let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
-    let context = || format!("cannot read {}", path.display());
-    let mut reader = BufReader::new(File::open(&path).with_context(context)?.take(LARGEST_TABLE));
+    let mut reader = BufReader::new(File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE));
     let mut line = Vec::new();
-    let mut next = |line: &mut Vec<u8>| {
-        line.clear();
-        reader.by_ref().take(LONGEST_ROW).read_until(b'\n', line)
-    };
-    next(&mut line).with_context(context)?;
+    next_row(&mut reader, &mut line).cannot("read", &path)?;
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
     let names: Vec<&str> = header.split(',').collect();
     if let Some(column) = required.iter().find(|column| !names.contains(column)) {
@@ -58,7 +54,7 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
     let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
     let mut row = 0;
-    while next(&mut line).with_context(context)? > 0 {
+    while next_row(&mut reader, &mut line).cannot("read", &path)? > 0 {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
         let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();

@@ -12,7 +12,7 @@ use crate::config::EnvConfig;
 use crate::draw::{FilmFormat, FilmWriter, Frame, gif_of, write_png};
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player, Trial};
-use crate::os::{Bar, OutputFile};
+use crate::os::{Bar, OutputFile, progress_bar};
 use crate::repose::{Repose, Task};
 use crate::run::Animation;
 use crate::sim::{Quality, Renderer};
@@ -72,7 +72,7 @@ impl Film {
         let renderer = Renderer::new(task.scene())?;
         let writer = FilmWriter::create(path, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
         let frames = Frames { renderer, fps, longest, drawn: 0 };
-        Ok(Self { frames, writer, all_frames: 0, bar: Bar::new(all, "frames", "film"), begun: Instant::now() })
+        Ok(Self { frames, writer, all_frames: 0, bar: progress_bar(all, "frames", "film"), begun: Instant::now() })
     }
 
     /// Adds the frames that are due at `moment`.
@@ -84,11 +84,11 @@ impl Film {
         self.frames.draw_due(moment, |frame| {
             self.writer.push(frame);
             self.all_frames += 1;
-            self.bar.count();
+            self.bar.inc(1);
         })?;
         if moment.ends() {
-            self.bar.shorten(self.frames.longest.saturating_sub(self.frames.drawn));
-            self.bar.say(format!("{} goals in episode {}", moment.env.episode().goals, moment.episode));
+            self.bar.dec_length(self.frames.longest.saturating_sub(self.frames.drawn));
+            self.bar.set_message(format!("{} goals in episode {}", moment.env.episode().goals, moment.episode));
         }
         Ok(())
     }

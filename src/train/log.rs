@@ -3,7 +3,7 @@
 use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
 use crate::repose::{EpisodeStats, Score};
-use crate::run::{self, Histogram, Tag};
+use crate::run::{self, Descriptions, Histogram, histogram};
 use crate::tags::quantity;
 
 /// The scores of the episodes that ended in an iteration.
@@ -63,18 +63,14 @@ const ADVANTAGES: &str = "histogram/advantages";
 pub(super) const FILM: &str = "eval/film";
 
 /// Returns the values with these names and all other things that are logged, with their descriptions.
-pub(super) fn described(names: &[String]) -> Vec<Tag> {
+pub(super) fn described(names: &[String]) -> Descriptions {
     let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, FILM, run::SETTINGS]);
-    let tag = |name: &str| Tag {
-        name: name.to_owned(),
-        description: quantity(name).map(|known| known.description).unwrap_or_default(),
-    };
-    all.map(tag).collect()
+    all.map(|name| (name.to_owned(), quantity(name).map(|known| known.description).unwrap_or_default())).collect()
 }
 
 /// Returns the histograms of the rollout that was just learnt from.
 pub(super) fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
-    let all = |of: fn(&RolloutBlock) -> &[f32]| Histogram::new(rollout.blocks.iter().flat_map(of));
+    let all = |of: fn(&RolloutBlock) -> &[f32]| histogram(rollout.blocks.iter().flat_map(of));
     vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
 }
 
@@ -91,8 +87,8 @@ mod tests {
 
     #[test]
     fn everything_that_is_logged_is_described() {
-        for tag in described(&tags(true)) {
-            assert!(tag.description.ends_with('.'), "{}: {}", tag.name, tag.description);
+        for (tag, description) in described(&tags(true)) {
+            assert!(description.ends_with('.'), "{tag}: {description}");
         }
     }
 
@@ -104,7 +100,7 @@ mod tests {
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let found = histograms(&agent.rollout);
         let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
-        let count = |histogram: &Histogram| histogram.counts.iter().sum::<f64>();
+        let count = |histogram: &Histogram| histogram.bucket.iter().sum::<f64>();
         assert_eq!([count(actions), count(advantages)], [32.0 * 20.0, 32.0]);
         assert!(actions.min < -0.5, "{found:?}");
         assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");

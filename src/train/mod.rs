@@ -83,7 +83,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
             Ok(Some(outcome)) => outcome,
             Ok(None) => {
                 session.count_divergence();
-                return stop(saver, report, requests.exit_code(), "stopped");
+                return stop(saver, report, os::exit_code(requests.signal()), "stopped");
             }
             Err(error) => {
                 session.count_divergence();
