@@ -165,7 +165,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
-        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
+        let layout = Layout::new(&net.hidden, spaces);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
     }
@@ -178,23 +178,23 @@ impl Checkpoint {
 
     fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
         self.expect_policy(net, &spaces)?;
-        let views = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size).views();
-        let parameters = self.take_floats("", &views)?;
-        let log_std = match self.take(LOG_STD)? {
+        let mut policy = Policy::new(net, spaces)?;
+        policy.parameters = self.take_floats("", &policy.layout.views())?;
+        policy.log_std = match self.take(LOG_STD)? {
             Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
             _ => bail!("tensor `{LOG_STD}` must hold the same F32 value for each action"),
         };
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
         let [mean, variance] = ["mean", "variance"].map(|of| self.take_vector(&format!("normalizer.{of}"), size));
-        let normalizer = Normalizer { mean: mean?, variance: variance?, count };
-        let Normalizer { mean, variance, .. } = &normalizer;
+        policy.normalizer = Normalizer { mean: mean?, variance: variance?, count };
+        let Normalizer { mean, variance, .. } = &policy.normalizer;
         let small = |x: f64| x.abs() < 1e18;
         let sound = small(count) && mean.iter().chain(variance).copied().all(small);
         ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
-        Policy::new(net, spaces, parameters, log_std, normalizer)
+        Ok(policy)
     }
 
     /// Checks that every array was removed.

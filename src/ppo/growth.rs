@@ -7,7 +7,7 @@
 use anyhow::{Result, ensure};
 
 use super::format::Array;
-use super::parameters::{Layer, Layout, View};
+use super::parameters::{Layout, View};
 use super::{Checkpoint, Policy};
 use crate::config::NetConfig;
 use crate::spaces::Spaces;
@@ -30,10 +30,9 @@ impl Checkpoint {
             to.hidden,
             from.hidden
         );
-        let layout = |net: &NetConfig| Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
-        let (old, new) = (layout(from), layout(to));
+        let (old, new) = (Layout::new(&from.hidden, &spaces), Layout::new(&to.hidden, &spaces));
         let mut policy = Policy::random(to, spaces, 1.0, seed)?.parameters;
-        for (old, new) in layers(&old).zip(layers(&new)) {
+        for (old, new) in old.layers().zip(new.layers()) {
             for row in policy[new.weight.clone()].chunks_exact_mut(new.inputs).take(old.outputs) {
                 row[old.inputs..].fill(0.0);
             }
@@ -62,7 +61,7 @@ impl Checkpoint {
     ) -> Result<()> {
         let known = self.take_floats(prefix, &old.views())?;
         let mut numbers = begin(&known);
-        for (old, new) in layers(old).zip(layers(new)) {
+        for (old, new) in old.layers().zip(new.layers()) {
             let rows = numbers[new.weight.clone()].chunks_exact_mut(new.inputs);
             for (row, known) in rows.zip(known[old.weight.clone()].chunks_exact(old.inputs)) {
                 row[..old.inputs].copy_from_slice(known);
@@ -74,11 +73,6 @@ impl Checkpoint {
         }
         Ok(())
     }
-}
-
-/// Returns the layers of both nets.
-fn layers(layout: &Layout) -> impl Iterator<Item = &Layer> {
-    layout.actor.iter().chain(&layout.critic)
 }
 
 #[cfg(test)]
@@ -108,7 +102,7 @@ mod tests {
     fn answers(ppo: &Ppo) -> Vec<f32> {
         let policy = ppo.policy().freeze();
         let (observations, mut means, mut values) = ([0.3, -2.0, 1.0, 0.0, 5.0, -0.1], [0.0; 4], [0.0; 2]);
-        policy.mean_actions_and_values(&observations, &mut means, &mut values, &mut policy.workspace(2));
+        policy.both(&observations, (&mut means, &mut values), &mut policy.workspace(2));
         means.into_iter().chain(values).collect()
     }
 

@@ -22,6 +22,7 @@ mod perception;
 mod policy;
 mod progress;
 mod rollout;
+mod widest;
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
@@ -39,8 +40,8 @@ pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
-pub use perception::Perception;
-pub use policy::{ActorParts, FrozenPolicy, LayerParts, Policy};
+pub use perception::{CLIP, InputTransform, Perception, ROTATIONS};
+pub use policy::{FrozenPolicy, Policy};
 pub use progress::{Evaluation, Fork, Progress};
 pub use rollout::{Rollout, RolloutBlock};
 

@@ -3,8 +3,7 @@
 //! candle computes these functions one element at a time, in several passes, which costs more than the matrix products
 //! between them.
 
-use pulp::Arch;
-
+use super::super::widest::widest;
 use crate::config::Activation;
 
 /// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); x is clamped to [-87, 88].
@@ -75,14 +74,11 @@ pub(super) fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Opt
 }
 
 fn add_columns(sums: &mut [f32], rows: &[f32]) {
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for row in rows.chunks_exact(sums.len()) {
-                sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
-            }
-        },
-    );
+    widest!({
+        for row in rows.chunks_exact(sums.len()) {
+            sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+        }
+    });
 }
 
 /// Sets `x[i] = f(x[i], y[i])` and adds the rows of `x` to `sums`.
@@ -90,30 +86,24 @@ fn add_columns(sums: &mut [f32], rows: &[f32]) {
 fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     assert_eq!(x.len(), y.len());
     let width = sums.len();
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
-                for ((x, &y), sum) in x.iter_mut().zip(y).zip(&mut *sums) {
-                    *x = f(*x, y);
-                    *sum += *x;
-                }
+    widest!({
+        for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
+            for ((x, &y), sum) in x.iter_mut().zip(y).zip(&mut *sums) {
+                *x = f(*x, y);
+                *sum += *x;
             }
-        },
-    );
+        }
+    });
 }
 
 /// Sets `x[i, j] = f(x[i, j], y[j])` for each row of `x` `[B, C]`, compiled for the processor it runs on.
 #[inline(always)]
 fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for row in x.chunks_exact_mut(y.len()) {
-                row.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y));
-            }
-        },
-    );
+    widest!({
+        for row in x.chunks_exact_mut(y.len()) {
+            row.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y));
+        }
+    });
 }
 
 #[cfg(test)]

@@ -1,7 +1,6 @@
 //! bf16, the upper half of an f32: rounding, and packing of operands into the tiles that [`super::units`] multiplies.
 
-use pulp::Arch;
-
+use super::super::widest::widest;
 use super::product::Matrix;
 
 /// Lines in a tile. The lines of an operand are the rows of the left matrix or the columns of the right one.
@@ -91,15 +90,12 @@ impl Packed {
         (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
         let groups = lines.div_ceil(2 * LINES) * 2;
         self.tiles.resize(groups * self.depth, Tile([0; LINES * DEPTH]));
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
-                    let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
-                    pack_tile(tile, matrix, [line, number], order);
-                }
-            },
-        );
+        widest!({
+            for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
+                let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
+                pack_tile(tile, matrix, [line, number], order);
+            }
+        });
     }
 }
 

@@ -4,10 +4,9 @@
 
 use std::iter::repeat_n;
 
-use pulp::Arch;
-
 use super::super::backend::LossSums;
 use super::super::rollout::{Rollout, RolloutBlock};
+use super::super::widest::widest;
 use crate::config::PpoConfig;
 
 /// The losses of a minibatch. An action has A values.
@@ -59,16 +58,13 @@ impl<'a> Loss<'a> {
         squared_shifts: &mut [f32],
     ) {
         let width = self.action_size;
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
-                for (&sample, (mean, grad)) in samples.iter().zip(rows) {
-                    let (block, i) = self.rollout.locate(sample);
-                    self.actor_sample((block, i), mean, grad, sums, squared_shifts);
-                }
-            },
-        );
+        widest!({
+            let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
+            for (&sample, (mean, grad)) in samples.iter().zip(rows) {
+                let (block, i) = self.rollout.locate(sample);
+                self.actor_sample((block, i), mean, grad, sums, squared_shifts);
+            }
+        });
     }
 
     #[inline(always)]

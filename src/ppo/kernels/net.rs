@@ -191,11 +191,14 @@ mod tests {
     use super::super::super::parameters::Layout;
     use super::*;
     use crate::config::Precision;
+    use crate::spaces::Spaces;
+
+    const SPACES: Spaces = Spaces { observation_size: 157, action_size: 20, cube_and_goal: None, distance: |_| 0.0 };
 
     #[test]
     fn packed_weights_change_no_bit() {
         let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
-        let layout = Layout::new(&[70, 33], 157, 20);
+        let layout = Layout::new(&[70, 33], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
@@ -216,7 +219,7 @@ mod tests {
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
-        let layout = Layout::new(&[300, 64], 157, 20);
+        let layout = Layout::new(&[300, 64], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
         work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
