@@ -241,7 +241,7 @@ impl Ppo {
         let log_std = vec![self.policy.log_std; self.policy.spaces.action_size];
         checkpoint.insert(LOG_STD, Array::F32(vec![log_std.len()], log_std));
         checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
-        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate.rate]));
+        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate]));
         let normalizer = &self.policy.normalizer;
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
@@ -275,8 +275,8 @@ impl Ppo {
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
         ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is not a step count");
         self.adam.steps = steps[0];
-        self.learning_rate.rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
-        ensure!(self.learning_rate.rate > 0.0, "its learning rate is {}", self.learning_rate.rate);
+        self.learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
+        ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
         Ok(())
     }
 }
@@ -317,7 +317,7 @@ mod tests {
     fn learnt(backend: Backend, seed: u64) -> Ppo {
         let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Exchange::alone(1)).unwrap();
         ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);
-        ppo.learning_rate.rate = 0.123;
+        ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
@@ -336,7 +336,7 @@ mod tests {
                 to.restore(&mut checkpoint).unwrap();
                 checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
-                assert_eq!(to.learning_rate.rate, 0.123);
+                assert_eq!(to.learning_rate, 0.123);
                 assert!(to.adam == from.adam && from.adam.mean.iter().any(|&x| x != 0.0));
                 assert_eq!(saved(&to).content, saved(&from).content);
             }
@@ -364,7 +364,7 @@ mod tests {
         to.begin_with(&saved(&from)).unwrap();
         assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
         let fresh = config(Backend::Fused, &[8]).learning_rate;
-        assert_eq!((to.learning_rate.rate, to.adam.steps), (fresh, 0));
+        assert_eq!((to.learning_rate, to.adam.steps), (fresh, 0));
         assert!(learner(&[9]).begin_with(&saved(&from)).is_err());
     }
 

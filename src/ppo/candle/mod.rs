@@ -8,7 +8,7 @@ use anyhow::Result;
 use candle_core::{Device, Module, Tensor};
 
 use super::Policy;
-use super::backend::{GradientBackend, LossSums};
+use super::backend::{Backend, Losses};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
@@ -52,18 +52,10 @@ impl Reference {
     }
 }
 
-impl GradientBackend for Reference {
-    fn begin(&mut self, _: &Policy, _: &Rollout) {}
-
-    fn gradient(
-        &mut self,
-        policy: &Policy,
-        rollout: &Rollout,
-        minibatch: &Minibatch,
-        out: &mut [f32],
-    ) -> Result<Vec<LossSums>> {
+impl Backend for Reference {
+    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
         let (mut sums, mut gradients) = (Vec::new(), Vec::new());
-        for group in &minibatch.groups {
+        for group in &of.groups {
             let (batch, nets) = (Self::minibatch(policy, rollout, group)?, Nets::new(policy)?);
             let means = nets.actor.forward(&batch.observations)?;
             let values = nets.critic.forward(&batch.observations)?.squeeze(1)?;
@@ -71,13 +63,13 @@ impl GradientBackend for Reference {
             let new = Gaussian { means, log_std, scales: batch.scales.clone() };
             let losses = loss::losses(&self.config, &batch, &new, &values)?;
             let mut gradient = vec![0.0; out.len()];
-            let weight = group.len() as f64 / minibatch.count as f64;
+            let weight = group.len() as f64 / of.count as f64;
             nets.write_gradient(&(losses.total * weight)?.backward()?, &mut gradient)?;
             gradients.push(gradient);
             let ratios = losses.ratios.to_vec1::<f32>()?;
             let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
             let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
-            sums.push(LossSums {
+            sums.push(Losses {
                 surrogate: -sum(&losses.policy)?,
                 value_error: sum(&losses.value)?,
                 excess: sum(&losses.excess)?,

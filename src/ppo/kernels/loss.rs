@@ -4,7 +4,7 @@
 
 use std::iter::repeat_n;
 
-use super::super::backend::LossSums;
+use super::super::backend::Losses;
 use super::super::rollout::{Rollout, RolloutBlock};
 use super::super::widest::widest;
 use crate::config::PpoConfig;
@@ -54,7 +54,7 @@ impl<'a> Loss<'a> {
         samples: &[u32],
         means: &[f32],
         grad: &mut [f32],
-        sums: &mut LossSums,
+        sums: &mut Losses,
         squared_shifts: &mut [f32],
     ) {
         let width = self.action_size;
@@ -73,7 +73,7 @@ impl<'a> Loss<'a> {
         (block, i): (&RolloutBlock, usize),
         mean: &[f32],
         grad: &mut [f32],
-        sums: &mut LossSums,
+        sums: &mut Losses,
         squared_shifts: &mut [f32],
     ) {
         let row = RolloutBlock::row(mean.len(), i);
@@ -107,7 +107,7 @@ impl<'a> Loss<'a> {
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
-    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut LossSums) {
+    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Losses) {
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let (old, target) = (block.values[i], block.returns[i]);
@@ -164,7 +164,7 @@ mod tests {
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
         let loss = Loss::new(&rollout, 3, &config, (log_std, 2));
-        let (mut sums, mut shifts) = (LossSums::default(), [0.0; 2]);
+        let (mut sums, mut shifts) = (Losses::default(), [0.0; 2]);
         let mut grad = [0.0; 6];
         loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums, &mut shifts);
         assert_close(&grad, &[0.0, 0.0, 0.130_386_1, -0.097_789_58, 6.613_660_5, 7.715_937]);

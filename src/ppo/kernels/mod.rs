@@ -29,7 +29,7 @@ pub use net::Workspace;
 pub(super) use product::Matrix;
 
 use super::Policy;
-use super::backend::{GradientBackend, LossSums};
+use super::backend::{Backend, Losses};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
@@ -57,7 +57,7 @@ pub(super) struct Kernels {
 #[derive(Clone, Default)]
 struct Partial {
     gradient: Vec<f32>,
-    sums: LossSums,
+    sums: Losses,
     /// See [`Loss::actor`].
     squared_shifts: Vec<f32>,
 }
@@ -103,7 +103,7 @@ impl Kernels {
     }
 }
 
-impl GradientBackend for Kernels {
+impl Backend for Kernels {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
         let (transform, size) = (policy.input_transform(), policy.spaces.observation_size);
         self.seen.resize(rollout.samples() * size, 0.0);
@@ -116,25 +116,19 @@ impl GradientBackend for Kernels {
         parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
     }
 
-    fn gradient(
-        &mut self,
-        policy: &Policy,
-        rollout: &Rollout,
-        minibatch: &Minibatch,
-        out: &mut [f32],
-    ) -> Result<Vec<LossSums>> {
-        let groups = &minibatch.groups;
+    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
+        let groups = &of.groups;
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
         let nets = [&policy.layout.actor, &policy.layout.critic];
         let nets = nets.map(|layers| policy.net(layers).packed(self.arithmetic, true));
         let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
-        let loss = Loss::new(rollout, minibatch.count, &self.config, (log_std, action_size));
+        let loss = Loss::new(rollout, of.count, &self.config, (log_std, action_size));
         let tasks = groups.iter().flat_map(|group| ROLES.map(|role| (group, role)));
         let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
         tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
             let net = &nets[role as usize];
             part.gradient.resize(net.parameter_count(), 0.0);
-            part.sums = LossSums::default();
+            part.sums = Losses::default();
             part.squared_shifts = vec![0.0; action_size];
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
@@ -157,9 +151,7 @@ impl GradientBackend for Kernels {
         }
         let of_group = |parts: &[Partial]| {
             let [actor, critic] = parts else { unreachable!("one part for each net") };
-            let mut sums = LossSums { kl: kl(&actor.squared_shifts, log_std), ..actor.sums };
-            sums += critic.sums;
-            sums
+            Losses { kl: kl(&actor.squared_shifts, log_std), ..actor.sums } + critic.sums
         };
         Ok(self.parts[..2 * groups.len()].chunks(2).map(of_group).collect())
     }
