@@ -88,9 +88,10 @@ impl Policy {
         InputTransform::new(self.perception, &self.normalizer)
     }
 
-    /// Returns the net of these layers.
-    pub(super) fn net(&self, layers: &[Layer]) -> Net<'_> {
-        Net::new(layers, &self.parameters, self.activation)
+    /// Returns actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
+    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
+        let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
+        [&self.layout.actor, &self.layout.critic].map(|layers| net(layers).prepared(arithmetic, learning))
     }
 
     /// Returns the buffers of both nets for blocks of up to `rows` rows.
@@ -105,8 +106,7 @@ impl Policy {
 
     /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let nets = [&self.layout.actor, &self.layout.critic];
-        let [actor, critic] = nets.map(|layers| self.net(layers).for_few_rows().packed(arithmetic, false));
+        let [actor, critic] = self.nets(arithmetic, false);
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }

@@ -45,17 +45,13 @@ fn tanh(x: f32) -> f32 {
     m / (m + 2.0)
 }
 
-/// Adds `bias` `[C]` to each row of `x` `[B, C]`.
-pub(super) fn add_bias(x: &mut [f32], bias: &[f32]) {
-    each_row(x, bias, |x, b| x + b);
-}
-
-/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, in place.
-pub(super) fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
+/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, if any, in place.
+pub(super) fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
     match activation {
-        Activation::Elu => each_row(x, bias, |x, b| elu(x + b)),
-        Activation::Relu => each_row(x, bias, |x, b| relu(x + b)),
-        Activation::Tanh => each_row(x, bias, |x, b| tanh(x + b)),
+        None => each_row(x, bias, |x, b| x + b),
+        Some(Activation::Elu) => each_row(x, bias, |x, b| elu(x + b)),
+        Some(Activation::Relu) => each_row(x, bias, |x, b| relu(x + b)),
+        Some(Activation::Tanh) => each_row(x, bias, |x, b| tanh(x + b)),
     }
 }
 
@@ -134,7 +130,7 @@ mod tests {
     fn activations_are_accurate_to_three_parts_in_ten_million() {
         for activation in ALL {
             let mut found = inputs();
-            add_bias_activate(&mut found, &[0.0], activation);
+            add_bias(&mut found, &[0.0], Some(activation));
             for (x, y) in inputs().into_iter().zip(found) {
                 let expected = exact(activation, f64::from(x));
                 let error = (f64::from(y) - expected).abs();
@@ -159,7 +155,7 @@ mod tests {
     fn what_is_not_a_number_stays_so() {
         for activation in ALL {
             let mut x = [f32::NAN];
-            add_bias_activate(&mut x, &[0.0], activation);
+            add_bias(&mut x, &[0.0], Some(activation));
             assert!(x[0].is_nan(), "{activation:?}");
         }
     }
@@ -169,7 +165,7 @@ mod tests {
         for activation in ALL {
             for x in [-3.0f32, -0.7, -0.01, 0.02, 0.9, 4.0] {
                 let mut output = [x];
-                add_bias_activate(&mut output, &[0.0], activation);
+                add_bias(&mut output, &[0.0], Some(activation));
                 let mut grad = [2.0];
                 let mut sums = [1.0];
                 slopes_and_sums(&mut grad, &output, Some(activation), &mut sums);

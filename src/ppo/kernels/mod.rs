@@ -9,7 +9,9 @@
 //! packs the weights anew for each minibatch.
 
 mod activation;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod amx;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
 mod bf16;
 mod loss;
@@ -33,7 +35,7 @@ use super::backend::{Backend, Losses};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
-use loss::{Loss, kl};
+use loss::{Loss, Sums};
 
 /// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
 pub(super) const ROWS: usize = 256;
@@ -57,9 +59,7 @@ pub(super) struct Kernels {
 #[derive(Clone, Default)]
 struct Partial {
     gradient: Vec<f32>,
-    sums: Losses,
-    /// See [`Loss::actor`].
-    squared_shifts: Vec<f32>,
+    sums: Sums,
 }
 
 /// The net that a job works on.
@@ -119,17 +119,14 @@ impl Backend for Kernels {
     fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
         let groups = &of.groups;
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
-        let nets = [&policy.layout.actor, &policy.layout.critic];
-        let nets = nets.map(|layers| policy.net(layers).packed(self.arithmetic, true));
-        let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
-        let loss = Loss::new(rollout, of.count, &self.config, (log_std, action_size));
+        let nets = policy.nets(self.arithmetic, true);
+        let loss = Loss::new(policy, rollout, of.count, &self.config);
         let tasks = groups.iter().flat_map(|group| ROLES.map(|role| (group, role)));
         let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
         tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
             let net = &nets[role as usize];
             part.gradient.resize(net.parameter_count(), 0.0);
-            part.sums = Losses::default();
-            part.squared_shifts = vec![0.0; action_size];
+            part.sums = loss.of_none();
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
@@ -139,7 +136,7 @@ impl Backend for Kernels {
                 net.forward(block.len(), work);
                 let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
                 match role {
-                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums, &mut part.squared_shifts),
+                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
                     Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
                 }
                 net.backward(block.len(), work, &mut part.gradient, i > 0);
@@ -149,10 +146,7 @@ impl Backend for Kernels {
         for (role, range) in ROLES.into_iter().zip(policy.layout.nets()) {
             self.add_up(role, groups.len(), &mut out[range]);
         }
-        let of_group = |parts: &[Partial]| {
-            let [actor, critic] = parts else { unreachable!("one part for each net") };
-            Losses { kl: kl(&actor.squared_shifts, log_std), ..actor.sums } + critic.sums
-        };
-        Ok(self.parts[..2 * groups.len()].chunks(2).map(of_group).collect())
+        let (parts, _) = self.parts[..2 * groups.len()].as_chunks::<2>();
+        Ok(parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
     }
 }
