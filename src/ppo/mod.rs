@@ -125,7 +125,7 @@ impl Ppo {
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn backend::Backend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference::new(config)),
+            Backend::Candle => Box::new(Reference(config.clone())),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
