@@ -68,9 +68,8 @@ impl Acting<'_> {
         work: &mut Workspace,
     ) {
         let size = final_observations.len() / rewards.len();
-        for ((reward, cut_off), observation) in
-            rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size))
-        {
+        let steps = rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size));
+        for ((reward, cut_off), observation) in steps {
             *reward *= self.config.reward_scale as f32;
             if cut_off {
                 let mut value = [0.0];

@@ -62,20 +62,21 @@ impl Adam {
     }
 }
 
-/// Returns the chunks of each range of parameters, whose squares are added up apart.
-pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Vec<Range<usize>>> {
+/// Returns the chunks of these ranges of parameters, whose squares are added up apart.
+pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let chunks = |group: &Range<usize>| {
-        let firsts = group.clone().step_by(NORM_CHUNK);
-        firsts.map(|first| first..group.end.min(first + NORM_CHUNK)).collect()
+        let (firsts, end) = (group.clone().step_by(NORM_CHUNK), group.end);
+        firsts.map(move |first| first..end.min(first + NORM_CHUNK))
     };
-    groups.iter().map(chunks).collect()
+    groups.iter().flat_map(chunks).collect()
 }
 
 /// Returns the Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
 /// group.
-pub(super) fn norm(squares: &[f64], chunks: &[Vec<Range<usize>>]) -> f64 {
+pub(super) fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
-    chunks.iter().map(|group| squares.by_ref().take(group.len()).sum::<f64>()).sum::<f64>().sqrt()
+    let of_group = |group: &Range<usize>| squares.by_ref().take(group.len().div_ceil(NORM_CHUNK)).sum::<f64>();
+    groups.iter().map(of_group).sum::<f64>().sqrt()
 }
 
 /// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
@@ -95,9 +96,8 @@ mod tests {
     use super::*;
 
     fn norm_of(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
-        let chunks = norm_chunks(groups);
-        let squares: Vec<f64> = chunks.concat().into_par_iter().map(|chunk| sum_of_squares(&gradient[chunk])).collect();
-        norm(&squares, &chunks)
+        let chunks = norm_chunks(groups).into_par_iter();
+        norm(&chunks.map(|chunk| sum_of_squares(&gradient[chunk])).collect::<Vec<f64>>(), groups)
     }
 
     /// The expected values are those of this program (PyTorch):

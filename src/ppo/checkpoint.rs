@@ -76,14 +76,11 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a value is not finite.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
-        let mut content = self.content.clone();
-        for (key, text) in
-            [("format", FORMAT), ("config", &self.config), ("progress", &serde_json::to_string(&self.progress)?)]
-        {
-            content.texts.insert(key.into(), text.into());
-        }
+        let (mut content, progress) = (self.content.clone(), serde_json::to_string(&self.progress)?);
+        let always = [("format", FORMAT), ("config", &self.config), ("progress", &progress)];
         let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene)];
-        content.texts.extend(others.into_iter().filter_map(|(key, text)| Some((key.into(), text.clone()?))));
+        let others = others.into_iter().filter_map(|(key, text)| Some((key, text.as_deref()?)));
+        content.texts.extend(always.into_iter().chain(others).map(|(key, text)| (key.into(), text.into())));
         content.to_bytes()
     }
 
@@ -91,11 +88,10 @@ impl Checkpoint {
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
-        let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
-        let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
-        let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
-        let content = Content { arrays, ..Content::default() };
-        Self { config, progress, provenance: self.provenance.clone(), scene: self.scene.clone(), content }
+        let mut alone = self.clone();
+        alone.content.arrays.retain(|name, _| needed(name));
+        alone.progress.fork = None;
+        alone
     }
 
     /// Returns whether its scene may be the one with this fingerprint.
@@ -122,10 +118,8 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_doubles(&mut self, name: &str) -> Result<Vec<f64>> {
-        match self.take(name)? {
-            Array::F64(_, values) => Ok(values),
-            _ => bail!("tensor `{name}` must be of type F64"),
-        }
+        let Array::F64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type F64") };
+        Ok(values)
     }
 
     /// Removes a u64 array of any shape and returns its values.
@@ -133,10 +127,8 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_counters(&mut self, name: &str) -> Result<Vec<u64>> {
-        match self.take(name)? {
-            Array::U64(_, values) => Ok(values),
-            _ => bail!("tensor `{name}` must be of type U64"),
-        }
+        let Array::U64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type U64") };
+        Ok(values)
     }
 
     fn take_vector(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
@@ -152,10 +144,8 @@ impl Checkpoint {
         for View { name, shape, .. } in views {
             let name = format!("{prefix}{name}");
             self.expect(&name, shape)?;
-            match self.take(&name)? {
-                Array::F32(_, values) => all.extend(values),
-                _ => bail!("tensor `{name}` must be of type F32"),
-            }
+            let Array::F32(_, values) = self.take(&name)? else { bail!("tensor `{name}` must be of type F32") };
+            all.extend(values);
         }
         Ok(all)
     }

@@ -22,13 +22,10 @@ impl Checkpoint {
         if from.hidden == to.hidden {
             return Ok(());
         }
-        let wider =
-            from.hidden.len() == to.hidden.len() && from.hidden.iter().zip(&to.hidden).all(|(old, new)| old <= new);
+        let [old, new] = [&from.hidden, &to.hidden];
         ensure!(
-            wider,
-            "ppo.hidden = {:?}: nets of {:?} can only be made wider, with the same number of layers and none smaller",
-            to.hidden,
-            from.hidden
+            old.len() == new.len() && old.iter().zip(new).all(|(old, new)| old <= new),
+            "ppo.hidden = {new:?}: nets of {old:?} can only be made wider, with the same number of layers and none smaller"
         );
         let (old, new) = (Layout::new(&from.hidden, &spaces), Layout::new(&to.hidden, &spaces));
         let mut policy = Policy::random(to, spaces, 1.0, seed)?.parameters;
@@ -37,11 +34,11 @@ impl Checkpoint {
                 row[old.inputs..].fill(0.0);
             }
         }
-        self.grow_array("", (&old, &new), |_| policy)?;
-        self.grow_array("adam.mean.", (&old, &new), |_| vec![0.0; new.count()])?;
+        self.widen("", [&old, &new], |_| policy)?;
+        self.widen("adam.mean.", [&old, &new], |_| vec![0.0; new.count()])?;
         // New entries start with the mean of the old ones of the same tensor: from zero, their first steps would be
         // many times too large.
-        self.grow_array("adam.square.", (&old, &new), |known| {
+        self.widen("adam.square.", [&old, &new], |known| {
             let mut begin = vec![0.0; new.count()];
             for (View { range: old, .. }, View { range: new, .. }) in old.views().into_iter().zip(new.views()) {
                 let mean = known[old.clone()].iter().sum::<f32>() / old.len() as f32;
@@ -53,12 +50,7 @@ impl Checkpoint {
 
     /// Replaces the arrays with this prefix by those of the new layout: the values that `begin` returns for them, with
     /// the existing values copied over.
-    fn grow_array(
-        &mut self,
-        prefix: &str,
-        (old, new): (&Layout, &Layout),
-        begin: impl FnOnce(&[f32]) -> Vec<f32>,
-    ) -> Result<()> {
+    fn widen(&mut self, prefix: &str, [old, new]: [&Layout; 2], begin: impl FnOnce(&[f32]) -> Vec<f32>) -> Result<()> {
         let known = self.take_floats(prefix, &old.views())?;
         let mut numbers = begin(&known);
         for (old, new) in old.layers().zip(new.layers()) {

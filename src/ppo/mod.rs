@@ -26,10 +26,10 @@ mod widest;
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
-use std::ops::{Add, Range};
+use std::ops::Add;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use rayon::prelude::*;
 
 pub use acting::Acting;
@@ -50,6 +50,7 @@ use crate::ranks::{Exchange, Minibatch, Slices};
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
 use adam::{Adam, norm, norm_chunks, sum_of_squares};
+use backend::GradientBackend;
 use candle::Reference;
 use gae::gae;
 use kernels::{Arithmetic, Kernels};
@@ -59,7 +60,7 @@ pub struct Ppo {
     config: PpoConfig,
     seed: u64,
     policy: Policy,
-    backend: Box<dyn backend::Backend>,
+    backend: Box<dyn GradientBackend>,
     arithmetic: Arithmetic,
     /// The gradient of all parameters for the last minibatch.
     gradient: Vec<f32>,
@@ -69,8 +70,6 @@ pub struct Ppo {
     /// The desired KL divergence of an iteration, nats; 0: the learning rate is fixed.
     desired_kl: f64,
     exchange: Exchange,
-    /// The chunks of each net, by which the norm of the gradient is computed.
-    chunks: Vec<Vec<Range<usize>>>,
     /// The parameters that are moved here.
     slices: Slices,
 }
@@ -123,14 +122,13 @@ impl Ppo {
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
         let policy = Policy::random(&config.net(), spaces, config.std.by_equal_factors(0), seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
-        let backend: Box<dyn backend::Backend> = match config.backend {
+        let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
             Backend::Candle => Box::new(Reference(config.clone())),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
-        let chunks = norm_chunks(&policy.layout.nets());
-        let slices = exchange.slices(&chunks.concat());
+        let slices = exchange.slices(&norm_chunks(&policy.layout.nets()));
         Ok(Self {
             config: config.clone(),
             seed,
@@ -142,7 +140,6 @@ impl Ppo {
             learning_rate,
             desired_kl,
             exchange,
-            chunks,
             slices,
         })
     }
@@ -201,30 +198,28 @@ impl Ppo {
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
         // wake it.
-        rayon::scope(|_| self.learn(rollout, iteration, stop))
-    }
-
-    fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
-        let explained_variance = self.prepare(rollout);
-        self.backend.begin(&self.policy, rollout);
-        let samples = rollout.samples();
-        let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
-        let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
-        let mut minibatches = self.exchange.minibatches(samples, size, stream);
-        let mut steps = Vec::new();
-        for epoch in 0..self.config.epochs {
-            for (part, minibatch) in minibatches.shuffled().enumerate() {
-                if stop.load(Ordering::Relaxed) {
-                    return Ok(None);
+        rayon::scope(|_| {
+            let explained_variance = self.prepare(rollout);
+            self.backend.begin(&self.policy, rollout);
+            let samples = rollout.samples();
+            let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
+            let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
+            let mut minibatches = self.exchange.minibatches(samples, size, stream);
+            let mut steps = Vec::new();
+            for epoch in 0..self.config.epochs {
+                for (part, minibatch) in minibatches.shuffled().enumerate() {
+                    if stop.load(Ordering::Relaxed) {
+                        return Ok(None);
+                    }
+                    let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
+                    steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
                 }
-                let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
-                steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
             }
-        }
-        self.check_weights()?;
-        let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
-        self.policy.see(&seen, &self.exchange);
-        Ok(Some(self.stats(&steps, explained_variance)))
+            self.check_weights()?;
+            let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
+            self.policy.see(&seen, &self.exchange);
+            Ok(Some(self.stats(&steps, explained_variance)))
+        })
     }
 
     /// Returns the statistics of an update with these steps: the mean losses and the norm of the gradient of each.
@@ -277,11 +272,9 @@ impl Ppo {
         self.slices.reduce_scatter(&mut self.gradient);
         let losses = self.losses(&sums, minibatch.count);
         let squares = self.slices.of_chunks(|chunk| sum_of_squares(&self.gradient[chunk.clone()]));
-        let grad_norm = norm(&squares, &self.chunks);
+        let grad_norm = norm(&squares, &self.policy.layout.nets());
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
-            if !value.is_finite() {
-                bail!("{what} is {value}: the training has failed and stops here");
-            }
+            ensure!(value.is_finite(), "{what} is {value}: the training has failed and stops here");
         }
         if !first {
             let range = self.config.learning_rate_range;

@@ -56,7 +56,7 @@ fn column_sums(
     arrays: &[&[f32]],
     means: &[f64],
     perceive: impl Fn(&mut [f32]) + Sync,
-    f: impl Fn(f64, f64) -> f64 + Sync,
+    f: fn(f64, f64) -> f64,
 ) -> Vec<f64> {
     let size = means.len();
     let of_task = |rows: &[f32]| {

@@ -9,7 +9,7 @@ use anyhow::Result;
 use candle_core::{Device, Tensor, Var};
 
 use super::Policy;
-use super::backend::{Backend, Losses};
+use super::backend::{GradientBackend, Losses};
 use super::parameters::Layer;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::{Activation, PpoConfig};
@@ -20,37 +20,34 @@ use loss::{Batch, Gaussian};
 /// The gradient backend in candle, with these settings.
 pub(super) struct Reference(pub PpoConfig);
 
-impl Reference {
-    /// Gathers these samples of a rollout.
-    fn minibatch(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
-        let Spaces { observation_size, action_size, .. } = policy.spaces;
-        let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
-            let located = samples.iter().map(|&sample| rollout.locate(sample));
-            located.flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)]).copied().collect()
-        };
-        let rows = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
-        let column = |of| Tensor::from_vec(array(1, of), samples.len(), &Device::Cpu);
-        let raw = array(observation_size, |block| &block.observations);
-        let mut observations = vec![0.0; raw.len()];
-        policy.input_transform().apply(&raw, &mut observations);
-        Ok(Batch {
-            observations: rows(observation_size, observations)?,
-            actions: rows(action_size, array(action_size, |block| &block.actions))?,
-            old_means: rows(action_size, array(action_size, |block| &block.means))?,
-            scales: rows(1, array(1, |block| &block.noise_scales))?,
-            old_log_probs: column(|block| &block.log_probs)?,
-            old_values: column(|block| &block.values)?,
-            advantages: column(|block| &block.advantages)?,
-            returns: column(|block| &block.returns)?,
-        })
-    }
+/// Gathers these samples of a rollout.
+fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
+    let Spaces { observation_size, action_size, .. } = policy.spaces;
+    let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
+        let located = samples.iter().map(|&sample| rollout.locate(sample));
+        located.flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)]).copied().collect()
+    };
+    let rows = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
+    let column = |of| Tensor::from_vec(array(1, of), samples.len(), &Device::Cpu);
+    let raw = array(observation_size, |block| &block.observations);
+    let mut observations = vec![0.0; raw.len()];
+    policy.input_transform().apply(&raw, &mut observations);
+    Ok(Batch {
+        observations: rows(observation_size, observations)?,
+        actions: rows(action_size, array(action_size, |block| &block.actions))?,
+        old_means: rows(action_size, array(action_size, |block| &block.means))?,
+        scales: rows(1, array(1, |block| &block.noise_scales))?,
+        old_log_probs: column(|block| &block.log_probs)?,
+        old_values: column(|block| &block.values)?,
+        advantages: column(|block| &block.advantages)?,
+        returns: column(|block| &block.returns)?,
+    })
 }
-
-impl Backend for Reference {
+impl GradientBackend for Reference {
     fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
         let (mut sums, mut gradients) = (Vec::new(), Vec::new());
         for group in &of.groups {
-            let (batch, mut variables) = (Self::minibatch(policy, rollout, group)?, Vec::new());
+            let (batch, mut variables) = (gathered(policy, rollout, group)?, Vec::new());
             let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
             let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?.squeeze(1)?;
             let log_std = Tensor::full(policy.log_std, policy.spaces.action_size, &Device::Cpu)?;

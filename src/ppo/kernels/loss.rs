@@ -26,7 +26,7 @@ pub(super) struct Loss<'a> {
 }
 
 /// Sums over the samples of a group.
-#[derive(Clone, Default)]
+#[derive(Default)]
 pub(super) struct Sums {
     /// All but the KL divergence.
     losses: Losses,

@@ -31,7 +31,7 @@ pub use net::Workspace;
 pub(super) use product::Matrix;
 
 use super::Policy;
-use super::backend::{Backend, Losses};
+use super::backend::{GradientBackend, Losses};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
@@ -49,27 +49,25 @@ pub(super) struct Kernels {
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
-    /// Results, one per group and net.
-    parts: Vec<Partial>,
+    /// Results of each group, for actor and critic.
+    parts: Vec<[Partial; 2]>,
     /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
 }
 
 /// The result of a job.
-#[derive(Clone, Default)]
+#[derive(Default)]
 struct Partial {
     gradient: Vec<f32>,
     sums: Sums,
 }
 
 /// The net that a job works on.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 enum Role {
     Actor,
     Critic,
 }
-
-const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 
 impl Kernels {
     /// Creates the backend with these settings.
@@ -85,34 +83,20 @@ impl Kernels {
         while self.workspaces.len() < rayon::current_num_threads() {
             self.workspaces.push(Mutex::new(policy.workspace(rows, true, self.arithmetic)));
         }
-        if self.parts.len() < 2 * groups {
-            self.parts.resize(2 * groups, Partial::default());
+        if self.parts.len() < groups {
+            self.parts.resize_with(groups, Default::default);
         }
         rows
     }
-
-    /// Writes the sum of the gradients of all groups for one net.
-    fn add_up(&self, role: Role, groups: usize, out: &mut [f32]) {
-        let gradients: Vec<&[f32]> =
-            (0..groups).map(|group| &self.parts[2 * group + role as usize].gradient[..]).collect();
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
-            let own = i * CHUNK..i * CHUNK + out.len();
-            let of_groups: Vec<&[f32]> = gradients.iter().map(|gradient| &gradient[own.clone()]).collect();
-            tree_sum(out, &of_groups);
-        });
-    }
 }
 
-impl Backend for Kernels {
+impl GradientBackend for Kernels {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
         let (transform, size) = (policy.input_transform(), policy.spaces.observation_size);
         self.seen.resize(rollout.samples() * size, 0.0);
-        let (mut rest, mut parts) = (&mut self.seen[..], Vec::new());
-        for block in &rollout.blocks {
-            let (seen, after) = rest.split_at_mut(block.samples() * size);
-            parts.push((seen, block));
-            rest = after;
-        }
+        let mut rest = &mut self.seen[..];
+        let mut seen = |block: &RolloutBlock| rest.split_off_mut(..block.samples() * size).expect("room for all");
+        let parts: Vec<_> = rollout.blocks.iter().map(|block| (seen(block), block)).collect();
         parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
     }
 
@@ -121,9 +105,10 @@ impl Backend for Kernels {
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
         let nets = policy.nets(self.arithmetic, true);
         let loss = Loss::new(policy, rollout, of.count, &self.config);
-        let tasks = groups.iter().flat_map(|group| ROLES.map(|role| (group, role)));
-        let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
-        tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
+        let parts = groups.iter().zip(&mut self.parts);
+        let jobs =
+            parts.flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)]);
+        jobs.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(|(group, role, part)| {
             let net = &nets[role as usize];
             part.gradient.resize(net.parameter_count(), 0.0);
             part.sums = loss.of_none();
@@ -143,10 +128,14 @@ impl Backend for Kernels {
             }
         });
 
-        for (role, range) in ROLES.into_iter().zip(policy.layout.nets()) {
-            self.add_up(role, groups.len(), &mut out[range]);
+        let parts = &self.parts[..groups.len()];
+        for (net, range) in policy.layout.nets().into_iter().enumerate() {
+            out[range].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
+                let own = i * CHUNK..i * CHUNK + out.len();
+                let of_groups: Vec<&[f32]> = parts.iter().map(|nets| &nets[net].gradient[own.clone()]).collect();
+                tree_sum(out, &of_groups);
+            });
         }
-        let (parts, _) = self.parts[..2 * groups.len()].as_chunks::<2>();
         Ok(parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
     }
 }

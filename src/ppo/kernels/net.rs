@@ -141,9 +141,8 @@ impl<'a> Net<'a> {
         let [above, below] = &mut work.grads;
         for (l, layer) in self.layers.iter().enumerate().rev() {
             let at = rest.len() - layer.outputs * (layer.inputs + 1);
-            let (first, own) = rest.split_at_mut(at);
+            let own = rest.split_off_mut(at..).expect("room for each layer");
             let (weight_grad, bias_grad) = own.split_at_mut(layer.outputs * layer.inputs);
-            rest = first;
 
             let grad = &mut above[..rows * layer.outputs];
             if !add {
