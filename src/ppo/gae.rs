@@ -2,8 +2,8 @@
 
 use super::rollout::RolloutBlock;
 
-/// Computes advantages and returns of a block. To its rewards, the discounted value of the final observation is already added
-/// where an episode, or the time under a goal, was cut off; its `dones` are set where the return ends with this step, for
+/// Computes advantages and returns of a block. Where an episode, or the time under a goal, was cut off, the reward already
+/// includes the discounted value of the final observation. Its `dones` are set where the return ends with this step, for
 /// whatever reason.
 ///
 /// `gamma` is the factor on a reward for each step that it comes later. At a `lambda` of 1, later rewards count alone (unbiased,

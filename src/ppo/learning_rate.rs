@@ -16,8 +16,8 @@ pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f
     }
 }
 
-/// Returns the learning rate of a fork with the settings `config`, whose parent had the settings `before` and had adapted it to
-/// `rate`: the configured one if the user changed it or fixed it, else the adapted one within its bounds.
+/// Returns the learning rate of a fork with the settings `config`: the configured one if the user changed it or fixed it, else
+/// the adapted one within its bounds. The parent had the settings `before` and had adapted it to `rate`.
 pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f64 {
     if config.desired_kl.to == 0.0 || config.learning_rate != before.learning_rate {
         return config.learning_rate;

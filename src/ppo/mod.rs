@@ -174,7 +174,7 @@ impl Ppo {
 
     /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false, self.arithmetic)
+        Workspace::new(&self.policy.layout.actor, rows, false, self.arithmetic)
     }
 
     /// Returns the policy of this iteration, for collecting a rollout.

@@ -94,11 +94,6 @@ impl Policy {
         [&self.layout.actor, &self.layout.critic].map(|layers| net(layers).prepared(arithmetic, learning))
     }
 
-    /// Returns the buffers of both nets for blocks of up to `rows` rows.
-    pub(super) fn workspace(&self, rows: usize, learning: bool, arithmetic: Arithmetic) -> Workspace {
-        Workspace::new(&self.layout.actor, rows, learning, arithmetic)
-    }
-
     /// Returns the policy in its current state.
     pub fn freeze(&self) -> FrozenPolicy<'_> {
         self.freeze_for(Arithmetic::F32)
@@ -115,7 +110,7 @@ impl FrozenPolicy<'_> {
     /// Returns a reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
     /// time, in f32.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false, Arithmetic::F32)
+        Workspace::new(&self.policy.layout.actor, rows, false, Arithmetic::F32)
     }
 
     /// Returns the sizes and the structure of observations and actions.
@@ -138,7 +133,7 @@ impl FrozenPolicy<'_> {
         self.forward(observations, &mut [(&self.critic, values)], work);
     }
 
-    /// Writes both into `out`, mean actions and values, reading the observations only once.
+    /// Writes both, mean actions and values, and reads the observations only once.
     pub fn both(&self, observations: &[f32], (means, values): (&mut [f32], &mut [f32]), work: &mut Workspace) {
         self.forward(observations, &mut [(&self.actor, means), (&self.critic, values)], work);
     }

@@ -59,8 +59,8 @@ impl Gaussian {
     }
 }
 
-/// Returns the loss that is minimised, a mean, and the sums over the samples of a minibatch for which the nets returned the
-/// distribution `new` and `values` `[M]`.
+/// Returns the loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
+/// the distribution `new` and `values` `[M]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 ///

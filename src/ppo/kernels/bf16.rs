@@ -48,7 +48,7 @@ pub trait Unit: Debug + Sync {
 }
 
 /// Computes a product block by block. `multiply` writes [`BLOCK`] × [`BLOCK`] values, whose rows are as far apart as its second
-/// argument says, or adds them if `add` is set. Its operands are two rows of tiles each: lines 0-15, then 16-31.
+/// argument says, or adds them if its last argument is set. Its operands are two rows of tiles each: lines 0-15, then 16-31.
 ///
 /// # Panics
 /// Panics if the sizes do not match.

@@ -81,7 +81,7 @@ impl Kernels {
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
         self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
-            self.workspaces.push(Mutex::new(policy.workspace(rows, true, self.arithmetic)));
+            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, true, self.arithmetic)));
         }
         if self.parts.len() < groups {
             self.parts.resize_with(groups, Default::default);
@@ -103,19 +103,19 @@ impl GradientBackend for Kernels {
     fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
         let groups = &of.groups;
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
-        let nets = policy.nets(self.arithmetic, true);
+        let (nets, ranges) = (policy.nets(self.arithmetic, true), policy.layout.nets());
         let loss = Loss::new(policy, rollout, of.count, &self.config);
         let parts = groups.iter().zip(&mut self.parts);
         let jobs =
             parts.flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)]);
         jobs.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(|(group, role, part)| {
             let net = &nets[role as usize];
-            part.gradient.resize(net.parameter_count(), 0.0);
+            part.gradient.resize(ranges[role as usize].len(), 0.0);
             part.sums = loss.of_none();
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
-                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(policy.spaces.observation_size)) {
                     row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
                 }
                 net.forward(block.len(), work);
@@ -129,7 +129,7 @@ impl GradientBackend for Kernels {
         });
 
         let parts = &self.parts[..groups.len()];
-        for (net, range) in policy.layout.nets().into_iter().enumerate() {
+        for (net, range) in ranges.into_iter().enumerate() {
             out[range].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
                 let own = i * CHUNK..i * CHUNK + out.len();
                 let of_groups: Vec<&[f32]> = parts.iter().map(|nets| &nets[net].gradient[own.clone()]).collect();

@@ -83,9 +83,9 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Returns the net with copies of its weights, which each product would else rearrange anew: for forward and backward passes
-    /// in this arithmetic if `learning`, else for many forward passes of few rows, where that takes longer than the product. The
-    /// results are the same, bit for bit.
+    /// Returns the net with rearranged copies of its weights, which each product would else make anew. They are for forward and
+    /// backward passes if `learning`, else for many forward passes of few rows, where making them would take longer than the
+    /// product. The results are the same, bit for bit.
     pub(crate) fn prepared(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
         for layer in &mut self.layers {
             if !learning {
@@ -101,19 +101,9 @@ impl<'a> Net<'a> {
         self
     }
 
-    /// Returns the number of inputs.
-    pub(crate) fn inputs(&self) -> usize {
-        self.layers[0].inputs
-    }
-
     /// Returns the number of outputs.
     pub(crate) fn outputs(&self) -> usize {
         self.layers.last().expect("a net has layers").outputs
-    }
-
-    /// Returns the number of weights and biases.
-    pub(crate) fn parameter_count(&self) -> usize {
-        self.layers.iter().map(|layer| layer.outputs * (layer.inputs + 1)).sum()
     }
 
     /// Returns the activation after layer `l`; none after the last one.
@@ -200,7 +190,7 @@ mod tests {
                 let outputs = net.forward(rows, &mut work).to_vec();
                 let (_, grad) = work.outputs_and_grad(rows, net.outputs());
                 grad.iter_mut().enumerate().for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
-                let mut gradient = vec![0.0; net.parameter_count()];
+                let mut gradient = vec![0.0; layout.nets()[0].len()];
                 net.backward(rows, &mut work, &mut gradient, false);
                 (outputs, gradient)
             });
