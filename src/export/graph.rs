@@ -3,31 +3,31 @@
 use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
-use crate::ppo::ActorParts;
-use crate::spaces::CubeAndGoal;
+use crate::ppo::{CLIP, InputTransform, Policy, ROTATIONS};
+use crate::spaces::{CubeAndGoal, Spaces};
 
 /// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
-pub(super) fn policy_graph(actor: &ActorParts) -> Graph {
-    let size = actor.mean.len();
-    let actions = actor.layers.last().expect("a net has layers").outputs;
-    let mut graph = Graph::new("policy", ("obs", size), ("actions", actions));
-    let seen = match actor.cube_and_goal {
-        Some(places) => canonicalize(&mut graph, actor, places),
+pub(super) fn policy_graph(policy: &Policy) -> Graph {
+    let Spaces { observation_size: size, action_size, .. } = policy.spaces;
+    let InputTransform { perception, mean, factor } = policy.input_transform();
+    let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));
+    let seen = match perception.cube_and_goal {
+        Some(places) => canonicalize(&mut graph, size, places),
         None => "obs".into(),
     };
-    graph.floats("mean", &[size], &actor.mean);
-    graph.floats("factor", &[size], &actor.factor);
+    graph.floats("mean", &[size], &mean);
+    graph.floats("factor", &[size], &factor);
     let centred = graph.node("Sub", &[&seen, "mean"], "centred", &[]);
     let scaled = graph.node("Mul", &[&centred, "factor"], "scaled", &[]);
-    let mut row = clip(&mut graph, &scaled, actor.clip, "normalised");
-    for (i, layer) in actor.layers.iter().enumerate() {
+    let mut row = clip(&mut graph, &scaled, CLIP, "normalised");
+    for (i, layer) in policy.layout.actor.iter().enumerate() {
         let (weight, bias) = (format!("actor.{i}.weight"), format!("actor.{i}.bias"));
-        graph.floats(&weight, &[layer.outputs, layer.inputs], layer.weight);
-        graph.floats(&bias, &[layer.outputs], layer.bias);
+        graph.floats(&weight, &[layer.outputs, layer.inputs], &policy.parameters[layer.weight.clone()]);
+        graph.floats(&bias, &[layer.outputs], &policy.parameters[layer.bias.clone()]);
         row = graph.node("Gemm", &[&row, &weight, &bias], &format!("layer{i}"), &[("transB", Int(1))]);
-        if i + 1 < actor.layers.len() {
+        if i + 1 < policy.layout.actor.len() {
             let name = format!("hidden{i}");
-            row = match actor.activation {
+            row = match policy.activation {
                 Activation::Elu => graph.node("Elu", &[&row], &name, &[("alpha", Float(1.0))]),
                 Activation::Relu => graph.node("Relu", &[&row], &name, &[]),
                 Activation::Tanh => graph.node("Tanh", &[&row], &name, &[]),
@@ -46,13 +46,13 @@ fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
 }
 
 /// Turns cube and goal by the rotation of the cube's symmetry that brings the cube closest to its unrotated orientation.
-fn canonicalize(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
+fn canonicalize(graph: &mut Graph, size: usize, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
     assert!(cube + 4 <= goal, "the goal follows the cube");
     // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
     let mut cosines = [0.0; 4 * 24];
     // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
     let mut products = Vec::new();
-    for (j, &[w, x, y, z]) in actor.rotations.iter().enumerate() {
+    for (j, &[w, x, y, z]) in ROTATIONS.iter().enumerate() {
         [w, -x, -y, -z].into_iter().enumerate().for_each(|(k, value)| cosines[k * 24 + j] = value);
         products.extend([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w]);
     }
@@ -61,7 +61,6 @@ fn canonicalize(graph: &mut Graph, actor: &ActorParts, CubeAndGoal { cube, goal 
     for (name, sign) in [("zero", 0.0), ("plus", 1.0), ("minus", -1.0)] {
         graph.floats(name, &[1], &[sign]);
     }
-    let size = actor.mean.len();
     let parts = [
         ("before", [0, cube]),
         ("cube", [cube, cube + 4]),

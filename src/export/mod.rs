@@ -13,7 +13,6 @@ use crate::load::Loaded;
 use crate::os;
 use crate::repose::{ACTUATORS, Hand, OBSERVATION, Task};
 use graph::policy_graph;
-use onnx::Model;
 
 /// The hand that the policy was trained for, for programs that refuse another.
 const HAND: &str = "right Shadow Hand, 24 joints, 20 actuators";
@@ -27,14 +26,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
     let output = os::OutputFile::create(&args.out)?;
-    let bytes = model(&loaded, &task).to_bytes();
+    let bytes = policy_graph(&loaded.policy).file(metadata(&loaded, task.hand()));
     output.finish(&bytes)?;
     os::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
     Ok(())
-}
-
-fn model(loaded: &Loaded, task: &Task) -> Model {
-    Model { graph: policy_graph(&loaded.policy.actor()), metadata: metadata(loaded, task.hand()) }
 }
 
 /// Returns what a program must know to run the policy: lists are comma-separated, numbers can be read back exactly.

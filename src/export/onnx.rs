@@ -10,32 +10,6 @@ const OPSET: i64 = 13;
 const FLOAT: i64 = 1;
 const INT64: i64 = 7;
 
-/// A file: a graph and texts about it.
-pub(super) struct Model {
-    pub(super) graph: Graph,
-    /// Sorted by key when it is written.
-    pub(super) metadata: Vec<(&'static str, String)>,
-}
-
-impl Model {
-    /// Returns the bytes of the file.
-    pub(super) fn to_bytes(&self) -> Vec<u8> {
-        let Graph { message, .. } = &self.graph;
-        let mut metadata = self.metadata.clone();
-        metadata.sort();
-        let model = Message::default()
-            .int(1, IR_VERSION)
-            .text(2, "shadow-repose")
-            .text(3, env!("CARGO_PKG_VERSION"))
-            .message(7, message)
-            .message(8, &Message::default().text(1, "").int(2, OPSET));
-        metadata
-            .iter()
-            .fold(model, |model, (key, value)| model.message(14, &Message::default().text(1, key).text(2, value)))
-            .0
-    }
-}
-
 /// A number that belongs to an operation.
 pub(super) enum Attribute {
     Int(i64),
@@ -43,15 +17,12 @@ pub(super) enum Attribute {
 }
 
 /// Operations on named values, in the order in which they are computed.
-pub(super) struct Graph {
-    message: Message,
-}
+pub(super) struct Graph(Message);
 
 impl Graph {
     /// Begins a graph that computes `output` `[batch, out]` from `input` `[batch, in]`.
     pub(super) fn new(name: &str, input: (&str, usize), output: (&str, usize)) -> Self {
-        let message = Message::default().text(2, name).message(11, &rows_of(input)).message(12, &rows_of(output));
-        Self { message }
+        Self(Message::default().text(2, name).message(11, &rows_of(input)).message(12, &rows_of(output)))
     }
 
     /// Adds an operation and returns the name of its result.
@@ -93,15 +64,27 @@ impl Graph {
     }
 
     fn add(&mut self, field: u32, part: &Message) {
-        self.message = std::mem::take(&mut self.message).message(field, part);
+        self.0 = std::mem::take(&mut self.0).message(field, part);
+    }
+
+    /// Returns the bytes of a file with this graph and texts about it, which are sorted by key.
+    pub(super) fn file(&self, mut metadata: Vec<(&str, String)>) -> Vec<u8> {
+        metadata.sort();
+        let model = Message::default()
+            .int(1, IR_VERSION)
+            .text(2, "shadow-repose")
+            .text(3, env!("CARGO_PKG_VERSION"))
+            .message(7, &self.0)
+            .message(8, &Message::default().text(1, "").int(2, OPSET));
+        let entry = |(key, value): &(&str, String)| Message::default().text(1, key).text(2, value);
+        metadata.iter().fold(model, |model, text| model.message(14, &entry(text))).0
     }
 }
 
 /// Describes a value `[batch, size]` of floats.
 fn rows_of((name, size): (&str, usize)) -> Message {
-    let dimension = |size: Message| Message::default().message(1, &size);
-    let batch = dimension(Message::default().text(2, "batch"));
-    let shape = Message(vec![]).concat(batch).concat(dimension(Message::default().int(1, size as i64)));
+    let dimensions = [Message::default().text(2, "batch"), Message::default().int(1, size as i64)];
+    let shape = dimensions.iter().fold(Message::default(), |shape, size| shape.message(1, size));
     let kind = Message::default().message(1, &Message::default().int(1, FLOAT).message(2, &shape));
     Message::default().text(1, name).message(2, &kind)
 }
@@ -129,11 +112,6 @@ impl Message {
 
     fn message(self, field: u32, value: &Self) -> Self {
         self.bytes(field, &value.0)
-    }
-
-    fn concat(mut self, other: Self) -> Self {
-        self.0.extend(other.0);
-        self
     }
 
     fn put(mut self, write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>) -> Self {

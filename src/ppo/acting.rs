@@ -26,7 +26,7 @@ impl Acting<'_> {
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
         let (actions, means) = (&mut block.actions[acted.clone()], &mut block.means[acted]);
-        self.policy.mean_actions_and_values(observations, means, &mut block.values[one.clone()], work);
+        self.policy.both(observations, (means, &mut block.values[one.clone()]), work);
         let std = self.policy.std();
         let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
@@ -68,9 +68,8 @@ impl Acting<'_> {
         work: &mut Workspace,
     ) {
         let size = final_observations.len() / rewards.len();
-        for ((reward, cut_off), observation) in
-            rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size))
-        {
+        let steps = rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size));
+        for ((reward, cut_off), observation) in steps {
             *reward *= self.config.reward_scale as f32;
             if cut_off {
                 let mut value = [0.0];

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
-use pulp::Arch;
 use rayon::prelude::*;
+
+use super::widest::widest;
 
 /// The decay rate of the mean gradient.
 const BETA1: f64 = 0.9;
@@ -37,67 +38,56 @@ impl Adam {
         Self { mean: vec![0.0; count], square: vec![0.0; count], steps: 0 }
     }
 
-    /// Moves the parameters in the range `own` one step against the gradient, which is first multiplied by `scale`.
-    pub(super) fn step(
-        &mut self,
-        parameters: &mut [f32],
-        gradient: &[f32],
-        own: Range<usize>,
-        learning_rate: f64,
-        scale: f64,
-    ) {
+    /// Moves the parameters in the range `own` one step against the gradient, which is first multiplied by `scale`, with this
+    /// learning `rate`.
+    pub(super) fn step(&mut self, parameters: &mut [f32], gradient: &[f32], own: Range<usize>, rate: f64, scale: f64) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
         let scale = scale as f32;
-        let rate = (learning_rate / correction(BETA1)) as f32;
+        let rate = (rate / correction(BETA1)) as f32;
         let unbiased = (1.0 / correction(BETA2)) as f32;
         let [mean, square] = [&mut self.mean, &mut self.square].map(|moment| &mut moment[own.clone()]);
         let parameters = parameters[own.clone()].par_chunks_mut(CHUNK).zip(gradient[own].par_chunks(CHUNK));
         let moments = mean.par_chunks_mut(CHUNK).zip(square.par_chunks_mut(CHUNK));
         parameters.zip(moments).for_each(|((x, grad), (mean, square))| {
-            Arch::new().dispatch(
-                #[inline(always)]
-                || {
-                    for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square) {
-                        let grad = grad * scale;
-                        *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
-                        *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
-                        *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
-                    }
-                },
-            );
+            widest!({
+                for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square) {
+                    let grad = grad * scale;
+                    *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
+                    *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
+                    *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
+                }
+            });
         });
     }
 }
 
-/// Returns the chunks of each range of parameters, whose squares are added up apart.
-pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Vec<Range<usize>>> {
+/// Returns the chunks of these ranges of parameters, whose squares are added up apart.
+pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let chunks = |group: &Range<usize>| {
-        let firsts = group.clone().step_by(NORM_CHUNK);
-        firsts.map(|first| first..group.end.min(first + NORM_CHUNK)).collect()
+        let (firsts, end) = (group.clone().step_by(NORM_CHUNK), group.end);
+        firsts.map(move |first| first..end.min(first + NORM_CHUNK))
     };
-    groups.iter().map(chunks).collect()
+    groups.iter().flat_map(chunks).collect()
 }
 
 /// Returns the Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
 /// group.
-pub(super) fn norm(squares: &[f64], chunks: &[Vec<Range<usize>>]) -> f64 {
+pub(super) fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
-    chunks.iter().map(|group| squares.by_ref().take(group.len()).sum::<f64>()).sum::<f64>().sqrt()
+    let of_group = |group: &Range<usize>| squares.by_ref().take(group.len().div_ceil(NORM_CHUNK)).sum::<f64>();
+    groups.iter().map(of_group).sum::<f64>().sqrt()
 }
 
 /// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
 pub(super) fn sum_of_squares(x: &[f32]) -> f64 {
     let mut lanes = [0.0f32; 32];
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            let (whole, rest) = x.as_chunks::<32>();
-            for chunk in whole.iter().map(|chunk| &chunk[..]).chain([rest]) {
-                lanes.iter_mut().zip(chunk).for_each(|(lane, x)| *lane += x * x);
-            }
-        },
-    );
+    widest!({
+        let (whole, rest) = x.as_chunks::<32>();
+        for chunk in whole.iter().map(|chunk| &chunk[..]).chain([rest]) {
+            lanes.iter_mut().zip(chunk).for_each(|(lane, x)| *lane += x * x);
+        }
+    });
     lanes.iter().map(|&lane| f64::from(lane)).sum()
 }
 
@@ -106,9 +96,8 @@ mod tests {
     use super::*;
 
     fn norm_of(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
-        let chunks = norm_chunks(groups);
-        let squares: Vec<f64> = chunks.concat().into_par_iter().map(|chunk| sum_of_squares(&gradient[chunk])).collect();
-        norm(&squares, &chunks)
+        let chunks = norm_chunks(groups).into_par_iter();
+        norm(&chunks.map(|chunk| sum_of_squares(&gradient[chunk])).collect::<Vec<f64>>(), groups)
     }
 
     /// The expected values are those of this program (PyTorch):

@@ -4,7 +4,7 @@
 mod tests {
     use std::sync::atomic::AtomicBool;
 
-    use super::super::backend::LossSums;
+    use super::super::backend::Losses;
     use super::super::kernels::{Arithmetic, Kernels};
     use super::super::{Policy, Ppo, Rollout};
     use crate::config::{self, Activation, Config, Precision};
@@ -58,7 +58,7 @@ mod tests {
     }
 
     /// Computes the gradient of these samples and leaves it in the learner.
-    fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> LossSums {
+    fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         let minibatch = ppo.exchange.minibatch(samples);
         let sums = ppo.backend.gradient(&ppo.policy, rollout, &minibatch, &mut ppo.gradient).unwrap();
         ppo.losses(&sums, minibatch.count)
@@ -119,7 +119,7 @@ mod tests {
                 let samples: Vec<u32> = (0..1024).collect();
                 (gradient(&mut ppo, &rollout, &samples), ppo)
             });
-            let total = |(losses, ppo): &(LossSums, Ppo)| losses.total(&ppo.config);
+            let total = |(losses, ppo): &(Losses, Ppo)| losses.total(&ppo.config);
             for (found, expected) in [(total(&eight), total(&one)), (eight.0.kl, one.0.kl)] {
                 assert_close(found, expected, 1e-4, "losses");
             }
@@ -155,8 +155,8 @@ mod tests {
         // 1e-8.
         for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
             let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
-            (ppo.config.epochs, ppo.config.minibatches, ppo.learning_rate.desired_kl) = (1, 1, 0.0);
-            (ppo.learning_rate.rate, ppo.config.max_grad_norm) = (1e-3, norm);
+            (ppo.config.epochs, ppo.config.minibatches, ppo.desired_kl) = (1, 1, 0.0);
+            (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
             let before = ppo.policy.parameters.clone();
             ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();
             let moved = before.iter().zip(&ppo.policy.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

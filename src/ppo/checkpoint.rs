@@ -76,14 +76,11 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a value is not finite.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
-        let mut content = self.content.clone();
-        for (key, text) in
-            [("format", FORMAT), ("config", &self.config), ("progress", &serde_json::to_string(&self.progress)?)]
-        {
-            content.texts.insert(key.into(), text.into());
-        }
+        let (mut content, progress) = (self.content.clone(), serde_json::to_string(&self.progress)?);
+        let always = [("format", FORMAT), ("config", &self.config), ("progress", &progress)];
         let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene)];
-        content.texts.extend(others.into_iter().filter_map(|(key, text)| Some((key.into(), text.clone()?))));
+        let others = others.into_iter().filter_map(|(key, text)| Some((key, text.as_deref()?)));
+        content.texts.extend(always.into_iter().chain(others).map(|(key, text)| (key.into(), text.into())));
         content.to_bytes()
     }
 
@@ -91,11 +88,10 @@ impl Checkpoint {
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
-        let arrays = self.content.arrays.iter().filter(|(name, _)| needed(name));
-        let arrays = arrays.map(|(name, array)| (name.clone(), array.clone())).collect();
-        let (config, progress) = (self.config.clone(), Progress { fork: None, ..self.progress.clone() });
-        let content = Content { arrays, ..Content::default() };
-        Self { config, progress, provenance: self.provenance.clone(), scene: self.scene.clone(), content }
+        let mut alone = self.clone();
+        alone.content.arrays.retain(|name, _| needed(name));
+        alone.progress.fork = None;
+        alone
     }
 
     /// Returns whether its scene may be the one with this fingerprint.
@@ -122,10 +118,8 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_doubles(&mut self, name: &str) -> Result<Vec<f64>> {
-        match self.take(name)? {
-            Array::F64(_, values) => Ok(values),
-            _ => bail!("tensor `{name}` must be of type F64"),
-        }
+        let Array::F64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type F64") };
+        Ok(values)
     }
 
     /// Removes a u64 array of any shape and returns its values.
@@ -133,10 +127,8 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_counters(&mut self, name: &str) -> Result<Vec<u64>> {
-        match self.take(name)? {
-            Array::U64(_, values) => Ok(values),
-            _ => bail!("tensor `{name}` must be of type U64"),
-        }
+        let Array::U64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type U64") };
+        Ok(values)
     }
 
     fn take_vector(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
@@ -152,10 +144,8 @@ impl Checkpoint {
         for View { name, shape, .. } in views {
             let name = format!("{prefix}{name}");
             self.expect(&name, shape)?;
-            match self.take(&name)? {
-                Array::F32(_, values) => all.extend(values),
-                _ => bail!("tensor `{name}` must be of type F32"),
-            }
+            let Array::F32(_, values) = self.take(&name)? else { bail!("tensor `{name}` must be of type F32") };
+            all.extend(values);
         }
         Ok(all)
     }
@@ -165,7 +155,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
-        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
+        let layout = Layout::new(&net.hidden, spaces);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
     }
@@ -178,23 +168,23 @@ impl Checkpoint {
 
     fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
         self.expect_policy(net, &spaces)?;
-        let views = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size).views();
-        let parameters = self.take_floats("", &views)?;
-        let log_std = match self.take(LOG_STD)? {
+        let mut policy = Policy::new(net, spaces)?;
+        policy.parameters = self.take_floats("", &policy.layout.views())?;
+        policy.log_std = match self.take(LOG_STD)? {
             Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
             _ => bail!("tensor `{LOG_STD}` must hold the same F32 value for each action"),
         };
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
         let [mean, variance] = ["mean", "variance"].map(|of| self.take_vector(&format!("normalizer.{of}"), size));
-        let normalizer = Normalizer { mean: mean?, variance: variance?, count };
-        let Normalizer { mean, variance, .. } = &normalizer;
+        policy.normalizer = Normalizer { mean: mean?, variance: variance?, count };
+        let Normalizer { mean, variance, .. } = &policy.normalizer;
         let small = |x: f64| x.abs() < 1e18;
         let sound = small(count) && mean.iter().chain(variance).copied().all(small);
         ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
-        Policy::new(net, spaces, parameters, log_std, normalizer)
+        Ok(policy)
     }
 
     /// Checks that every array was removed.
@@ -241,7 +231,7 @@ impl Ppo {
         let log_std = vec![self.policy.log_std; self.policy.spaces.action_size];
         checkpoint.insert(LOG_STD, Array::F32(vec![log_std.len()], log_std));
         checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
-        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate.rate]));
+        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate]));
         let normalizer = &self.policy.normalizer;
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
@@ -275,8 +265,8 @@ impl Ppo {
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
         ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is not a step count");
         self.adam.steps = steps[0];
-        self.learning_rate.rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
-        ensure!(self.learning_rate.rate > 0.0, "its learning rate is {}", self.learning_rate.rate);
+        self.learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
+        ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
         Ok(())
     }
 }
@@ -317,7 +307,7 @@ mod tests {
     fn learnt(backend: Backend, seed: u64) -> Ppo {
         let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Exchange::alone(1)).unwrap();
         ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);
-        ppo.learning_rate.rate = 0.123;
+        ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
@@ -336,7 +326,7 @@ mod tests {
                 to.restore(&mut checkpoint).unwrap();
                 checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
-                assert_eq!(to.learning_rate.rate, 0.123);
+                assert_eq!(to.learning_rate, 0.123);
                 assert!(to.adam == from.adam && from.adam.mean.iter().any(|&x| x != 0.0));
                 assert_eq!(saved(&to).content, saved(&from).content);
             }
@@ -364,7 +354,7 @@ mod tests {
         to.begin_with(&saved(&from)).unwrap();
         assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
         let fresh = config(Backend::Fused, &[8]).learning_rate;
-        assert_eq!((to.learning_rate.rate, to.adam.steps), (fresh, 0));
+        assert_eq!((to.learning_rate, to.adam.steps), (fresh, 0));
         assert!(learner(&[9]).begin_with(&saved(&from)).is_err());
     }
 

@@ -56,11 +56,11 @@ impl Content {
         let mut parts = Vec::new();
         for (name, array) in &self.arrays {
             ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
-            parts.push((name, array.bytes(), array));
+            parts.push((name, array.bytes(), array.shape()));
         }
         let mut views = Vec::new();
-        for (name, bytes, array) in &parts {
-            views.push((name.to_string(), TensorView::new(array.dtype(), array.shape().to_vec(), bytes)?));
+        for (name, (kind, bytes), shape) in &parts {
+            views.push((name.to_string(), TensorView::new(*kind, shape.to_vec(), bytes)?));
         }
         seal(self.texts.clone().into_iter().collect(), views)
     }
@@ -165,19 +165,12 @@ impl Array {
         Ok(array)
     }
 
-    fn bytes(&self) -> Vec<u8> {
+    /// Returns the type of the values, and their bytes.
+    fn bytes(&self) -> (Dtype, Vec<u8>) {
         match self {
-            Self::F32(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
-            Self::F64(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
-            Self::U64(_, values) => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
-        }
-    }
-
-    fn dtype(&self) -> Dtype {
-        match self {
-            Self::F32(..) => Dtype::F32,
-            Self::F64(..) => Dtype::F64,
-            Self::U64(..) => Dtype::U64,
+            Self::F32(_, values) => (Dtype::F32, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Self::F64(_, values) => (Dtype::F64, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Self::U64(_, values) => (Dtype::U64, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
         }
     }
 

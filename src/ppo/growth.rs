@@ -7,7 +7,7 @@
 use anyhow::{Result, ensure};
 
 use super::format::Array;
-use super::parameters::{Layer, Layout, View};
+use super::parameters::{Layout, View};
 use super::{Checkpoint, Policy};
 use crate::config::NetConfig;
 use crate::spaces::Spaces;
@@ -22,27 +22,23 @@ impl Checkpoint {
         if from.hidden == to.hidden {
             return Ok(());
         }
-        let wider =
-            from.hidden.len() == to.hidden.len() && from.hidden.iter().zip(&to.hidden).all(|(old, new)| old <= new);
+        let [old, new] = [&from.hidden, &to.hidden];
         ensure!(
-            wider,
-            "ppo.hidden = {:?}: nets of {:?} can only be made wider, with the same number of layers and none smaller",
-            to.hidden,
-            from.hidden
+            old.len() == new.len() && old.iter().zip(new).all(|(old, new)| old <= new),
+            "ppo.hidden = {new:?}: nets of {old:?} can only be made wider, with the same number of layers and none smaller"
         );
-        let layout = |net: &NetConfig| Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
-        let (old, new) = (layout(from), layout(to));
+        let (old, new) = (Layout::new(&from.hidden, &spaces), Layout::new(&to.hidden, &spaces));
         let mut policy = Policy::random(to, spaces, 1.0, seed)?.parameters;
-        for (old, new) in layers(&old).zip(layers(&new)) {
+        for (old, new) in old.layers().zip(new.layers()) {
             for row in policy[new.weight.clone()].chunks_exact_mut(new.inputs).take(old.outputs) {
                 row[old.inputs..].fill(0.0);
             }
         }
-        self.grow_array("", (&old, &new), |_| policy)?;
-        self.grow_array("adam.mean.", (&old, &new), |_| vec![0.0; new.count()])?;
+        self.widen("", [&old, &new], |_| policy)?;
+        self.widen("adam.mean.", [&old, &new], |_| vec![0.0; new.count()])?;
         // New entries start with the mean of the old ones of the same tensor: from zero, their first steps would be
         // many times too large.
-        self.grow_array("adam.square.", (&old, &new), |known| {
+        self.widen("adam.square.", [&old, &new], |known| {
             let mut begin = vec![0.0; new.count()];
             for (View { range: old, .. }, View { range: new, .. }) in old.views().into_iter().zip(new.views()) {
                 let mean = known[old.clone()].iter().sum::<f32>() / old.len() as f32;
@@ -54,15 +50,10 @@ impl Checkpoint {
 
     /// Replaces the arrays with this prefix by those of the new layout: the values that `begin` returns for them, with
     /// the existing values copied over.
-    fn grow_array(
-        &mut self,
-        prefix: &str,
-        (old, new): (&Layout, &Layout),
-        begin: impl FnOnce(&[f32]) -> Vec<f32>,
-    ) -> Result<()> {
+    fn widen(&mut self, prefix: &str, [old, new]: [&Layout; 2], begin: impl FnOnce(&[f32]) -> Vec<f32>) -> Result<()> {
         let known = self.take_floats(prefix, &old.views())?;
         let mut numbers = begin(&known);
-        for (old, new) in layers(old).zip(layers(new)) {
+        for (old, new) in old.layers().zip(new.layers()) {
             let rows = numbers[new.weight.clone()].chunks_exact_mut(new.inputs);
             for (row, known) in rows.zip(known[old.weight.clone()].chunks_exact(old.inputs)) {
                 row[..old.inputs].copy_from_slice(known);
@@ -74,11 +65,6 @@ impl Checkpoint {
         }
         Ok(())
     }
-}
-
-/// Returns the layers of both nets.
-fn layers(layout: &Layout) -> impl Iterator<Item = &Layer> {
-    layout.actor.iter().chain(&layout.critic)
 }
 
 #[cfg(test)]
@@ -108,7 +94,7 @@ mod tests {
     fn answers(ppo: &Ppo) -> Vec<f32> {
         let policy = ppo.policy().freeze();
         let (observations, mut means, mut values) = ([0.3, -2.0, 1.0, 0.0, 5.0, -0.1], [0.0; 4], [0.0; 2]);
-        policy.mean_actions_and_values(&observations, &mut means, &mut values, &mut policy.workspace(2));
+        policy.both(&observations, (&mut means, &mut values), &mut policy.workspace(2));
         means.into_iter().chain(values).collect()
     }
 

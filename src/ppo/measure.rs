@@ -60,10 +60,10 @@ pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
         for (o, i, inner) in products(policy) {
             let weight = Matrix::new(&weights[..o * i], o, i);
             let (x, dz) = (Matrix::new(&x[..ROWS * i], ROWS, i), Matrix::new(&dz[..ROWS * o], ROWS, o));
-            multiplier.product(&mut out[..ROWS * o], x, weight.transposed().into(), false);
-            multiplier.product(&mut out[..o * i], dz.transposed(), x.into(), true);
+            multiplier.product(&mut out[..ROWS * o], x, weight.transposed(), None, false);
+            multiplier.product(&mut out[..o * i], dz.transposed(), x, None, true);
             if inner {
-                multiplier.product(&mut out[..ROWS * i], dz, weight.into(), false);
+                multiplier.product(&mut out[..ROWS * i], dz, weight, None, false);
             }
         }
         start.elapsed().as_secs_f64()

@@ -22,25 +22,26 @@ mod perception;
 mod policy;
 mod progress;
 mod rollout;
+mod widest;
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
-use std::ops::Range;
+use std::ops::Add;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use rayon::prelude::*;
 
 pub use acting::Acting;
+pub use backend::Losses;
 pub use checkpoint::Checkpoint;
 pub use format::{Array, Damaged, sealed};
-pub use gae::{Discount, gae};
 pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
-pub use perception::Perception;
-pub use policy::{ActorParts, FrozenPolicy, LayerParts, Policy};
+pub use perception::{CLIP, InputTransform, Perception, ROTATIONS};
+pub use policy::{FrozenPolicy, Policy};
 pub use progress::{Evaluation, Fork, Progress};
 pub use rollout::{Rollout, RolloutBlock};
 
@@ -49,10 +50,10 @@ use crate::ranks::{Exchange, Minibatch, Slices};
 use crate::rng::{self, Rng};
 use crate::spaces::Spaces;
 use adam::{Adam, norm, norm_chunks, sum_of_squares};
-use backend::{GradientBackend, LossSums};
+use backend::GradientBackend;
 use candle::Reference;
+use gae::gae;
 use kernels::{Arithmetic, Kernels};
-use learning_rate::LearningRate;
 
 /// A learner: the policy and everything that trains it.
 pub struct Ppo {
@@ -64,10 +65,11 @@ pub struct Ppo {
     /// The gradient of all parameters for the last minibatch.
     gradient: Vec<f32>,
     adam: Adam,
-    learning_rate: LearningRate,
+    /// The learning rate of the next step.
+    learning_rate: f64,
+    /// The desired KL divergence of an iteration, nats; 0: the learning rate is fixed.
+    desired_kl: f64,
     exchange: Exchange,
-    /// The chunks of each net, by which the norm of the gradient is computed.
-    chunks: Vec<Vec<Range<usize>>>,
     /// The parameters that are moved here.
     slices: Slices,
 }
@@ -75,22 +77,12 @@ pub struct Ppo {
 /// Statistics of an update: means over its minibatches unless stated otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
-    /// The clipped surrogate, negated.
-    pub policy_loss: f64,
-    /// The clipped squared error of the values.
-    pub value_loss: f64,
-    /// Squared distance of the mean actions from [-1, 1], beyond which they are clipped.
-    pub excess: f64,
+    /// The losses.
+    pub losses: Losses,
+    /// Those of the first minibatch alone, before any gradient step: KL divergence and ratio error are zero up to rounding.
+    pub first: Losses,
     /// Entropy of the action distribution at noise scale 1, nats.
     pub entropy: f64,
-    /// KL divergence from the policy that collected the rollout, nats.
-    pub kl: f64,
-    /// The same for the first minibatch alone, before any gradient step: zero up to rounding.
-    pub first_kl: f64,
-    /// The largest |ratio - 1| of the first minibatch: zero up to rounding.
-    pub first_ratio_error: f64,
-    /// Fraction of the samples whose ratio was clipped.
-    pub clip_fraction: f64,
     /// Norm of the whole gradient, before clipping.
     pub grad_norm: f64,
     /// Standard deviation at noise scale 1, after the update.
@@ -105,14 +97,14 @@ impl UpdateStats {
     /// Returns the logged statistics, each with its group and name.
     pub fn named(&self) -> [(&'static str, f64); 11] {
         [
-            ("loss/policy", self.policy_loss),
-            ("loss/value", self.value_loss),
+            ("loss/policy", -self.losses.surrogate),
+            ("loss/value", self.losses.value_error),
             ("policy/entropy", self.entropy),
-            ("policy/kl", self.kl),
-            ("policy/first_kl", self.first_kl),
-            ("policy/clip_fraction", self.clip_fraction),
+            ("policy/kl", self.losses.kl),
+            ("policy/first_kl", self.first.kl),
+            ("policy/clip_fraction", self.losses.clipped),
             ("policy/std", self.std),
-            ("policy/excess", self.excess),
+            ("policy/excess", self.losses.excess),
             ("value/explained_variance", self.explained_variance),
             ("optim/learning_rate", self.learning_rate),
             ("optim/grad_norm", self.grad_norm),
@@ -132,13 +124,24 @@ impl Ppo {
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference::new(config)),
+            Backend::Candle => Box::new(Reference(config.clone())),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
-        let (config, learning_rate) = (config.clone(), LearningRate::new(config));
-        let chunks = norm_chunks(&policy.layout.nets());
-        let slices = exchange.slices(&chunks.concat());
-        Ok(Self { config, seed, policy, backend, arithmetic, gradient, adam, learning_rate, exchange, chunks, slices })
+        let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
+        let slices = exchange.slices(&norm_chunks(&policy.layout.nets()));
+        Ok(Self {
+            config: config.clone(),
+            seed,
+            policy,
+            backend,
+            arithmetic,
+            gradient,
+            adam,
+            learning_rate,
+            desired_kl,
+            exchange,
+            slices,
+        })
     }
 
     /// Returns the current policy.
@@ -165,13 +168,13 @@ impl Ppo {
         if horizon != rollout.horizon() {
             rollout.resize(horizon, &self.policy.spaces);
         }
-        self.learning_rate.follow_ramp(env_steps);
+        self.desired_kl = self.config.desired_kl.by_equal_factors(env_steps);
         self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
     }
 
     /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false, self.arithmetic)
+        Workspace::new(&self.policy.layout.actor, rows, false, self.arithmetic)
     }
 
     /// Returns the policy of this iteration, for collecting a rollout.
@@ -195,63 +198,53 @@ impl Ppo {
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
         // wake it.
-        rayon::scope(|_| self.learn(rollout, iteration, stop))
-    }
-
-    fn learn(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
-        let explained_variance = self.prepare(rollout);
-        self.backend.begin(&self.policy, rollout);
-        let samples = rollout.samples();
-        let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
-        let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
-        let mut minibatches = self.exchange.minibatches(samples, size, stream);
-        let mut steps = Vec::new();
-        for epoch in 0..self.config.epochs {
-            for (part, minibatch) in minibatches.shuffled().enumerate() {
-                if stop.load(Ordering::Relaxed) {
-                    return Ok(None);
+        rayon::scope(|_| {
+            let explained_variance = self.prepare(rollout);
+            self.backend.begin(&self.policy, rollout);
+            let samples = rollout.samples();
+            let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
+            let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
+            let mut minibatches = self.exchange.minibatches(samples, size, stream);
+            let mut steps = Vec::new();
+            for epoch in 0..self.config.epochs {
+                for (part, minibatch) in minibatches.shuffled().enumerate() {
+                    if stop.load(Ordering::Relaxed) {
+                        return Ok(None);
+                    }
+                    let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
+                    steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
                 }
-                let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
-                steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
             }
-        }
-        self.check_weights()?;
-        let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
-        self.policy.see(&seen, &self.exchange);
-        Ok(Some(self.stats(&steps, explained_variance)))
+            self.check_weights()?;
+            let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
+            self.policy.see(&seen, &self.exchange);
+            Ok(Some(self.stats(&steps, explained_variance)))
+        })
     }
 
     /// Returns the statistics of an update with these steps: the mean losses and the norm of the gradient of each.
-    fn stats(&self, steps: &[(LossSums, f64)], explained_variance: f64) -> UpdateStats {
-        let mean = |of: &dyn Fn(&LossSums) -> f64| steps.iter().map(|(losses, _)| of(losses)).sum::<f64>();
-        let mean = |of: &dyn Fn(&LossSums) -> f64| mean(of) / steps.len() as f64;
+    fn stats(&self, steps: &[(Losses, f64)], explained_variance: f64) -> UpdateStats {
+        let mean = |sum: f64| sum / steps.len() as f64;
+        let losses = steps.iter().map(|(losses, _)| *losses).reduce(Losses::add).expect("a step").means(steps.len());
         // The entropy of the Gaussian at noise scale 1.
         let of_action = f64::from(self.policy.log_std) + 0.5 * (TAU * E).ln();
         let entropy: f64 = repeat_n(of_action, self.policy.spaces.action_size).sum();
-        let (first, _) = steps[0];
         UpdateStats {
-            policy_loss: mean(&|losses| -losses.surrogate),
-            value_loss: mean(&|losses| losses.value_error),
-            excess: mean(&|losses| losses.excess),
-            entropy: mean(&|_| entropy),
-            kl: mean(&|losses| losses.kl),
-            first_kl: first.kl,
-            first_ratio_error: first.ratio_error,
-            clip_fraction: mean(&|losses| losses.clipped),
-            grad_norm: steps.iter().map(|(_, norm)| norm).sum::<f64>() / steps.len() as f64,
+            losses,
+            first: steps[0].0,
+            entropy: mean(repeat_n(entropy, steps.len()).sum()),
+            grad_norm: mean(steps.iter().map(|(_, norm)| norm).sum()),
             std: f64::from(self.policy.std()),
             explained_variance,
-            learning_rate: self.learning_rate.rate,
+            learning_rate: self.learning_rate,
         }
     }
 
     /// Computes the returns and advantages, normalises the advantages to mean 0 and standard deviation 1, and returns
     /// the explained variance.
     fn prepare(&self, rollout: &mut Rollout) -> f64 {
-        let discount = Discount { gamma: self.config.gamma as f32, lambda: self.config.lambda as f32 };
-        rollout.blocks.par_iter_mut().for_each(|block| {
-            gae(discount, &block.rewards, &block.values, &block.dones, &mut block.advantages, &mut block.returns);
-        });
+        let [gamma, lambda] = [self.config.gamma, self.config.lambda].map(|factor| factor as f32);
+        rollout.blocks.par_iter_mut().for_each(|block| gae(block, gamma, lambda));
         let (_, spread) = self.mean_and_variance(rollout, |block| &block.returns);
         let (mean, residual) = self.mean_and_variance(rollout, |block| &block.advantages);
         let scale = 1.0 / (residual.sqrt() + 1e-8);
@@ -274,44 +267,36 @@ impl Ppo {
 
     /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient. In the `first` step of an
     /// update, the policy is still the one that acted.
-    fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, first: bool) -> Result<(LossSums, f64)> {
+    fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, first: bool) -> Result<(Losses, f64)> {
         let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
         self.slices.reduce_scatter(&mut self.gradient);
         let losses = self.losses(&sums, minibatch.count);
         let squares = self.slices.of_chunks(|chunk| sum_of_squares(&self.gradient[chunk.clone()]));
-        let grad_norm = norm(&squares, &self.chunks);
+        let grad_norm = norm(&squares, &self.policy.layout.nets());
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
-            if !value.is_finite() {
-                bail!("{what} is {value}: the training has failed and stops here");
-            }
+            ensure!(value.is_finite(), "{what} is {value}: the training has failed and stops here");
         }
         if !first {
-            self.learning_rate.adapt(losses.kl);
+            let range = self.config.learning_rate_range;
+            self.learning_rate = learning_rate::adapted(self.learning_rate, losses.kl, self.desired_kl, range);
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
-        self.adam.step(parameters, &self.gradient, own, self.learning_rate.rate, scale);
+        self.adam.step(parameters, &self.gradient, own, self.learning_rate, scale);
         self.slices.all_gather(parameters);
         Ok((losses, grad_norm))
     }
 
     /// Returns the mean losses of a minibatch of `count` samples, given the sums of each group here.
-    fn losses(&self, sums: &[LossSums], count: usize) -> LossSums {
-        let add = |sum: &mut LossSums, more| *sum += more;
-        let of_groups = |groups: &[LossSums]| {
-            groups.iter().copied().reduce(|mut sum, more| {
-                sum += more;
-                sum
-            })
-        };
-        let total = self.exchange.sum(sums, |groups| of_groups(groups).expect("a group"), add);
-        total.means(count)
+    fn losses(&self, sums: &[Losses], count: usize) -> Losses {
+        let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
+        self.exchange.sum(sums, of_shard, |sum: &mut Losses, more| *sum = *sum + more).means(count)
     }
 
     /// Brings the learning rate of a fork, whose parent had the settings `before`, in line with its own settings.
     pub fn reconcile_learning_rate(&mut self, before: &PpoConfig) {
-        self.learning_rate.reconcile(before);
+        self.learning_rate = learning_rate::reconciled(self.learning_rate, before, &self.config);
     }
 
     fn check_weights(&self) -> Result<()> {
@@ -338,7 +323,7 @@ mod tests {
         let config = Config::resolve(None, &["ppo.symmetry=none".parse().unwrap()]).unwrap().ppo;
         let ppo = Ppo::new(&config, SPACES, 0, Exchange::alone(1)).unwrap();
         // With a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of the two actions.
-        let entropy = ppo.stats(&[(LossSums::default(), 0.0)], 0.0).entropy;
+        let entropy = ppo.stats(&[(Losses::default(), 0.0)], 0.0).entropy;
         assert!((entropy - 2.0 * 0.908_113).abs() < 1e-5, "{entropy}");
     }
 }

@@ -1,15 +1,9 @@
 //! Running mean and variance of the observations, saved with the policy that was trained on them.
 
-use pulp::Arch;
 use rayon::prelude::*;
 
+use super::widest::widest;
 use crate::ranks::Exchange;
-
-/// Added to the variance, so that a constant input does not cause a division by zero.
-const EPSILON: f64 = 1e-5;
-
-/// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
-pub(super) const CLIP: f32 = 5.0;
 
 /// Rows that one task sums; fixed, so that the result does not depend on the number of threads.
 const ROWS_PER_TASK: usize = 1024;
@@ -29,14 +23,6 @@ impl Normalizer {
     /// Creates a normaliser that has seen nothing and leaves observations of `size` values almost unchanged.
     pub fn new(size: usize) -> Self {
         Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
-    }
-
-    /// Returns the current normalisation, in f32.
-    pub fn scaling(&self) -> Scaling {
-        Scaling {
-            mean: self.mean.iter().map(|&m| m as f32).collect(),
-            factor: self.variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect(),
-        }
     }
 
     /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the statistics; `perceive` is first
@@ -70,52 +56,25 @@ fn column_sums(
     arrays: &[&[f32]],
     means: &[f64],
     perceive: impl Fn(&mut [f32]) + Sync,
-    f: impl Fn(f64, f64) -> f64 + Sync,
+    f: fn(f64, f64) -> f64,
 ) -> Vec<f64> {
     let size = means.len();
     let of_task = |rows: &[f32]| {
         let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for row in rows.chunks_exact(size) {
-                    seen.copy_from_slice(row);
-                    perceive(&mut seen);
-                    for ((sum, &x), &mean) in sums.iter_mut().zip(&seen).zip(means) {
-                        *sum += f(f64::from(x), mean);
-                    }
+        widest!({
+            for row in rows.chunks_exact(size) {
+                seen.copy_from_slice(row);
+                perceive(&mut seen);
+                for ((sum, &x), &mean) in sums.iter_mut().zip(&seen).zip(means) {
+                    *sum += f(f64::from(x), mean);
                 }
-            },
-        );
+            }
+        });
         sums
     };
     let tasks: Vec<&[f32]> = arrays.iter().flat_map(|array| array.chunks(ROWS_PER_TASK * size)).collect();
     let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
     (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum()).collect()
-}
-
-/// The normalisation `(x - mean) · factor`, clipped.
-#[derive(Clone, Debug)]
-pub struct Scaling {
-    /// `[O]`
-    pub(super) mean: Vec<f32>,
-    /// `[O]`
-    pub(super) factor: Vec<f32>,
-}
-
-impl Scaling {
-    /// Returns the number of values in an observation.
-    pub fn size(&self) -> usize {
-        self.mean.len()
-    }
-
-    /// Normalises one observation `[O]` in place.
-    #[inline(always)]
-    pub fn apply(&self, row: &mut [f32]) {
-        for ((x, mean), factor) in row.iter_mut().zip(&self.mean).zip(&self.factor) {
-            *x = ((*x - mean) * factor).clamp(-CLIP, CLIP);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -142,17 +101,5 @@ mod tests {
             assert!((normalizer.variance[column] / variance - 1.0).abs() < 1e-9);
         }
         assert_eq!(normalizer.count, 5000.0);
-    }
-
-    #[test]
-    fn normalised_values_are_in_standard_deviations_and_clipped() {
-        let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
-        let normalised = [4.0, 2.0, 400.0].map(|x| {
-            let mut row = [x];
-            normalizer.scaling().apply(&mut row);
-            row[0]
-        });
-        assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
-        assert_eq!(normalised[1..], [0.0, CLIP]);
     }
 }

@@ -5,6 +5,8 @@
 
 use std::ops::Range;
 
+use crate::spaces::Spaces;
+
 /// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
@@ -39,15 +41,15 @@ pub struct View {
 }
 
 impl Layout {
-    /// Creates the layout of nets with these hidden layers, for observations and actions of these sizes.
-    pub fn new(hidden: &[usize], observation_size: usize, action_size: usize) -> Self {
+    /// Creates the layout of nets with these hidden layers, for observations and actions of the sizes in `spaces`.
+    pub fn new(hidden: &[usize], spaces: &Spaces) -> Self {
         let mut at = 0;
         let mut take = |count: usize| {
             at += count;
             at - count..at
         };
         let mut net = |outputs: usize| -> Vec<Layer> {
-            let mut inputs = observation_size;
+            let mut inputs = spaces.observation_size;
             let layer = |&outputs: &usize| {
                 let layer = Layer { inputs, outputs, weight: take(outputs * inputs), bias: take(outputs) };
                 inputs = outputs;
@@ -55,7 +57,12 @@ impl Layout {
             };
             hidden.iter().chain([&outputs]).map(layer).collect()
         };
-        Self { actor: net(action_size), critic: net(1) }
+        Self { actor: net(spaces.action_size), critic: net(1) }
+    }
+
+    /// Returns the layers of the actor, then those of the critic.
+    pub fn layers(&self) -> impl Iterator<Item = &Layer> {
+        self.actor.iter().chain(&self.critic)
     }
 
     /// Returns the number of weights and biases.
@@ -88,7 +95,10 @@ mod tests {
 
     #[test]
     fn the_views_cover_all_numbers_once_and_have_the_names_of_the_files() {
-        let layout = Layout::new(&[5, 4], 3, 2);
+        let layout = Layout::new(
+            &[5, 4],
+            &Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 },
+        );
         let views = layout.views();
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let layers = "0.weight 0.bias 1.weight 1.bias 2.weight 2.bias";

@@ -8,53 +8,41 @@
 use std::f32::consts::FRAC_1_SQRT_2;
 
 use anyhow::{Context, Result};
-use pulp::Arch;
 
-use super::normalizer::Scaling;
+use super::normalizer::Normalizer;
+use super::widest::widest;
 use crate::config::Symmetry;
 use crate::quat;
 use crate::spaces::{CubeAndGoal, Spaces};
 
+/// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
+pub const CLIP: f32 = 5.0;
+
+/// Added to the variance, so that a constant input does not cause a division by zero.
+const EPSILON: f64 = 1e-5;
+
+const H: f32 = 0.5;
+const R: f32 = FRAC_1_SQRT_2;
+
 /// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
-pub(super) const ROTATIONS: [[f32; 4]; 24] = {
-    const H: f32 = 0.5;
-    const R: f32 = FRAC_1_SQRT_2;
-    [
-        [1.0, 0.0, 0.0, 0.0],
-        [0.0, 1.0, 0.0, 0.0],
-        [0.0, 0.0, 1.0, 0.0],
-        [0.0, 0.0, 0.0, 1.0],
-        // Quarter turns about an axis through the centres of two faces.
-        [R, R, 0.0, 0.0],
-        [R, -R, 0.0, 0.0],
-        [R, 0.0, R, 0.0],
-        [R, 0.0, -R, 0.0],
-        [R, 0.0, 0.0, R],
-        [R, 0.0, 0.0, -R],
-        // Half turns about an axis through the midpoints of two edges.
-        [0.0, R, R, 0.0],
-        [0.0, R, -R, 0.0],
-        [0.0, R, 0.0, R],
-        [0.0, R, 0.0, -R],
-        [0.0, 0.0, R, R],
-        [0.0, 0.0, R, -R],
-        // Third turns about an axis through two corners.
-        [H, H, H, H],
-        [H, -H, H, H],
-        [H, H, -H, H],
-        [H, H, H, -H],
-        [H, H, -H, -H],
-        [H, -H, H, -H],
-        [H, -H, -H, H],
-        [H, -H, -H, -H],
-    ]
-};
+#[rustfmt::skip]
+pub const ROTATIONS: [[f32; 4]; 24] = [
+    // None, and half turns about an axis through the centres of two faces.
+    [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0],
+    // Quarter turns about the same axes.
+    [R, R, 0.0, 0.0], [R, -R, 0.0, 0.0], [R, 0.0, R, 0.0], [R, 0.0, -R, 0.0], [R, 0.0, 0.0, R], [R, 0.0, 0.0, -R],
+    // Half turns about an axis through the midpoints of two edges.
+    [0.0, R, R, 0.0], [0.0, R, -R, 0.0], [0.0, R, 0.0, R], [0.0, R, 0.0, -R], [0.0, 0.0, R, R], [0.0, 0.0, R, -R],
+    // Third turns about an axis through two corners.
+    [H, H, H, H], [H, -H, H, H], [H, H, -H, H], [H, H, H, -H],
+    [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
+];
 
 /// The symmetry that a policy exploits in raw observations.
 #[derive(Clone, Copy, Debug)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
-    pub(super) cube_and_goal: Option<CubeAndGoal>,
+    pub cube_and_goal: Option<CubeAndGoal>,
 }
 
 impl Perception {
@@ -91,33 +79,35 @@ fn nearest(cube: [f32; 4]) -> [f32; 4] {
     ROTATIONS[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
 }
 
-/// The way a policy reads raw observations: perception, then normalisation.
+/// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
 #[derive(Clone, Debug)]
-pub(super) struct InputTransform {
+pub struct InputTransform {
     /// The symmetry that it exploits.
     pub perception: Perception,
-    /// The normalisation.
-    pub scaling: Scaling,
+    /// `[O]`
+    pub mean: Vec<f32>,
+    /// `[O]`
+    pub factor: Vec<f32>,
 }
 
 impl InputTransform {
-    /// Returns the number of values in an observation.
-    pub(super) fn size(&self) -> usize {
-        self.scaling.size()
+    /// Creates the transform of a policy that has seen these statistics.
+    pub(super) fn new(perception: Perception, Normalizer { mean, variance, .. }: &Normalizer) -> Self {
+        let factor = variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect();
+        Self { perception, mean: mean.iter().map(|&m| m as f32).collect(), factor }
     }
 
     /// Writes what the nets see of the `raw` observations `[B, O]` into `out` `[B, O]`.
     pub(super) fn apply(&self, raw: &[f32], out: &mut [f32]) {
         out.copy_from_slice(raw);
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for row in out.chunks_exact_mut(self.size()) {
-                    self.perception.canonicalize(row);
-                    self.scaling.apply(row);
+        widest!({
+            for row in out.chunks_exact_mut(self.mean.len()) {
+                self.perception.canonicalize(row);
+                for ((x, mean), factor) in row.iter_mut().zip(&self.mean).zip(&self.factor) {
+                    *x = ((*x - mean) * factor).clamp(-CLIP, CLIP);
                 }
-            },
-        );
+            }
+        });
     }
 }
 
@@ -127,7 +117,6 @@ fn quaternion(observation: &[f32], place: usize) -> [f32; 4] {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Normalizer;
     use super::*;
     use crate::quat::Quat;
     use crate::rng;
@@ -213,8 +202,8 @@ mod tests {
 
     #[test]
     fn what_is_read_is_perceived_and_then_normalised() {
-        let scaling = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 }.scaling();
-        let transform = InputTransform { perception: Perception::new(Symmetry::Cube, &SPACES).unwrap(), scaling };
+        let normalizer = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 };
+        let transform = InputTransform::new(Perception::new(Symmetry::Cube, &SPACES).unwrap(), &normalizer);
         let raw = [observation(random(0), random(1)), observation(random(2), random(3))].concat();
         let mut found = vec![0.0; 40];
         transform.apply(&raw, &mut found);
@@ -225,6 +214,16 @@ mod tests {
             let normalised = expected.iter().map(|x| ((x - 1.0) / 2.0).clamp(-5.0, 5.0));
             assert!(normalised.zip(found).all(|(a, b)| (a - b).abs() < 1e-4));
         }
+    }
+
+    #[test]
+    fn normalised_values_are_in_standard_deviations_and_clipped() {
+        let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
+        let mut normalised = [0.0; 3];
+        let transform = InputTransform::new(Perception { cube_and_goal: None }, &normalizer);
+        transform.apply(&[4.0, 2.0, 400.0], &mut normalised);
+        assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
+        assert_eq!(normalised[1..], [0.0, CLIP]);
     }
 
     #[test]

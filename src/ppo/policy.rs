@@ -5,13 +5,12 @@ use rand::RngExt;
 
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
-use super::normalizer::CLIP;
 use super::parameters::{Layer, Layout};
-use super::perception::{InputTransform, Perception, ROTATIONS};
+use super::perception::{InputTransform, Perception};
 use crate::config::{Activation, NetConfig};
 use crate::ranks::Exchange;
-use crate::rng::{self, Rng};
-use crate::spaces::{CubeAndGoal, Spaces};
+use crate::rng;
+use crate::spaces::Spaces;
 
 /// The factor on the initial weights of the actor's last layer; it keeps first actions near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
@@ -41,73 +40,16 @@ pub struct FrozenPolicy<'a> {
     transform: InputTransform,
 }
 
-/// What the actor computes, as numbers for another program: the symmetry, then `(x - mean) * factor` within ± `clip`, then the
-/// layers, with the activation after all but the last.
-pub struct ActorParts<'a> {
-    /// The offsets of the orientations of cube and goal, if they are to be rotated (see `perception`).
-    pub cube_and_goal: Option<CubeAndGoal>,
-    /// The rotations of the cube's symmetry, as w, x, y, z; the first of the nearest is taken.
-    pub rotations: &'static [[f32; 4]],
-    /// `[O]`
-    pub mean: Vec<f32>,
-    /// `[O]`
-    pub factor: Vec<f32>,
-    /// The limit of a normalised value.
-    pub clip: f32,
-    /// The layers, from the observation to the mean action.
-    pub layers: Vec<LayerParts<'a>>,
-    /// The function after each hidden layer.
-    pub activation: Activation,
-}
-
-/// A layer: weight · x + bias.
-pub struct LayerParts<'a> {
-    /// The number of inputs.
-    pub inputs: usize,
-    /// The number of outputs.
-    pub outputs: usize,
-    /// `[outputs, inputs]`
-    pub weight: &'a [f32],
-    /// `[outputs]`
-    pub bias: &'a [f32],
-}
-
 impl Policy {
-    /// Returns the parts of the actor.
-    pub fn actor(&self) -> ActorParts<'_> {
-        let InputTransform { perception, scaling } = self.input_transform();
-        let layers = self.layout.actor.iter().map(|layer| LayerParts {
-            inputs: layer.inputs,
-            outputs: layer.outputs,
-            weight: &self.parameters[layer.weight.clone()],
-            bias: &self.parameters[layer.bias.clone()],
-        });
-        ActorParts {
-            cube_and_goal: perception.cube_and_goal,
-            rotations: &ROTATIONS,
-            mean: scaling.mean,
-            factor: scaling.factor,
-            clip: CLIP,
-            layers: layers.collect(),
-            activation: self.activation,
-        }
-    }
-
-    /// Creates a policy with these parameters and this logarithm of the standard deviation for environments with these spaces.
+    /// Creates a policy whose parameters are all zero, for environments with these spaces.
     ///
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
-    pub fn new(
-        net: &NetConfig,
-        spaces: Spaces,
-        parameters: Vec<f32>,
-        log_std: f32,
-        normalizer: Normalizer,
-    ) -> Result<Self> {
-        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
-        assert_eq!(parameters.len(), layout.count(), "number of parameters");
+    pub fn new(net: &NetConfig, spaces: Spaces) -> Result<Self> {
+        let layout = Layout::new(&net.hidden, &spaces);
+        let (parameters, normalizer) = (vec![0.0; layout.count()], Normalizer::new(spaces.observation_size));
         let perception = Perception::new(net.symmetry, &spaces)?;
-        Ok(Self { layout, parameters, log_std, normalizer, activation: net.activation, spaces, perception })
+        Ok(Self { layout, parameters, log_std: 0.0, normalizer, activation: net.activation, spaces, perception })
     }
 
     /// Creates an untrained policy with weights drawn from `seed` and this standard deviation.
@@ -117,19 +59,17 @@ impl Policy {
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
     pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Result<Self> {
-        let layout = Layout::new(&net.hidden, spaces.observation_size, spaces.action_size);
+        let mut policy = Self { log_std: std.ln() as f32, ..Self::new(net, spaces)? };
         let mut rng = rng::stream(seed, "weights", 0);
-        let mut parameters = vec![0.0; layout.count()];
-        let mut fill = |layer: &Layer, shrink: f32| {
+        for (i, layer) in policy.layout.layers().enumerate() {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
-            uniform(&mut rng, bound * shrink, &mut parameters[layer.weight.clone()]);
-            uniform(&mut rng, bound, &mut parameters[layer.bias.clone()]);
-        };
-        let (last, hidden) = layout.actor.split_last().expect("a net has layers");
-        hidden.iter().for_each(|layer| fill(layer, 1.0));
-        fill(last, LAST_ACTOR_LAYER);
-        layout.critic.iter().for_each(|layer| fill(layer, 1.0));
-        Self::new(net, spaces, parameters, std.ln() as f32, Normalizer::new(spaces.observation_size))
+            let is_last_of_actor = i + 1 == policy.layout.actor.len();
+            let of_weights = if is_last_of_actor { bound * LAST_ACTOR_LAYER } else { bound };
+            for (range, bound) in [(&layer.weight, of_weights), (&layer.bias, bound)] {
+                policy.parameters[range.clone()].fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
+            }
+        }
+        Ok(policy)
     }
 
     /// Returns the standard deviation of each action at noise scale 1; training may scale the noise (see `Acting`).
@@ -144,18 +84,14 @@ impl Policy {
     }
 
     /// Returns the way it currently reads observations.
-    pub(super) fn input_transform(&self) -> InputTransform {
-        InputTransform { perception: self.perception, scaling: self.normalizer.scaling() }
+    pub fn input_transform(&self) -> InputTransform {
+        InputTransform::new(self.perception, &self.normalizer)
     }
 
-    /// Returns the net of these layers.
-    pub(super) fn net(&self, layers: &[Layer]) -> Net<'_> {
-        Net::new(layers, &self.parameters, self.activation)
-    }
-
-    /// Returns the buffers of both nets for blocks of up to `rows` rows.
-    pub(super) fn workspace(&self, rows: usize, learning: bool, arithmetic: Arithmetic) -> Workspace {
-        Workspace::new(&self.layout.actor, rows, learning, arithmetic)
+    /// Returns actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
+    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
+        let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
+        [&self.layout.actor, &self.layout.critic].map(|layers| net(layers).prepared(arithmetic, learning))
     }
 
     /// Returns the policy in its current state.
@@ -165,8 +101,7 @@ impl Policy {
 
     /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let nets = [&self.layout.actor, &self.layout.critic];
-        let [actor, critic] = nets.map(|layers| self.net(layers).for_few_rows().packed(arithmetic, false));
+        let [actor, critic] = self.nets(arithmetic, false);
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }
@@ -175,7 +110,7 @@ impl FrozenPolicy<'_> {
     /// Returns a reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
     /// time, in f32.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        self.policy.workspace(rows, false, Arithmetic::F32)
+        Workspace::new(&self.policy.layout.actor, rows, false, Arithmetic::F32)
     }
 
     /// Returns the sizes and the structure of observations and actions.
@@ -198,14 +133,8 @@ impl FrozenPolicy<'_> {
         self.forward(observations, &mut [(&self.critic, values)], work);
     }
 
-    /// Writes both, reading the observations only once.
-    pub fn mean_actions_and_values(
-        &self,
-        observations: &[f32],
-        means: &mut [f32],
-        values: &mut [f32],
-        work: &mut Workspace,
-    ) {
+    /// Writes both, mean actions and values, and reads the observations only once.
+    pub fn both(&self, observations: &[f32], (means, values): (&mut [f32], &mut [f32]), work: &mut Workspace) {
         self.forward(observations, &mut [(&self.actor, means), (&self.critic, values)], work);
     }
 
@@ -222,8 +151,4 @@ impl FrozenPolicy<'_> {
             done += rows;
         }
     }
-}
-
-fn uniform(rng: &mut Rng, bound: f32, numbers: &mut [f32]) {
-    numbers.fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
 }

@@ -85,7 +85,10 @@ impl Rollout {
 
     /// Moves the observations after the last step to the first step, for the next iteration.
     pub fn carry_over(&mut self) {
-        self.blocks.iter_mut().for_each(RolloutBlock::carry_over);
+        for block in &mut self.blocks {
+            let last = block.samples() * block.observation_size;
+            block.observations.copy_within(last.., 0);
+        }
     }
 
     /// Returns the observations `[n, O]` of each block that the first step acts on.
@@ -140,11 +143,6 @@ impl RolloutBlock {
         let size = self.envs * width;
         t * size..(t + 1) * size
     }
-
-    fn carry_over(&mut self) {
-        let last = self.samples() * self.observation_size;
-        self.observations.copy_within(last.., 0);
-    }
 }
 
 #[cfg(test)]
@@ -155,12 +153,13 @@ mod tests {
 
     #[test]
     fn what_follows_the_last_step_is_what_the_next_iteration_starts_from() {
-        let mut block = RolloutBlock::new(2, 3, &SPACES);
-        let after_the_last = block.step(2, 4);
-        block.observations[after_the_last].fill(7.0);
-        assert!(block.first_observations_mut().iter().all(|&x| x == 0.0));
-        block.carry_over();
-        assert_eq!(block.first_observations_mut(), [7.0; 12]);
+        let mut rollout = Rollout::new(2, &[3], &SPACES);
+        let after_the_last = rollout.blocks[0].step(2, 4);
+        rollout.blocks[0].observations[after_the_last].fill(7.0);
+        assert_eq!(rollout.first_observations_mut(), [[0.0; 12]]);
+        rollout.carry_over();
+        assert_eq!(rollout.first_observations_mut(), [[7.0; 12]]);
+        let block = &rollout.blocks[0];
         assert_eq!(block.observations[block.step(0, 4)], [7.0; 12]);
     }
 

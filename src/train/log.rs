@@ -81,7 +81,7 @@ mod tests {
     use super::*;
     use crate::agent::{Agent, Iteration};
     use crate::config::Config;
-    use crate::ppo::UpdateStats;
+    use crate::ppo::{Losses, UpdateStats};
     use crate::ranks::{Exchange, Traffic};
     use crate::repose::{Lesson, StepSums, Task, TaskReward, TrainingReward};
 
@@ -111,14 +111,9 @@ mod tests {
     fn each_value_of_a_row_stands_beside_its_own_name() {
         let lesson = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
         let update = UpdateStats {
-            policy_loss: 1.0,
-            value_loss: 2.0,
-            excess: 3.0,
+            losses: Losses { surrogate: -1.0, value_error: 2.0, excess: 3.0, kl: 5.0, clipped: 8.0, ratio_error: 0.0 },
+            first: Losses { kl: 6.0, ratio_error: 7.0, ..Losses::default() },
             entropy: 4.0,
-            kl: 5.0,
-            first_kl: 6.0,
-            first_ratio_error: 7.0,
-            clip_fraction: 8.0,
             grad_norm: 9.0,
             std: 10.0,
             explained_variance: 11.0,

@@ -164,9 +164,9 @@ fn the_first_minibatch_sees_the_very_policy_that_acted() {
         let mut agent = agent(&PpoConfig { backend, ..settings() }, 3);
         for iteration in 1..=5 {
             let stats = agent.iterate(&NEVER).unwrap().expect("nothing stops it").update;
-            assert!(stats.first_kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first_kl);
-            assert!(stats.first_ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first_ratio_error);
-            assert!(stats.kl > 1e-4, "the policy must have changed in later minibatches: {}", stats.kl);
+            assert!(stats.first.kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first.kl);
+            assert!(stats.first.ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first.ratio_error);
+            assert!(stats.losses.kl > 1e-4, "the policy must have changed in later minibatches: {}", stats.losses.kl);
         }
     }
 }

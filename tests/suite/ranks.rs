@@ -96,7 +96,7 @@ fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode>
     let mut figures = Vec::new();
     for _ in 0..iterations {
         let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
-        figures.extend([stats.kl, stats.value_loss, stats.explained_variance, stats.grad_norm, stats.learning_rate]);
+        figures.extend(stats.named().map(|(_, value)| value));
     }
     let policy = agent.ppo.policy();
     figures.extend(policy.normalizer.mean.iter().chain(&policy.normalizer.variance));

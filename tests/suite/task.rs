@@ -283,7 +283,7 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
             simulation.qvel_mut()[20] = poison;
         }
         let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
-        assert!(stats.value_loss.is_finite() && stats.kl.is_finite());
+        assert!(stats.losses.value_error.is_finite() && stats.losses.kl.is_finite());
         let diverged: u64 = agent.pool.envs_mut().map(|env| env.take_sums().diverged).sum();
         assert_eq!(diverged, 2, "iteration {iteration}");
         assert_eq!(

@@ -295,7 +295,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
         assert!(count > 200.0 && (std / expected - 1.0).abs() < 0.1, "{std} instead of {expected}, {count}");
     }
     let stats = ppo.update(rollout, 1, &never).unwrap().unwrap();
-    assert!(stats.first_kl.abs() < 1e-5 && stats.first_ratio_error < 1e-3, "{stats:?}");
+    assert!(stats.first.kl.abs() < 1e-5 && stats.first.ratio_error < 1e-3, "{stats:?}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use candle_core::{D, Result, Tensor};
 
+use super::super::backend::Losses;
 use crate::config::PpoConfig;
 
 /// The action distributions of M samples.
@@ -34,22 +35,6 @@ pub(super) struct Batch {
     pub returns: Tensor,
 }
 
-/// The losses and statistics of a minibatch.
-pub(super) struct LossTensors {
-    /// The loss that is minimised.
-    pub total: Tensor,
-    /// The clipped surrogate, negated.
-    pub policy: Tensor,
-    /// The clipped squared error of the values.
-    pub value: Tensor,
-    /// Mean squared distance of the means from [-1, 1], beyond which actions are clipped.
-    pub excess: Tensor,
-    /// Mean KL divergence of the current distribution from the one that acted, nats.
-    pub kl: Tensor,
-    /// `[M]`: probability ratios of the actions
-    pub ratios: Tensor,
-}
-
 impl Gaussian {
     /// Returns the log-density of `actions` `[M, A]` for each sample, `[M]`. It omits the logarithm of the scales, here
     /// and where the actions were drawn, since only ratios are used.
@@ -74,13 +59,14 @@ impl Gaussian {
     }
 }
 
-/// Returns the losses of a minibatch for which the nets returned the distribution `new` and `values` `[M]`.
+/// Returns the loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
+/// the distribution `new` and `values` `[M]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
 ///
 /// # Errors
 /// Fails if the shapes do not match.
-pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: &Tensor) -> Result<LossTensors> {
+pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: &Tensor) -> Result<(Tensor, Losses)> {
     let ratios = (new.log_prob(&batch.actions)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
@@ -93,8 +79,19 @@ pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: 
 
     let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
-    let kl = new.kl(&batch.old_means)?;
-    Ok(LossTensors { total, policy, value, excess, kl, ratios: ratios.detach() })
+
+    let ratios = ratios.to_vec1::<f32>()?;
+    let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
+    let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
+    let sums = Losses {
+        surrogate: -sum(&policy)?,
+        value_error: sum(&value)?,
+        excess: sum(&excess)?,
+        kl: sum(&new.kl(&batch.old_means)?)?,
+        clipped: errors().filter(|&error| error > config.clip).count() as f64,
+        ratio_error: errors().fold(0.0, f64::max),
+    };
+    Ok((total, sums))
 }
 
 #[cfg(test)]
@@ -167,13 +164,12 @@ mod tests {
             returns: tensor(&[0.5, 0.1, 1.9], &[3]),
         };
         let new = Gaussian { means: mean.as_tensor().clone(), log_std: old.log_std, scales: old.scales };
-        let found = losses(&config, &batch, &new, &value).unwrap();
+        let (total, sums) = losses(&config, &batch, &new, &value).unwrap();
+        let means = sums.means(3);
         assert_close(&new.log_prob(&batch.actions).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
-        assert_close(&found.ratios, &[1.389_307_4, 0.886_564_5, 1.721_431]);
-        assert_close(&found.policy, &[0.599_859_9]);
-        assert_close(&found.value, &[0.296_666_7]);
-        assert_close(&found.kl, &[0.046_028_256]);
-        let grads = found.total.backward().unwrap();
+        let found = [means.ratio_error, -means.surrogate, means.value_error, means.kl].map(|x| x as f32);
+        assert_close(&tensor(&found, &[4]), &[0.721_431, 0.599_859_9, 0.296_666_7, 0.046_028_256]);
+        let grads = total.backward().unwrap();
         let mean_grad = [0.0, 0.0, 0.142_810_8, -0.026_412_528, 2.924_584_2, 0.841_392_4];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
         assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
@@ -197,9 +193,9 @@ mod tests {
             config.bounds_coef = bounds_coef;
             let Gaussian { log_std, scales, .. } = gaussian(&[0.0; 2], &[1.0]);
             let new = Gaussian { means: mean.as_tensor().clone(), log_std, scales };
-            let found = losses(&config, &batch, &new, &tensor(&[1.4], &[1])).unwrap();
-            assert_close(&found.excess, &[0.25]);
-            found.total.backward().unwrap().get(&mean).unwrap().clone()
+            let (total, sums) = losses(&config, &batch, &new, &tensor(&[1.4], &[1])).unwrap();
+            assert!((sums.excess - 0.25).abs() < 1e-6);
+            total.backward().unwrap().get(&mean).unwrap().clone()
         };
         assert_close(&(with(0.5) - with(0.0)).unwrap(), &[0.5, 0.0]);
     }

@@ -3,8 +3,7 @@
 //! candle computes these functions one element at a time, in several passes, which costs more than the matrix products
 //! between them.
 
-use pulp::Arch;
-
+use super::super::widest::widest;
 use crate::config::Activation;
 
 /// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); x is clamped to [-87, 88].
@@ -46,17 +45,13 @@ fn tanh(x: f32) -> f32 {
     m / (m + 2.0)
 }
 
-/// Adds `bias` `[C]` to each row of `x` `[B, C]`.
-pub(super) fn add_bias(x: &mut [f32], bias: &[f32]) {
-    each_row(x, bias, |x, b| x + b);
-}
-
-/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, in place.
-pub(super) fn add_bias_activate(x: &mut [f32], bias: &[f32], activation: Activation) {
+/// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, if any, in place.
+pub(super) fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
     match activation {
-        Activation::Elu => each_row(x, bias, |x, b| elu(x + b)),
-        Activation::Relu => each_row(x, bias, |x, b| relu(x + b)),
-        Activation::Tanh => each_row(x, bias, |x, b| tanh(x + b)),
+        None => each_row(x, bias, |x, b| x + b),
+        Some(Activation::Elu) => each_row(x, bias, |x, b| elu(x + b)),
+        Some(Activation::Relu) => each_row(x, bias, |x, b| relu(x + b)),
+        Some(Activation::Tanh) => each_row(x, bias, |x, b| tanh(x + b)),
     }
 }
 
@@ -75,14 +70,11 @@ pub(super) fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Opt
 }
 
 fn add_columns(sums: &mut [f32], rows: &[f32]) {
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for row in rows.chunks_exact(sums.len()) {
-                sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
-            }
-        },
-    );
+    widest!({
+        for row in rows.chunks_exact(sums.len()) {
+            sums.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+        }
+    });
 }
 
 /// Sets `x[i] = f(x[i], y[i])` and adds the rows of `x` to `sums`.
@@ -90,30 +82,24 @@ fn add_columns(sums: &mut [f32], rows: &[f32]) {
 fn each_and_sum(x: &mut [f32], y: &[f32], sums: &mut [f32], f: impl Fn(f32, f32) -> f32) {
     assert_eq!(x.len(), y.len());
     let width = sums.len();
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
-                for ((x, &y), sum) in x.iter_mut().zip(y).zip(&mut *sums) {
-                    *x = f(*x, y);
-                    *sum += *x;
-                }
+    widest!({
+        for (x, y) in x.chunks_exact_mut(width).zip(y.chunks_exact(width)) {
+            for ((x, &y), sum) in x.iter_mut().zip(y).zip(&mut *sums) {
+                *x = f(*x, y);
+                *sum += *x;
             }
-        },
-    );
+        }
+    });
 }
 
 /// Sets `x[i, j] = f(x[i, j], y[j])` for each row of `x` `[B, C]`, compiled for the processor it runs on.
 #[inline(always)]
 fn each_row(x: &mut [f32], y: &[f32], f: impl Fn(f32, f32) -> f32) {
-    Arch::new().dispatch(
-        #[inline(always)]
-        || {
-            for row in x.chunks_exact_mut(y.len()) {
-                row.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y));
-            }
-        },
-    );
+    widest!({
+        for row in x.chunks_exact_mut(y.len()) {
+            row.iter_mut().zip(y).for_each(|(x, &y)| *x = f(*x, y));
+        }
+    });
 }
 
 #[cfg(test)]
@@ -144,7 +130,7 @@ mod tests {
     fn activations_are_accurate_to_three_parts_in_ten_million() {
         for activation in ALL {
             let mut found = inputs();
-            add_bias_activate(&mut found, &[0.0], activation);
+            add_bias(&mut found, &[0.0], Some(activation));
             for (x, y) in inputs().into_iter().zip(found) {
                 let expected = exact(activation, f64::from(x));
                 let error = (f64::from(y) - expected).abs();
@@ -169,7 +155,7 @@ mod tests {
     fn what_is_not_a_number_stays_so() {
         for activation in ALL {
             let mut x = [f32::NAN];
-            add_bias_activate(&mut x, &[0.0], activation);
+            add_bias(&mut x, &[0.0], Some(activation));
             assert!(x[0].is_nan(), "{activation:?}");
         }
     }
@@ -179,7 +165,7 @@ mod tests {
         for activation in ALL {
             for x in [-3.0f32, -0.7, -0.01, 0.02, 0.9, 4.0] {
                 let mut output = [x];
-                add_bias_activate(&mut output, &[0.0], activation);
+                add_bias(&mut output, &[0.0], Some(activation));
                 let mut grad = [2.0];
                 let mut sums = [1.0];
                 slopes_and_sums(&mut grad, &output, Some(activation), &mut sums);

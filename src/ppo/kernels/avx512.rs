@@ -4,144 +4,106 @@
 
 #![expect(unsafe_code, reason = "instructions that not every processor has, on pointers")]
 
-pub(super) use machine::DotSession;
+use std::arch::x86_64::{
+    __m512bh, __m512i, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_ps,
+    _mm512_storeu_ps,
+};
+use std::mem::transmute;
 
-use super::bf16::Order;
+use super::bf16::{BLOCK, DEPTH, LINES, Order, Packed, Tile, Unit, depth_of_block, in_blocks};
+use super::product::Matrix;
+
+/// Rows of a block that are computed together. With the two columns of tiles of a block, this takes 16 of the 32 registers
+/// for sums, enough to hide the delay of the instruction.
+const ROWS: usize = 8;
 
 /// The permission to use the dot products.
-#[derive(Clone, Copy, Debug)]
-pub struct Dots(());
+#[derive(Debug)]
+struct Dots(());
 
-impl Dots {
-    /// Asks the processor for the dot products.
-    ///
-    /// # Errors
-    /// Fails if it does not have them.
-    pub fn request() -> Result<Self, &'static str> {
-        machine::request().map(|()| Self(()))
-    }
-
-    /// Returns what multiplies blocks whose left operand is in this order.
-    pub fn begin(self, left: Order) -> DotSession {
-        DotSession::new(left)
-    }
+/// Asks the processor for the dot products.
+///
+/// # Errors
+/// Fails if it does not have them.
+pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
+    let there = std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512bf16");
+    if there { Ok(&Dots(())) } else { Err("it has no bf16 dot products (AVX-512 BF16)") }
 }
 
-#[cfg(target_arch = "x86_64")]
-mod machine {
-    use std::arch::x86_64::{
-        __m512bh, __m512i, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_ps,
-        _mm512_storeu_ps,
-    };
-    use std::mem::transmute;
-
-    use super::super::bf16::{BLOCK, DEPTH, LINES, MultiplyBlock, Order, Tile, depth_of_block};
-
-    /// Rows of a block that are computed together. With the two columns of tiles of a block, this takes 16 of the 32 registers
-    /// for sums, enough to hide the delay of the instruction.
-    const ROWS: usize = 8;
-
-    pub(super) fn request() -> Result<(), &'static str> {
-        let there = std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512bf16");
-        if there { Ok(()) } else { Err("it has no bf16 dot products (AVX-512 BF16)") }
+impl Unit for Dots {
+    /// Dot products read either order: what is taken is the one that needs no transposition.
+    fn order_of_left(&self, lhs: Matrix) -> Order {
+        let [_, along] = lhs.strides();
+        if along == 1 { Order::Lines } else { Order::Pairs }
     }
 
-    /// The dot products, for left operands in one order.
-    pub struct DotSession(Order);
-
-    impl DotSession {
-        pub fn new(left: Order) -> Self {
-            Self(left)
-        }
-    }
-
-    impl MultiplyBlock for DotSession {
-        fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[Tile], rhs: &[Tile], add: bool) {
-            let depth = depth_of_block(out, columns, lhs, rhs);
+    fn product(&self, out: &mut [f32], columns: usize, operands: [&Packed; 2], add: bool) {
+        let left = operands[0].order;
+        in_blocks(out, columns, operands, add, |out, columns, [lhs, rhs], add| {
+            let depth = depth_of_block(out, columns, [lhs, rhs]);
             for first in (0..BLOCK).step_by(ROWS) {
                 let lhs = &lhs[first / LINES * depth..][..depth];
                 let out = &mut out[first * columns..];
-                // SAFETY: `Dots`, which alone creates a session, exists only where the processor has these instructions. `out`
-                // has eight more rows of 32 values at that distance; both halves of `rhs` have as many tiles as `lhs`.
+                // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `out` has
+                // eight more rows of 32 values at that distance; both halves of `rhs` have as many tiles as `lhs`.
                 unsafe {
-                    match self.0 {
+                    match left {
                         Order::Lines => rows::<DEPTH, 2>(out, columns, lhs, first % LINES, rhs, add),
                         Order::Pairs => rows::<2, DEPTH>(out, columns, lhs, first % LINES, rhs, add),
                     }
                 }
             }
-        }
-    }
-
-    /// Computes eight rows of a block, from row `first` of the tiles `lhs` on, whose values are `LINE` apart from line to line
-    /// and `PAIR` from pair to pair.
-    #[target_feature(enable = "avx512f,avx512bf16")]
-    unsafe fn rows<const LINE: usize, const PAIR: usize>(
-        out: &mut [f32],
-        columns: usize,
-        lhs: &[Tile],
-        first: usize,
-        rhs: &[Tile],
-        add: bool,
-    ) {
-        let mut sums = [[_mm512_setzero_ps(); 2]; ROWS];
-        let at = |row: usize, half: usize| row * columns + half * LINES;
-        if add {
-            for (row, sums) in sums.iter_mut().enumerate() {
-                for (half, sum) in sums.iter_mut().enumerate() {
-                    // SAFETY: the caller promises that `out` has these values.
-                    *sum = unsafe { _mm512_loadu_ps(out.as_ptr().add(at(row, half))) };
-                }
-            }
-        }
-        let (left, right) = rhs.split_at(lhs.len());
-        for ((Tile(lhs), Tile(left)), Tile(right)) in lhs.iter().zip(left).zip(right) {
-            for pair in 0..DEPTH / 2 {
-                // SAFETY: a tile has `DEPTH / 2` rows of sixteen pairs, and as many pairs for each of sixteen lines.
-                let [left, right] = [left, right].map(|tile| unsafe { tile.as_ptr().add(pair * DEPTH).cast() });
-                let [left, right] = [left, right].map(|row| bf16(unsafe { _mm512_loadu_si512(row) }));
-                for (row, [a, b]) in sums.iter_mut().enumerate() {
-                    // SAFETY: as above.
-                    let one = unsafe { lhs.as_ptr().add((first + row) * LINE + pair * PAIR).cast::<i32>().read() };
-                    let all = bf16(_mm512_set1_epi32(one));
-                    *a = _mm512_dpbf16_ps(*a, all, left);
-                    *b = _mm512_dpbf16_ps(*b, all, right);
-                }
-            }
-        }
-        for (row, sums) in sums.into_iter().enumerate() {
-            for (half, sum) in sums.into_iter().enumerate() {
-                // SAFETY: as above.
-                unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(at(row, half)), sum) };
-            }
-        }
-    }
-
-    /// Returns the same bits as pairs of bf16.
-    #[target_feature(enable = "avx512f")]
-    fn bf16(bits: __m512i) -> __m512bh {
-        // SAFETY: both are 512 bits of which every value is valid.
-        unsafe { transmute(bits) }
+        });
     }
 }
 
-#[cfg(not(target_arch = "x86_64"))]
-mod machine {
-    use super::super::bf16::{MultiplyBlock, Order, Tile};
-
-    pub(super) fn request() -> Result<(), &'static str> {
-        Err("bf16 dot products (AVX-512 BF16) are used only on x86-64")
-    }
-
-    pub struct DotSession;
-
-    impl DotSession {
-        pub fn new(_: Order) -> Self {
-            unreachable!("there are no dot products here")
+/// Computes eight rows of a block, from row `first` of the tiles `lhs` on, whose values are `LINE` apart from line to line
+/// and `PAIR` from pair to pair.
+#[target_feature(enable = "avx512f,avx512bf16")]
+unsafe fn rows<const LINE: usize, const PAIR: usize>(
+    out: &mut [f32],
+    columns: usize,
+    lhs: &[Tile],
+    first: usize,
+    rhs: &[Tile],
+    add: bool,
+) {
+    let mut sums = [[_mm512_setzero_ps(); 2]; ROWS];
+    let at = |row: usize, half: usize| row * columns + half * LINES;
+    if add {
+        for (row, sums) in sums.iter_mut().enumerate() {
+            for (half, sum) in sums.iter_mut().enumerate() {
+                // SAFETY: the caller promises that `out` has these values.
+                *sum = unsafe { _mm512_loadu_ps(out.as_ptr().add(at(row, half))) };
+            }
         }
     }
-
-    impl MultiplyBlock for DotSession {
-        fn multiply(&self, _: &mut [f32], _: usize, _: &[Tile], _: &[Tile], _: bool) {}
+    let (left, right) = rhs.split_at(lhs.len());
+    for ((Tile(lhs), Tile(left)), Tile(right)) in lhs.iter().zip(left).zip(right) {
+        for pair in 0..DEPTH / 2 {
+            // SAFETY: a tile has `DEPTH / 2` rows of sixteen pairs, and as many pairs for each of sixteen lines.
+            let [left, right] = [left, right].map(|tile| unsafe { tile.as_ptr().add(pair * DEPTH).cast() });
+            let [left, right] = [left, right].map(|row| bf16(unsafe { _mm512_loadu_si512(row) }));
+            for (row, [a, b]) in sums.iter_mut().enumerate() {
+                // SAFETY: as above.
+                let one = unsafe { lhs.as_ptr().add((first + row) * LINE + pair * PAIR).cast::<i32>().read() };
+                let all = bf16(_mm512_set1_epi32(one));
+                *a = _mm512_dpbf16_ps(*a, all, left);
+                *b = _mm512_dpbf16_ps(*b, all, right);
+            }
+        }
     }
+    for (row, sums) in sums.into_iter().enumerate() {
+        for (half, sum) in sums.into_iter().enumerate() {
+            // SAFETY: as above.
+            unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(at(row, half)), sum) };
+        }
+    }
+}
+
+/// Returns the same bits as pairs of bf16.
+#[target_feature(enable = "avx512f")]
+fn bf16(bits: __m512i) -> __m512bh {
+    // SAFETY: both are 512 bits of which every value is valid.
+    unsafe { transmute(bits) }
 }

@@ -1,7 +1,8 @@
-//! bf16, the upper half of an f32: rounding, and packing of operands into the tiles that [`super::units`] multiplies.
+//! bf16, the upper half of an f32: rounding, and packing of operands into tiles, and products of these block by block.
 
-use pulp::Arch;
+use std::fmt::Debug;
 
+use super::super::widest::widest;
 use super::product::Matrix;
 
 /// Lines in a tile. The lines of an operand are the rows of the left matrix or the columns of the right one.
@@ -13,7 +14,7 @@ pub(super) const DEPTH: usize = 32;
 /// A tile, at the start of a cache line.
 #[derive(Clone, Debug)]
 #[repr(C, align(64))]
-pub struct Tile(pub [u16; LINES * DEPTH]);
+pub(super) struct Tile(pub [u16; LINES * DEPTH]);
 
 /// Rounds to the nearest bf16, ties to even; NaN stays NaN.
 #[inline(always)]
@@ -32,18 +33,60 @@ pub(super) fn rounded(x: f32) -> f32 {
 /// Rows and columns of a product that are computed together: two by two tiles.
 pub(super) const BLOCK: usize = 2 * LINES;
 
-/// A unit of the processor that multiplies tiles, in use by this thread.
-pub(super) trait MultiplyBlock {
-    /// Writes [`BLOCK`] × [`BLOCK`] values of a product, whose rows are `columns` values apart in `out`, or adds them if `add`
-    /// is set. `lhs` and `rhs` hold two rows of tiles each: lines 0-15, then 16-31.
+/// A unit of the processor that multiplies bf16 matrices. A value proves that the unit is there and may be used.
+pub trait Unit: Debug + Sync {
+    /// Returns the order in which it reads this left operand best. The right operand is always in pairs.
+    fn order_of_left(&self, _lhs: Matrix) -> Order {
+        Order::Lines
+    }
+
+    /// Writes the product of packed matrices to `out` `[rows, columns]`, by rows, or adds it if `add` is set.
     ///
     /// # Panics
     /// Panics if the sizes do not match.
-    fn multiply(&self, out: &mut [f32], columns: usize, lhs: &[Tile], rhs: &[Tile], add: bool);
+    fn product(&self, out: &mut [f32], columns: usize, operands: [&Packed; 2], add: bool);
+}
+
+/// Computes a product block by block. `multiply` writes [`BLOCK`] × [`BLOCK`] values, whose rows are as far apart as its second
+/// argument says, or adds them if its last argument is set. Its operands are two rows of tiles each: lines 0-15, then 16-31.
+///
+/// # Panics
+/// Panics if the sizes do not match.
+pub(super) fn in_blocks<F>(out: &mut [f32], columns: usize, [lhs, rhs]: [&Packed; 2], add: bool, multiply: F)
+where
+    F: Fn(&mut [f32], usize, [&[Tile]; 2], bool),
+{
+    let (rows, depth) = (out.len() / columns, lhs.depth);
+    assert_eq!(out.len(), rows * columns, "elements of the product");
+    assert_eq!(depth, rhs.depth, "tiles along the lines of both matrices");
+    assert_eq!(rhs.order, Order::Pairs, "order of the right matrix");
+    let pair = 2 * depth;
+    assert_eq!(lhs.tiles.len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
+    assert_eq!(rhs.tiles.len(), columns.div_ceil(BLOCK) * pair, "tiles of the right matrix");
+    // The tiles of the right matrix in use stay in the cache while those of the left one stream past.
+    for (j, rhs) in rhs.tiles.chunks_exact(pair).enumerate() {
+        for (i, lhs) in lhs.tiles.chunks_exact(pair).enumerate() {
+            let (height, width) = ((rows - i * BLOCK).min(BLOCK), (columns - j * BLOCK).min(BLOCK));
+            let first = i * BLOCK * columns + j * BLOCK;
+            if (height, width) == (BLOCK, BLOCK) {
+                multiply(&mut out[first..], columns, [lhs, rhs], add);
+                continue;
+            }
+            // A block that extends beyond the edge is computed in a separate buffer.
+            let mut whole = [0.0; BLOCK * BLOCK];
+            multiply(&mut whole, BLOCK, [lhs, rhs], false);
+            for (row, whole) in whole.chunks_exact(BLOCK).take(height).enumerate() {
+                let out = &mut out[first + row * columns..][..width];
+                for (out, x) in out.iter_mut().zip(whole) {
+                    *out = if add { *out + x } else { *x };
+                }
+            }
+        }
+    }
 }
 
 /// Panics unless these are the operands of a block, and `out` has room for it. Returns the tiles along a line.
-pub(super) fn depth_of_block(out: &[f32], columns: usize, lhs: &[Tile], rhs: &[Tile]) -> usize {
+pub(super) fn depth_of_block(out: &[f32], columns: usize, [lhs, rhs]: [&[Tile]; 2]) -> usize {
     let depth = lhs.len() / 2;
     assert!(depth > 0 && lhs.len() == 2 * depth && rhs.len() == lhs.len(), "tiles of a block");
     assert!(columns >= BLOCK && out.len() >= (BLOCK - 1) * columns + BLOCK, "room for a block");
@@ -65,24 +108,16 @@ pub enum Order {
 #[derive(Default)]
 pub struct Packed {
     tiles: Vec<Tile>,
+    /// The number of tiles along a line.
     depth: usize,
-    order: Order,
+    /// The order of the values in a tile.
+    pub(super) order: Order,
 }
 
 impl Packed {
-    /// Returns the tiles.
-    pub fn tiles(&self) -> &[Tile] {
-        &self.tiles
-    }
-
-    /// Returns the number of tiles along a line.
-    pub fn depth(&self) -> usize {
-        self.depth
-    }
-
-    /// Returns the order of the values in a tile.
-    pub fn order(&self) -> Order {
-        self.order
+    /// Packs a right operand.
+    pub fn pack_right(&mut self, rhs: Matrix) {
+        self.pack(rhs.transposed(), Order::Pairs);
     }
 
     /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
@@ -91,15 +126,12 @@ impl Packed {
         (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
         let groups = lines.div_ceil(2 * LINES) * 2;
         self.tiles.resize(groups * self.depth, Tile([0; LINES * DEPTH]));
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
-                    let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
-                    pack_tile(tile, matrix, [line, number], order);
-                }
-            },
-        );
+        widest!({
+            for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
+                let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
+                pack_tile(tile, matrix, [line, number], order);
+            }
+        });
     }
 }
 
@@ -190,16 +222,16 @@ mod tests {
                 // Left from a previous matrix.
                 let mut packed = Packed { tiles: vec![Tile([7; LINES * DEPTH]); 20], depth: 3, order };
                 packed.pack(matrix, order);
-                assert_eq!((packed.depth(), packed.order()), (columns.div_ceil(DEPTH), order));
+                assert_eq!((packed.depth, packed.order), (columns.div_ceil(DEPTH), order));
                 let groups = rows.div_ceil(2 * LINES) * 2;
-                assert_eq!(packed.tiles().len(), groups * packed.depth());
-                for (i, &x) in packed.tiles().iter().flat_map(|Tile(tile)| tile).enumerate() {
+                assert_eq!(packed.tiles.len(), groups * packed.depth);
+                for (i, &x) in packed.tiles.iter().flat_map(|Tile(tile)| tile).enumerate() {
                     let (tile, row, cell) = (i / (LINES * DEPTH), i % (LINES * DEPTH) / DEPTH, i % DEPTH);
                     let (line, along) = match order {
                         Order::Lines => (row, cell),
                         Order::Pairs => (cell / 2, 2 * row + cell % 2),
                     };
-                    let (line, along) = (tile / packed.depth() * LINES + line, tile % packed.depth() * DEPTH + along);
+                    let (line, along) = (tile / packed.depth * LINES + line, tile % packed.depth * DEPTH + along);
                     let inside = line < rows && along < columns;
                     let expected = if inside { number(line, along) } else { 0.0 };
                     assert_eq!(x, round(expected), "{order:?}: {line}, {along}");

@@ -4,82 +4,73 @@
 
 use std::iter::repeat_n;
 
-use pulp::Arch;
-
-use super::super::backend::LossSums;
+use super::super::backend::Losses;
+use super::super::policy::Policy;
 use super::super::rollout::{Rollout, RolloutBlock};
+use super::super::widest::widest;
 use crate::config::PpoConfig;
 
 /// The losses of a minibatch. An action has A values.
 pub(super) struct Loss<'a> {
     rollout: &'a Rollout,
-    clip: f32,
-    value_clip: f32,
-    value_coef: f32,
-    bounds_coef: f32,
+    config: &'a PpoConfig,
     /// The weight of one sample in the means over the minibatch.
     sample_weight: f32,
-    /// The reciprocal of the standard deviation of an action.
+    /// The logarithm of the standard deviation of an action.
+    log_std: f32,
+    /// The reciprocal of that standard deviation.
     inverse_std: f32,
     /// The negated log-density at the mean.
     log_scale: f32,
     action_size: usize,
 }
 
+/// Sums over the samples of a group.
+#[derive(Default)]
+pub(super) struct Sums {
+    /// All but the KL divergence.
+    losses: Losses,
+    /// `[A]`: squared differences of the means from those that acted, divided by the squared noise scales.
+    squared_shifts: Vec<f32>,
+}
+
 impl<'a> Loss<'a> {
-    /// Creates the losses of a minibatch of `samples` samples of `rollout` under the policy with the standard deviation
-    /// e^`log_std` for each of its `action_size` actions.
-    pub(super) fn new(
-        rollout: &'a Rollout,
-        samples: usize,
-        config: &PpoConfig,
-        (log_std, action_size): (f32, usize),
-    ) -> Self {
-        Self {
-            rollout,
-            clip: config.clip as f32,
-            value_clip: config.value_clip() as f32,
-            value_coef: config.value_coef as f32,
-            bounds_coef: config.bounds_coef as f32,
-            sample_weight: 1.0 / samples as f32,
-            inverse_std: (-log_std).exp(),
-            log_scale: repeat_n(log_std + 0.5 * std::f32::consts::TAU.ln(), action_size).sum(),
-            action_size,
-        }
+    /// Creates the losses of a minibatch of `samples` samples of `rollout` under `policy`.
+    pub(super) fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &'a PpoConfig) -> Self {
+        let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
+        let log_scale = repeat_n(log_std + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
+        let (sample_weight, inverse_std) = (1.0 / samples as f32, (-log_std).exp());
+        Self { rollout, config, sample_weight, log_std, inverse_std, log_scale, action_size }
     }
 
-    /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples. Adds to `squared_shifts` `[A]` the
-    /// squared differences of the means from those that acted, divided by the squared noise scales.
-    pub(super) fn actor(
-        &self,
-        samples: &[u32],
-        means: &[f32],
-        grad: &mut [f32],
-        sums: &mut LossSums,
-        squared_shifts: &mut [f32],
-    ) {
+    /// Returns the sums over no samples.
+    pub(super) fn of_none(&self) -> Sums {
+        Sums { losses: Losses::default(), squared_shifts: vec![0.0; self.action_size] }
+    }
+
+    /// Returns the losses of a group, given the sums of [`Loss::actor`] and [`Loss::critic`].
+    pub(super) fn of_group(&self, actor: &Sums, critic: &Sums) -> Losses {
+        // The divergence of Gaussians with the same standard deviation.
+        let variance = (2.0 * f64::from(self.log_std)).exp();
+        let kl = actor.squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum();
+        Losses { kl, ..actor.losses } + critic.losses
+    }
+
+    /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
+    pub(super) fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
         let width = self.action_size;
-        Arch::new().dispatch(
-            #[inline(always)]
-            || {
-                let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
-                for (&sample, (mean, grad)) in samples.iter().zip(rows) {
-                    let (block, i) = self.rollout.locate(sample);
-                    self.actor_sample((block, i), mean, grad, sums, squared_shifts);
-                }
-            },
-        );
+        widest!({
+            let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
+            for (&sample, (mean, grad)) in samples.iter().zip(rows) {
+                self.actor_sample(self.rollout.locate(sample), mean, grad, sums);
+            }
+        });
     }
 
     #[inline(always)]
-    fn actor_sample(
-        &self,
-        (block, i): (&RolloutBlock, usize),
-        mean: &[f32],
-        grad: &mut [f32],
-        sums: &mut LossSums,
-        squared_shifts: &mut [f32],
-    ) {
+    fn actor_sample(&self, (block, i): (&RolloutBlock, usize), mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        let Sums { losses: sums, squared_shifts } = sums;
+        let [clip, bounds_coef] = [self.config.clip, self.config.bounds_coef].map(|x| x as f32);
         let row = RolloutBlock::row(mean.len(), i);
         let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
         // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
@@ -90,18 +81,18 @@ impl<'a> Loss<'a> {
         let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
         let ratio = (log_prob - block.log_probs[i]).exp();
         let advantage = block.advantages[i];
-        let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage);
+        let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage);
         // A NaN ratio takes the second branch and makes the sum NaN.
         let (surrogate, slope) = if free <= bounded { (free, -self.sample_weight * free) } else { (bounded, 0.0) };
         let error = (ratio - 1.0).abs();
         sums.surrogate += f64::from(surrogate);
-        sums.clipped += f64::from(u8::from(error > self.clip));
+        sums.clipped += f64::from(u8::from(error > clip));
         sums.ratio_error = sums.ratio_error.max(f64::from(error));
         for ((sum, mean), old_mean) in squared_shifts.iter_mut().zip(mean).zip(old_mean) {
             let shift = (mean - old_mean) * inverse_scale;
             *sum += shift * shift;
         }
-        let (mut excess, pull) = (0.0, 2.0 * self.bounds_coef * self.sample_weight);
+        let (mut excess, pull) = (0.0, 2.0 * bounds_coef * self.sample_weight);
         for (z, mean) in grad.iter_mut().zip(mean) {
             let beyond = mean - mean.clamp(-1.0, 1.0);
             excess += beyond * beyond;
@@ -111,33 +102,27 @@ impl<'a> Loss<'a> {
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
-    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut LossSums) {
+    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
+        let [clip, value_coef] = [self.config.value_clip(), self.config.value_coef].map(|x| x as f32);
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let (old, target) = (block.values[i], block.returns[i]);
-            let step = (value - old).clamp(-self.value_clip, self.value_clip);
+            let step = (value - old).clamp(-clip, clip);
             let (free, bounded) = (value - target, old + step - target);
-            let inside = (value - old).abs() <= self.value_clip;
+            let inside = (value - old).abs() <= clip;
             // Where clipping the step makes the error larger, the error does not depend on the value.
             let (error, slope) =
                 if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
-            sums.value_error += f64::from(error * error);
-            *grad = self.value_coef * self.sample_weight * slope;
+            sums.losses.value_error += f64::from(error * error);
+            *grad = value_coef * self.sample_weight * slope;
         }
     }
-}
-
-/// Returns the sum over samples of the KL divergence of Gaussians with the same standard deviation e^`log_std`, given the sums of
-/// squared differences of their means `[A]`.
-pub(super) fn kl(squared_shifts: &[f32], log_std: f32) -> f64 {
-    let variance = (2.0 * f64::from(log_std)).exp();
-    squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use crate::config::{Activation, Config, NetConfig, Symmetry};
     use crate::spaces::Spaces;
 
     fn assert_close(found: &[f32], expected: &[f32]) {
@@ -167,32 +152,36 @@ mod tests {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
-        let loss = Loss::new(&rollout, 3, &config, (log_std, 2));
-        let (mut sums, mut shifts) = (LossSums::default(), [0.0; 2]);
+        let net = NetConfig { hidden: vec![1], activation: Activation::Elu, symmetry: Symmetry::None };
+        let mut policy = Policy::new(&net, spaces).unwrap();
+        policy.log_std = log_std;
+        let loss = Loss::new(&policy, &rollout, 3, &config);
+        let (mut actor, mut critic) = (loss.of_none(), loss.of_none());
         let mut grad = [0.0; 6];
-        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut sums, &mut shifts);
+        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut actor);
         assert_close(&grad, &[0.0, 0.0, 0.130_386_1, -0.097_789_58, 6.613_660_5, 7.715_937]);
+        let mut grad = [0.0; 3];
+        loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut critic);
+        assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
+        let sums = loss.of_group(&actor, &critic);
         assert_close(&[-sums.surrogate as f32 / 3.0], &[2.060_326_3]);
         assert_close(&[sums.ratio_error as f32], &[2.892_847_6]);
         assert_eq!(sums.clipped, 2.0);
-        assert_close(&[kl(&shifts, log_std) as f32 / 3.0], &[0.103_508_65]);
-        let mut grad = [0.0; 3];
-        loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut sums);
-        assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
+        assert_close(&[sums.kl as f32 / 3.0], &[0.103_508_65]);
         assert_close(&[sums.value_error as f32 / 3.0], &[0.296_666_7]);
         assert_eq!(sums.excess, 0.0);
 
         // Means beyond ±1 add 2 · 0.5 · their distance, divided by three samples, to the gradient of the surrogate.
         let grads = [[1.5, -0.2], [1.0, -0.2]].map(|mean| {
             let mut grad = [0.0; 2];
-            loss.actor(&[2], &mean, &mut grad, &mut sums, &mut shifts);
+            loss.actor(&[2], &mean, &mut grad, &mut actor);
             grad
         });
-        assert!((sums.excess - 0.25).abs() < 1e-6);
-        config.bounds_coef = 0.0;
+        assert!((actor.losses.excess - 0.25).abs() < 1e-6);
+        let config = PpoConfig { bounds_coef: 0.0, ..config.clone() };
         let mut free = [0.0; 2];
-        let loss = Loss::new(&rollout, 3, &config, (log_std, 2));
-        loss.actor(&[2], &[1.5, -0.2], &mut free, &mut sums, &mut shifts);
+        let loss = Loss::new(&policy, &rollout, 3, &config);
+        loss.actor(&[2], &[1.5, -0.2], &mut free, &mut actor);
         assert_close(&[grads[0][0] - free[0], grads[0][1] - free[1]], &[0.5 / 3.0, 0.0]);
     }
 }

@@ -9,7 +9,9 @@
 //! packs the weights anew for each minibatch.
 
 mod activation;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod amx;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
 mod bf16;
 mod loss;
@@ -29,11 +31,11 @@ pub use net::Workspace;
 pub(super) use product::Matrix;
 
 use super::Policy;
-use super::backend::{GradientBackend, LossSums};
+use super::backend::{GradientBackend, Losses};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
-use loss::{Loss, kl};
+use loss::{Loss, Sums};
 
 /// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
 pub(super) const ROWS: usize = 256;
@@ -47,29 +49,25 @@ pub(super) struct Kernels {
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
-    /// Results, one per group and net.
-    parts: Vec<Partial>,
+    /// Results of each group, for actor and critic.
+    parts: Vec<[Partial; 2]>,
     /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
 }
 
 /// The result of a job.
-#[derive(Clone, Default)]
+#[derive(Default)]
 struct Partial {
     gradient: Vec<f32>,
-    sums: LossSums,
-    /// See [`Loss::actor`].
-    squared_shifts: Vec<f32>,
+    sums: Sums,
 }
 
 /// The net that a job works on.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 enum Role {
     Actor,
     Critic,
 }
-
-const ROLES: [Role; 2] = [Role::Actor, Role::Critic];
 
 impl Kernels {
     /// Creates the backend with these settings.
@@ -83,23 +81,12 @@ impl Kernels {
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
         self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
-            self.workspaces.push(Mutex::new(policy.workspace(rows, true, self.arithmetic)));
+            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, true, self.arithmetic)));
         }
-        if self.parts.len() < 2 * groups {
-            self.parts.resize(2 * groups, Partial::default());
+        if self.parts.len() < groups {
+            self.parts.resize_with(groups, Default::default);
         }
         rows
-    }
-
-    /// Writes the sum of the gradients of all groups for one net.
-    fn add_up(&self, role: Role, groups: usize, out: &mut [f32]) {
-        let gradients: Vec<&[f32]> =
-            (0..groups).map(|group| &self.parts[2 * group + role as usize].gradient[..]).collect();
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
-            let own = i * CHUNK..i * CHUNK + out.len();
-            let of_groups: Vec<&[f32]> = gradients.iter().map(|gradient| &gradient[own.clone()]).collect();
-            tree_sum(out, &of_groups);
-        });
     }
 }
 
@@ -107,60 +94,48 @@ impl GradientBackend for Kernels {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
         let (transform, size) = (policy.input_transform(), policy.spaces.observation_size);
         self.seen.resize(rollout.samples() * size, 0.0);
-        let (mut rest, mut parts) = (&mut self.seen[..], Vec::new());
-        for block in &rollout.blocks {
-            let (seen, after) = rest.split_at_mut(block.samples() * size);
-            parts.push((seen, block));
-            rest = after;
-        }
+        let mut rest = &mut self.seen[..];
+        let mut seen = |block: &RolloutBlock| rest.split_off_mut(..block.samples() * size).expect("room for all");
+        let parts: Vec<_> = rollout.blocks.iter().map(|block| (seen(block), block)).collect();
         parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
     }
 
-    fn gradient(
-        &mut self,
-        policy: &Policy,
-        rollout: &Rollout,
-        minibatch: &Minibatch,
-        out: &mut [f32],
-    ) -> Result<Vec<LossSums>> {
-        let groups = &minibatch.groups;
+    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
+        let groups = &of.groups;
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
-        let nets = [&policy.layout.actor, &policy.layout.critic];
-        let nets = nets.map(|layers| policy.net(layers).packed(self.arithmetic, true));
-        let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
-        let loss = Loss::new(rollout, minibatch.count, &self.config, (log_std, action_size));
-        let tasks = groups.iter().flat_map(|group| ROLES.map(|role| (group, role)));
-        let tasks: Vec<_> = tasks.zip(&mut self.parts).collect();
-        tasks.into_par_iter().with_max_len(1).for_each(|((group, role), part)| {
+        let (nets, ranges) = (policy.nets(self.arithmetic, true), policy.layout.nets());
+        let loss = Loss::new(policy, rollout, of.count, &self.config);
+        let parts = groups.iter().zip(&mut self.parts);
+        let jobs =
+            parts.flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)]);
+        jobs.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(|(group, role, part)| {
             let net = &nets[role as usize];
-            part.gradient.resize(net.parameter_count(), 0.0);
-            part.sums = LossSums::default();
-            part.squared_shifts = vec![0.0; action_size];
+            part.gradient.resize(ranges[role as usize].len(), 0.0);
+            part.sums = loss.of_none();
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
-                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(policy.spaces.observation_size)) {
                     row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
                 }
                 net.forward(block.len(), work);
                 let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
                 match role {
-                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums, &mut part.squared_shifts),
+                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
                     Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
                 }
                 net.backward(block.len(), work, &mut part.gradient, i > 0);
             }
         });
 
-        for (role, range) in ROLES.into_iter().zip(policy.layout.nets()) {
-            self.add_up(role, groups.len(), &mut out[range]);
+        let parts = &self.parts[..groups.len()];
+        for (net, range) in ranges.into_iter().enumerate() {
+            out[range].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
+                let own = i * CHUNK..i * CHUNK + out.len();
+                let of_groups: Vec<&[f32]> = parts.iter().map(|nets| &nets[net].gradient[own.clone()]).collect();
+                tree_sum(out, &of_groups);
+            });
         }
-        let of_group = |parts: &[Partial]| {
-            let [actor, critic] = parts else { unreachable!("one part for each net") };
-            let mut sums = LossSums { kl: kl(&actor.squared_shifts, log_std), ..actor.sums };
-            sums += critic.sums;
-            sums
-        };
-        Ok(self.parts[..2 * groups.len()].chunks(2).map(of_group).collect())
+        Ok(parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
     }
 }

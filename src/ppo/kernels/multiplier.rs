@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result};
 
-use super::bf16::{Packed, rounded};
+use super::bf16::{Packed, Unit, rounded};
 use super::product::{Matrix, product};
-use super::units::{Unit, pack_right};
+use super::units;
 use crate::config::Precision;
 
 /// An arithmetic that this machine supports.
@@ -15,7 +15,7 @@ pub enum Arithmetic {
     /// Operands rounded to bf16, products and sums in f32.
     Rounded,
     /// Operands rounded to bf16, products on a unit of the processor, sums in f32.
-    Bf16(Unit),
+    Bf16(&'static dyn Unit),
 }
 
 impl Arithmetic {
@@ -28,7 +28,7 @@ impl Arithmetic {
             Precision::F32 => Self::F32,
             Precision::Bf16Rounded => Self::Rounded,
             Precision::Bf16 => Self::Bf16(
-                Unit::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
+                units::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
             ),
         })
     }
@@ -37,29 +37,9 @@ impl Arithmetic {
     pub(crate) fn packed(self, rhs: Matrix) -> Option<Packed> {
         matches!(self, Self::Bf16(_)).then(|| {
             let mut packed = Packed::default();
-            pack_right(rhs, &mut packed);
+            packed.pack_right(rhs);
             packed
         })
-    }
-}
-
-/// A right operand.
-#[derive(Clone, Copy)]
-pub(crate) struct Right<'a> {
-    matrix: Matrix<'a>,
-    packed: Option<&'a Packed>,
-}
-
-impl<'a> Right<'a> {
-    /// Creates the operand from a matrix, and from what [`Arithmetic::packed`] has made of it, if it has.
-    pub(crate) fn new(matrix: Matrix<'a>, packed: Option<&'a Packed>) -> Self {
-        Self { matrix, packed }
-    }
-}
-
-impl<'a> From<Matrix<'a>> for Right<'a> {
-    fn from(matrix: Matrix<'a>) -> Self {
-        Self { matrix, packed: None }
     }
 }
 
@@ -76,12 +56,12 @@ impl Multiplier {
         Self { arithmetic, rounded: Default::default(), packed: Default::default() }
     }
 
-    /// Writes the product to `out`, by rows, or adds it if `add` is set.
+    /// Writes the product to `out`, by rows, or adds it if `add` is set. `ready` is what [`Arithmetic::packed`] has made of the
+    /// right operand, if it has.
     ///
     /// # Panics
     /// Panics if the sizes do not match.
-    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Right, add: bool) {
-        let Right { matrix: rhs, packed: ready } = rhs;
+    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, ready: Option<&Packed>, add: bool) {
         assert_eq!(lhs.size()[1], rhs.size()[0], "columns of the first and rows of the second matrix");
         assert_eq!(out.len(), lhs.size()[0] * rhs.size()[1], "elements of the product");
         match self.arithmetic {
@@ -92,13 +72,12 @@ impl Multiplier {
             }
             Arithmetic::Bf16(unit) => {
                 let [left, right] = &mut self.packed;
-                unit.pack_left(lhs, left);
+                left.pack(lhs, unit.order_of_left(lhs));
                 let right = ready.unwrap_or_else(|| {
-                    pack_right(rhs, right);
+                    right.pack_right(rhs);
                     right
                 });
-                let [_, columns] = rhs.size();
-                unit.product(out, columns, left, right, add);
+                unit.product(out, rhs.size()[1], [left, right], add);
             }
         }
     }

@@ -1,9 +1,9 @@
 //! A network on a block of rows: forward and backward, layer by layer, in the cache of one core.
 
 use super::super::parameters;
-use super::activation::{add_bias, add_bias_activate, slopes_and_sums};
+use super::activation::{add_bias, slopes_and_sums};
 use super::bf16::Packed;
-use super::multiplier::{Arithmetic, Multiplier, Right};
+use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
 
@@ -16,13 +16,15 @@ pub(crate) struct Net<'a> {
     activation: Activation,
 }
 
-/// A dense layer: weight `[outputs, inputs]` and bias `[outputs]`.
+/// A dense layer.
 struct Dense<'a> {
-    weight: &'a [f32],
+    /// `[outputs, inputs]`
+    weight: Matrix<'a>,
     /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
     weight_t: Option<Vec<f32>>,
     /// The weight, transposed and as it is, as products in bf16 read it, if it was packed.
     packed: [Option<Packed>; 2],
+    /// `[outputs]`
     bias: &'a [f32],
     inputs: usize,
     outputs: usize,
@@ -71,7 +73,7 @@ impl<'a> Net<'a> {
     /// Creates the net of these layers, whose ranges refer to `parameters`.
     pub(crate) fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
         let layer = |layer: &parameters::Layer| Dense {
-            weight: &parameters[layer.weight.clone()],
+            weight: Matrix::new(&parameters[layer.weight.clone()], layer.outputs, layer.inputs),
             weight_t: None,
             packed: [None, None],
             bias: &parameters[layer.bias.clone()],
@@ -81,33 +83,22 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Returns the net with copies of the weights for many forward passes of few rows. Without them, each product first
-    /// rearranges the weights, which takes longer than the product if there are few rows. The results are the same, bit for bit.
-    pub(crate) fn for_few_rows(mut self) -> Self {
+    /// Returns the net with rearranged copies of its weights, which each product would else make anew. They are for forward and
+    /// backward passes if `learning`, else for many forward passes of few rows, where making them would take longer than the
+    /// product. The results are the same, bit for bit.
+    pub(crate) fn prepared(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
         for layer in &mut self.layers {
-            let mut weight_t = vec![0.0; layer.weight.len()];
-            for (output, row) in layer.weight.chunks_exact(layer.inputs).enumerate() {
-                weight_t[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
+            if !learning {
+                let mut weight_t = vec![0.0; layer.inputs * layer.outputs];
+                for (output, row) in layer.weight.data().chunks_exact(layer.inputs).enumerate() {
+                    weight_t[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
+                }
+                layer.weight_t = Some(weight_t);
             }
-            layer.weight_t = Some(weight_t);
+            let backward = if learning { arithmetic.packed(layer.weight) } else { None };
+            layer.packed = [arithmetic.packed(layer.weight.transposed()), backward];
         }
         self
-    }
-
-    /// Returns the net with its weights packed for this arithmetic, which each product would else do anew: for forward passes
-    /// and, if `learning`, for backward passes. The results are the same, bit for bit.
-    pub(crate) fn packed(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
-        for layer in &mut self.layers {
-            let weight = layer.weight();
-            let backward = if learning { arithmetic.packed(weight) } else { None };
-            layer.packed = [arithmetic.packed(weight.transposed()), backward];
-        }
-        self
-    }
-
-    /// Returns the number of inputs.
-    pub(crate) fn inputs(&self) -> usize {
-        self.layers[0].inputs
     }
 
     /// Returns the number of outputs.
@@ -115,9 +106,9 @@ impl<'a> Net<'a> {
         self.layers.last().expect("a net has layers").outputs
     }
 
-    /// Returns the number of weights and biases.
-    pub(crate) fn parameter_count(&self) -> usize {
-        self.layers.iter().map(|layer| layer.outputs * (layer.inputs + 1)).sum()
+    /// Returns the activation after layer `l`; none after the last one.
+    fn activation_of(&self, l: usize) -> Option<Activation> {
+        (l + 1 < self.layers.len()).then_some(self.activation)
     }
 
     /// Runs the first `rows` rows of the inputs through the net and returns its outputs `[rows, outputs]`.
@@ -126,13 +117,9 @@ impl<'a> Net<'a> {
             let (below, outputs) = work.outputs.split_at_mut(l);
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
-            let weight = Right::new(layer.weight_t(rows), layer.packed[0].as_ref());
-            work.multiplier.product(y, layer.x(x, rows), weight, false);
-            if l + 1 == self.layers.len() {
-                add_bias(y, layer.bias);
-            } else {
-                add_bias_activate(y, layer.bias, self.activation);
-            }
+            let packed = layer.packed[0].as_ref();
+            work.multiplier.product(y, layer.x(x, rows), layer.weight_t(rows), packed, false);
+            add_bias(y, layer.bias, self.activation_of(l));
         }
         &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
     }
@@ -144,22 +131,20 @@ impl<'a> Net<'a> {
         let [above, below] = &mut work.grads;
         for (l, layer) in self.layers.iter().enumerate().rev() {
             let at = rest.len() - layer.outputs * (layer.inputs + 1);
-            let (first, own) = rest.split_at_mut(at);
+            let own = rest.split_off_mut(at..).expect("room for each layer");
             let (weight_grad, bias_grad) = own.split_at_mut(layer.outputs * layer.inputs);
-            rest = first;
 
             let grad = &mut above[..rows * layer.outputs];
             if !add {
                 bias_grad.fill(0.0);
             }
-            let activation = (l + 1 < self.layers.len()).then_some(self.activation);
-            slopes_and_sums(grad, &work.outputs[l][..grad.len()], activation, bias_grad);
+            slopes_and_sums(grad, &work.outputs[l][..grad.len()], self.activation_of(l), bias_grad);
             let grad = Matrix::new(grad, rows, layer.outputs);
             let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
-            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows).into(), add);
+            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), None, add);
             if l > 0 {
-                let weight = Right::new(layer.weight(), layer.packed[1].as_ref());
-                work.multiplier.product(&mut below[..rows * layer.inputs], grad, weight, false);
+                let (out, packed) = (&mut below[..rows * layer.inputs], layer.packed[1].as_ref());
+                work.multiplier.product(out, grad, layer.weight, packed, false);
                 std::mem::swap(above, below);
             }
         }
@@ -167,17 +152,13 @@ impl<'a> Net<'a> {
 }
 
 impl Dense<'_> {
-    fn weight(&self) -> Matrix<'_> {
-        Matrix::new(self.weight, self.outputs, self.inputs)
-    }
-
     /// Returns the transposed weight, for a product with `rows` rows.
     fn weight_t(&self, rows: usize) -> Matrix<'_> {
         // gemm adds up single rows and small products in an order that depends on how the weight is stored.
         let ordered = rows > 1 && rows * self.outputs > LARGEST_SMALL;
         match self.weight_t.as_ref().filter(|_| ordered) {
             Some(weight_t) => Matrix::new(weight_t, self.inputs, self.outputs),
-            None => self.weight().transposed(),
+            None => self.weight.transposed(),
         }
     }
 
@@ -191,22 +172,25 @@ mod tests {
     use super::super::super::parameters::Layout;
     use super::*;
     use crate::config::Precision;
+    use crate::spaces::Spaces;
+
+    const SPACES: Spaces = Spaces { observation_size: 157, action_size: 20, cube_and_goal: None, distance: |_| 0.0 };
 
     #[test]
     fn packed_weights_change_no_bit() {
         let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
-        let layout = Layout::new(&[70, 33], 157, 20);
+        let layout = Layout::new(&[70, 33], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
                 let net = Net::new(&layout.actor, &parameters, Activation::Elu);
-                let net = if packed { net.packed(arithmetic, true) } else { net };
+                let net = if packed { net.prepared(arithmetic, true) } else { net };
                 let mut work = Workspace::new(&layout.actor, rows, true, arithmetic);
                 work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
                 let outputs = net.forward(rows, &mut work).to_vec();
                 let (_, grad) = work.outputs_and_grad(rows, net.outputs());
                 grad.iter_mut().enumerate().for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
-                let mut gradient = vec![0.0; net.parameter_count()];
+                let mut gradient = vec![0.0; layout.nets()[0].len()];
                 net.backward(rows, &mut work, &mut gradient, false);
                 (outputs, gradient)
             });
@@ -216,7 +200,7 @@ mod tests {
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
-        let layout = Layout::new(&[300, 64], 157, 20);
+        let layout = Layout::new(&[300, 64], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
         work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
@@ -224,7 +208,7 @@ mod tests {
             let net = || Net::new(layers, &parameters, Activation::Elu);
             for rows in [1, 2, 5, 13, 32, 64] {
                 let expected = net().forward(rows, &mut work).to_vec();
-                assert_eq!(net().for_few_rows().forward(rows, &mut work), expected, "{rows} rows");
+                assert_eq!(net().prepared(Arithmetic::F32, false).forward(rows, &mut work), expected, "{rows} rows");
             }
         }
     }

@@ -61,28 +61,16 @@ pub(super) fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
     let ([m, k], [rhs_rows, n]) = (lhs.size, rhs.size);
     assert_eq!(k, rhs_rows, "columns of the first and rows of the second matrix");
     assert_eq!(out.len(), m * n, "elements of the product");
+    let [[down, right], [rhs_down, rhs_right]] = [lhs.strides, rhs.strides];
     // SAFETY: the strides of `Matrix` stay within its slice, and `out` has m rows of n elements.
     unsafe {
+        #[rustfmt::skip]
         gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            n as isize,
-            add,
-            lhs.data.as_ptr(),
-            lhs.strides[1],
-            lhs.strides[0],
-            rhs.data.as_ptr(),
-            rhs.strides[1],
-            rhs.strides[0],
-            1.0,
-            1.0,
-            false,
-            false,
-            false,
-            Parallelism::None,
+            m, n, k,
+            out.as_mut_ptr(), 1, n as isize, add,
+            lhs.data.as_ptr(), right, down,
+            rhs.data.as_ptr(), rhs_right, rhs_down,
+            1.0, 1.0, false, false, false, Parallelism::None,
         );
     }
 }
