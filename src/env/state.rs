@@ -24,13 +24,12 @@ pub struct SavedEnv<'a> {
 impl EnvState {
     /// Returns the states of these environments, one part after another.
     pub fn joined(parts: Vec<Self>) -> Self {
-        let mut parts = parts.into_iter();
-        let mut all = parts.next().unwrap_or_default();
-        for Self { numbers, counters } in parts {
-            all.numbers.extend(numbers);
-            all.counters.extend(counters);
-        }
-        all
+        let join = |mut all: Self, part: Self| {
+            all.numbers.extend(part.numbers);
+            all.counters.extend(part.counters);
+            all
+        };
+        parts.into_iter().reduce(join).unwrap_or_default()
     }
 
     /// Returns the rows of each of `count` environments.

@@ -70,12 +70,12 @@ impl Exchange {
     }
 
     /// Returns the number of all shards.
-    pub(super) fn shards(&self) -> usize {
+    pub fn shards(&self) -> usize {
         self.shards
     }
 
     /// Returns the shards of this rank.
-    pub(super) fn own_shards(&self) -> Range<usize> {
+    pub fn own_shards(&self) -> Range<usize> {
         self.own(self.shards)
     }
 

@@ -11,7 +11,6 @@
 //! as bytes.
 
 mod alike;
-mod blocks;
 mod exchange;
 mod launch;
 mod minibatches;
@@ -23,7 +22,6 @@ use std::ops::Range;
 
 use pulp::Arch;
 
-pub use blocks::Blocks;
 pub use exchange::{Exchange, Traffic};
 pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
 pub use minibatches::{Minibatch, Minibatches};

@@ -92,7 +92,7 @@ impl Session {
         if !self.dumps {
             return Vec::new();
         }
-        let (iteration, first) = (self.agent.iteration, self.agent.pool.first());
+        let (iteration, first) = (self.agent.iteration, self.agent.pool.blocks[0].first);
         let mut own: Vec<(String, String)> = Vec::new();
         for (env, hand) in (first..).zip(self.agent.pool.envs_mut()) {
             let Some(diverged) = hand.take_diverged() else { continue };
