@@ -10,14 +10,15 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::{Alone, Ranks};
+use super::Ranks;
 
 /// The shards of a training, those of them that this rank computes, and the exchange with the other ranks. All ranks make the same
 /// calls in the same order. Copies share the count of their traffic.
 #[derive(Clone)]
 pub struct Exchange {
     shards: usize,
-    ranks: Arc<dyn Ranks>,
+    /// All ranks, if this is not the only one.
+    ranks: Option<Arc<dyn Ranks>>,
     sent: Arc<Counters>,
 }
 
@@ -46,12 +47,12 @@ impl Traffic {
 impl Exchange {
     /// Creates the exchange of a single shard.
     pub fn new(ranks: Arc<dyn Ranks>) -> Self {
-        Self { shards: 1, ranks, sent: Arc::default() }
+        Self { shards: 1, ranks: Some(ranks).filter(|ranks| ranks.size() > 1), sent: Arc::default() }
     }
 
     /// Creates the exchange of one rank that computes all shards.
     pub fn alone(shards: usize) -> Self {
-        Self::new(Arc::new(Alone)).over(shards).expect("one rank")
+        Self { shards: 1, ranks: None, sent: Arc::default() }.over(shards).expect("one rank")
     }
 
     /// Deals this number of shards, a power of two, to the ranks.
@@ -59,7 +60,7 @@ impl Exchange {
     /// # Errors
     /// Fails if the number of ranks is not a power of two, or if there are fewer shards.
     pub fn over(self, shards: usize) -> Result<Self> {
-        let ranks = self.ranks.size();
+        let ranks = self.ranks();
         ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
         ensure!(
             ranks <= shards,
@@ -81,37 +82,37 @@ impl Exchange {
 
     /// Returns this rank's part of `count` things in a row: parts differ by one thing at most.
     pub fn own(&self, count: usize) -> Range<usize> {
-        part(count, self.ranks.rank(), self.ranks.size())
+        part(count, self.rank(), self.ranks())
     }
 
     /// Returns the number of things of all ranks, if each has `own` of them.
     pub fn of_all(&self, own: usize) -> usize {
-        own * self.ranks.size()
+        own * self.ranks()
     }
 
     /// Returns whether there is no other rank.
     pub fn is_alone(&self) -> bool {
-        self.ranks.size() == 1
+        self.ranks.is_none()
     }
 
     /// Returns whether this is the rank that reports and saves.
     pub fn is_first(&self) -> bool {
-        self.ranks.rank() == 0
+        self.rank() == 0
     }
 
     /// Returns the number of this rank.
     pub(super) fn rank(&self) -> usize {
-        self.ranks.rank()
+        self.ranks.as_ref().map_or(0, |ranks| ranks.rank())
     }
 
     /// Returns the number of all ranks.
     pub(super) fn ranks(&self) -> usize {
-        self.ranks.size()
+        self.ranks.as_ref().map_or(1, |ranks| ranks.size())
     }
 
-    /// Ends all ranks at once.
+    /// Ends all ranks at once, of which there are several.
     pub(super) fn abort(&self) -> ! {
-        self.ranks.abort()
+        self.ranks.as_ref().expect("there are several").abort()
     }
 
     /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts are those of this
@@ -132,30 +133,30 @@ impl Exchange {
 
     /// Returns the values of all ranks, in their order.
     pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
-        if self.is_alone() {
-            return vec![own];
-        }
+        let Some(ranks) = &self.ranks else { return vec![own] };
         let own = to_bytes(&own);
-        let all = self.timed(own.len() * (self.ranks.size() - 1), || self.ranks.all_gather(own));
+        let all = self.timed(own.len() * (ranks.size() - 1), || ranks.all_gather(own));
         all.iter().map(|bytes| from_bytes(bytes)).collect()
     }
 
     /// Returns the value of the first rank; the others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
-        match first {
-            Some(value) if self.is_alone() => value,
-            first => from_bytes(&self.ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value)))),
-        }
+        let Some(ranks) = &self.ranks else { return first.expect("this is the first rank") };
+        from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
     }
 
-    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them.
-    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Vec<f32> {
-        self.timed(4 * (numbers.len() - own), || self.ranks.all_to_all(numbers, slices))
+    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them. Returns `None` if there
+    /// are no others.
+    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Option<Vec<f32>> {
+        let ranks = self.ranks.as_ref()?;
+        Some(self.timed(4 * (numbers.len() - own), || ranks.all_to_all(numbers, slices)))
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
     pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>], own: usize) {
-        self.timed(4 * own * (self.ranks.size() - 1), || self.ranks.all_gather_slices(numbers, slices));
+        if let Some(ranks) = &self.ranks {
+            self.timed(4 * own * (ranks.size() - 1), || ranks.all_gather_slices(numbers, slices));
+        }
     }
 
     /// Returns the traffic since the last call.

@@ -51,37 +51,6 @@ pub trait Ranks: Send + Sync {
     fn abort(&self) -> !;
 }
 
-/// One rank that computes all shards.
-pub struct Alone;
-
-impl Ranks for Alone {
-    fn size(&self) -> usize {
-        1
-    }
-
-    fn rank(&self) -> usize {
-        0
-    }
-
-    fn all_to_all(&self, numbers: &[f32], _: &[Range<usize>]) -> Vec<f32> {
-        numbers.to_vec()
-    }
-
-    fn all_gather_slices(&self, _: &mut [f32], _: &[Range<usize>]) {}
-
-    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
-        vec![bytes]
-    }
-
-    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
-        bytes
-    }
-
-    fn abort(&self) -> ! {
-        std::process::exit(1)
-    }
-}
-
 /// Writes the sum of `parts`, which have equal length and whose number is a power of two. They are added as a binary
 /// tree: the first and the second, the third and the fourth, and so on, then these sums likewise.
 pub fn tree_sum(out: &mut [f32], parts: &[&[f32]]) {
