@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 
-use crate::cli::{CompletionsArgs, Shell, command};
+use crate::cli::{CompletionsArgs, command};
 use crate::os;
 
 /// Prints completions for a shell.
@@ -10,13 +10,8 @@ use crate::os;
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn completions(args: &CompletionsArgs) -> Result<()> {
-    let shell = match args.shell {
-        Shell::Bash => clap_complete::Shell::Bash,
-        Shell::Zsh => clap_complete::Shell::Zsh,
-        Shell::Fish => clap_complete::Shell::Fish,
-    };
     let mut text = Vec::new();
-    clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
+    clap_complete::generate(args.shell, &mut command(), "shadow-repose", &mut text);
     os::print(&String::from_utf8(text)?)
 }
 

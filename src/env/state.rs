@@ -52,9 +52,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let (first, rest) = self.numbers.split_first_chunk().context("the state has too few numbers")?;
-        self.numbers = rest;
-        Ok(*first)
+        let next = self.numbers.split_off(..N).and_then(|next| next.first_chunk().copied());
+        next.context("the state has too few numbers")
     }
 
     /// Returns how many numbers are left.
@@ -67,10 +66,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer than `kept` are left.
     pub fn numbers_but(&mut self, kept: usize) -> Result<&'a [f64]> {
-        let count = self.numbers.len().checked_sub(kept).context("the state has too few numbers")?;
-        let (first, rest) = self.numbers.split_at(count);
-        self.numbers = rest;
-        Ok(first)
+        let count = self.numbers.len().checked_sub(kept);
+        count.and_then(|count| self.numbers.split_off(..count)).context("the state has too few numbers")
     }
 
     /// Reads the next `N` counters.
@@ -78,9 +75,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let (first, rest) = self.counters.split_first_chunk().context("the state has too few counters")?;
-        self.counters = rest;
-        Ok(*first)
+        let next = self.counters.split_off(..N).and_then(|next| next.first_chunk().copied());
+        next.context("the state has too few counters")
     }
 
     /// Checks that everything has been read.

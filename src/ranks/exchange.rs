@@ -19,13 +19,8 @@ pub struct Exchange {
     shards: usize,
     /// All ranks, if this is not the only one.
     ranks: Option<Arc<dyn Ranks>>,
-    sent: Arc<Counters>,
-}
-
-#[derive(Default)]
-struct Counters {
-    nanoseconds: AtomicU64,
-    bytes: AtomicU64,
+    /// The nanoseconds spent, and the bytes sent.
+    sent: Arc<[AtomicU64; 2]>,
 }
 
 /// The cost of the exchange.
@@ -161,7 +156,7 @@ impl Exchange {
 
     /// Returns the traffic since the last call.
     pub fn take_traffic(&self) -> Traffic {
-        let [nanoseconds, bytes] = [&self.sent.nanoseconds, &self.sent.bytes].map(|of| of.swap(0, Ordering::Relaxed));
+        let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));
         let known = |value: f64| if self.is_alone() { f64::NAN } else { value };
         Traffic { seconds: known(nanoseconds as f64 * 1e-9), bytes: known(bytes as f64) }
     }
@@ -169,8 +164,8 @@ impl Exchange {
     fn timed<T>(&self, bytes: usize, talk: impl FnOnce() -> T) -> T {
         let started = Instant::now();
         let result = talk();
-        self.sent.nanoseconds.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
-        self.sent.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+        self.sent[0].fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
+        self.sent[1].fetch_add(bytes as u64, Ordering::Relaxed);
         result
     }
 }

@@ -144,6 +144,11 @@ impl Session {
             let (pool, exchange) = (&mut self.agent.pool, &self.agent.exchange);
             let ended = exchange.all_gather(pool.take_finished()).concat();
             let sums: Vec<StepSums> = pool.envs_mut().map(Repose::take_sums).collect();
+            let total = |sums: &[StepSums]| {
+                let mut total = StepSums::default();
+                sums.iter().for_each(|sums| total += *sums);
+                total
+            };
             let steps = exchange.sum(&sums, total, |sum, more| *sum += more);
             let decision = self.decide(requests, place.is_some_and(|(_, folder)| folder.take_stop()), improved)?;
             Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, media, decision }))
@@ -215,13 +220,6 @@ impl Session {
         }
         report.iteration(self.agent.iteration, &row(outcome, &ended), media, &status);
     }
-}
-
-fn total(sums: &[StepSums]) -> StepSums {
-    sums.iter().fold(StepSums::default(), |mut total, &more| {
-        total += more;
-        total
-    })
 }
 
 /// Prints notes about settings that are rarely intended.

@@ -59,14 +59,11 @@ impl Session {
             os::say(&format!("warning: {warning}"));
         }
         // A new folder is created last, so that a training that cannot be set up leaves none behind.
-        let (folder, lock, from_newest) = match existing {
+        let (place, from_newest) = match existing {
             Some(existing) => existing,
-            None => {
-                let (folder, lock) = RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?;
-                (folder, lock, false)
-            }
+            None => (RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?, false),
         };
-        let saver = Saver::new((folder, lock), args, &session.config, session.checkpoint(), from_newest);
+        let saver = Saver::new(place, args, &session.config, session.checkpoint(), from_newest);
         Ok((session, saver))
     }
 

@@ -43,7 +43,7 @@ pub(super) enum Takes {
 }
 
 /// The folder of a run that is resumed, the lock on it, and whether the checkpoint that is resumed is the newest one.
-pub(super) type Existing = (RunFolder, Locked, bool);
+pub(super) type Existing = ((RunFolder, Locked), bool);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
 type Message = (String, Option<(Takes, Vec<u8>)>, Option<Evaluation>, Option<String>, bool);
@@ -121,7 +121,7 @@ impl Plan {
         let from_newest = os::same_file(&path, &newest[0]);
         let from = Some((Takes::State, checkpoint));
         let plan = Self { from, best, context: Some(context), ..Self::new(config, args)? };
-        Ok((plan, (folder, lock, from_newest)))
+        Ok((plan, ((folder, lock), from_newest)))
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
