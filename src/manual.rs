@@ -1,17 +1,18 @@
 //! The command line as texts for other programs: shell completions and a manual page.
 
 use anyhow::Result;
+use clap_complete::Shell;
 
-use crate::cli::{CompletionsArgs, command};
+use crate::cli::command;
 use crate::os;
 
 /// Prints completions for a shell.
 ///
 /// # Errors
 /// Fails if stdout cannot be written to.
-pub fn completions(args: &CompletionsArgs) -> Result<()> {
+pub fn completions(shell: Shell) -> Result<()> {
     let mut text = Vec::new();
-    clap_complete::generate(args.shell, &mut command(), "shadow-repose", &mut text);
+    clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
     os::print(&String::from_utf8(text)?)
 }
 

@@ -63,7 +63,6 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
-    let asked = |part: Part| args.only.is_none_or(|only| only == part);
     let (threads, num_envs, hidden) = (rayon::current_num_threads(), config.env.num_envs, &config.ppo.hidden);
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
@@ -72,14 +71,10 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
         lines += &text;
     };
-    if asked(Part::Physics) {
-        tell(physics_and_pool(&task, &config)?);
-    }
-    if asked(Part::Learner) {
-        tell(learner(&task, &config)?);
-    }
-    if asked(Part::Training) {
-        tell(end_to_end(&task, &config)?);
+    let measures: [(Part, Measure); 3] =
+        [(Part::Physics, physics_and_pool), (Part::Learner, learner), (Part::Training, end_to_end)];
+    for (_, measure) in measures.into_iter().filter(|(part, _)| args.only.is_none_or(|only| only == *part)) {
+        tell(measure(&task, &config)?);
     }
     if args.only == Some(Part::Iteration) {
         let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
@@ -92,6 +87,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
 
 /// Figures by their keys in JSON, and lines that tell them.
 type Found = (Vec<(&'static str, f64)>, String);
+
+/// The measurement of a part.
+type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
 
 /// Returns the seconds and shares of the parts of an iteration as lines.
 fn table(seconds: [f64; 4]) -> String {

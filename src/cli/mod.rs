@@ -73,7 +73,10 @@ pub enum Command {
         "completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
         "completions zsh > ~/.zfunc/_shadow-repose"
     ))]
-    Completions(CompletionsArgs),
+    Completions {
+        /// The shell that completes
+        shell: clap_complete::Shell,
+    },
     /// Print a manual page
     #[command(after_help = examples!("man | man -l -", "man > ~/.local/share/man/man1/shadow-repose.1"))]
     Man,
@@ -399,12 +402,4 @@ pub enum Part {
     Training,
     /// The parts of an iteration, while a trained policy acts; only if asked for
     Iteration,
-}
-
-/// The options of `completions`.
-#[derive(Args, Debug)]
-pub struct CompletionsArgs {
-    /// The shell that completes
-    #[arg(value_enum)]
-    pub shell: clap_complete::Shell,
 }

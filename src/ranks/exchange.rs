@@ -23,22 +23,6 @@ pub struct Exchange {
     sent: Arc<[AtomicU64; 2]>,
 }
 
-/// The cost of the exchange.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Traffic {
-    /// The time spent, waiting for others included, s; `NaN` for a single rank.
-    pub seconds: f64,
-    /// The bytes that this rank has sent to others; `NaN` for a single rank.
-    pub bytes: f64,
-}
-
-impl Traffic {
-    /// Returns the traffic by name.
-    pub fn named(&self) -> [(&'static str, f64); 2] {
-        [("exchange_s", self.seconds), ("exchange_bytes", self.bytes)]
-    }
-}
-
 impl Exchange {
     /// Creates the exchange of a single shard.
     pub fn new(ranks: Arc<dyn Ranks>) -> Self {
@@ -154,11 +138,12 @@ impl Exchange {
         }
     }
 
-    /// Returns the traffic since the last call.
-    pub fn take_traffic(&self) -> Traffic {
+    /// Returns the traffic since the last call, by name: the time spent, waiting for others included, s, and the bytes that this
+    /// rank has sent to others. Both are `NaN` for a single rank.
+    pub fn take_traffic(&self) -> [(&'static str, f64); 2] {
         let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));
         let known = |value: f64| if self.is_alone() { f64::NAN } else { value };
-        Traffic { seconds: known(nanoseconds as f64 * 1e-9), bytes: known(bytes as f64) }
+        [("exchange_s", known(nanoseconds as f64 * 1e-9)), ("exchange_bytes", known(bytes as f64))]
     }
 
     fn timed<T>(&self, bytes: usize, talk: impl FnOnce() -> T) -> T {

@@ -22,7 +22,7 @@ use std::ops::Range;
 
 use pulp::Arch;
 
-pub use exchange::{Exchange, Traffic};
+pub use exchange::Exchange;
 pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
 pub use minibatches::{Minibatch, Minibatches};
 pub use slices::Slices;

@@ -62,7 +62,8 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
     if !args.quiet {
-        say_hints(&session)?;
+        let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
+        hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if args.resume.is_none()
@@ -220,13 +221,6 @@ impl Session {
         }
         report.iteration(self.agent.iteration, &row(outcome, &ended), media, &status);
     }
-}
-
-/// Prints notes about settings that are rarely intended.
-fn say_hints(session: &Session) -> Result<()> {
-    let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-    hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
-    Ok(())
 }
 
 /// Prints how to look at a run that has finished.
