@@ -24,7 +24,7 @@
 //! | [`see`] | rendering of the task: window, film, picture | cli, config, draw, env, evaluate, os, repose, run, sim |
 //! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
-//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, rng, schedule |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim |
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
 //! | [`cli`] | the structure of the command line | config, sim |

@@ -22,33 +22,28 @@ fn main() -> ExitCode {
         Command::Export(args) => export::export(&args).map(|()| ExitCode::SUCCESS),
         Command::Plot(args) => plot::plot(&args).map(|()| ExitCode::SUCCESS),
         Command::Bench(args) => bench::bench(&args).map(|()| ExitCode::SUCCESS),
-        Command::Completions(args) => manual::completions(&args).map(|()| ExitCode::SUCCESS),
+        Command::Completions { shell } => manual::completions(shell).map(|()| ExitCode::SUCCESS),
         Command::Man => manual::man().map(|()| ExitCode::SUCCESS),
     });
-    match result {
-        Ok(code) => code,
-        Err(error) => match error.downcast::<clap::Error>() {
-            Ok(answer) => tell(&answer),
-            Err(error) => {
-                if trains || ranks::is_spokesman() {
-                    os::say(&format!("error: {error:#}"));
-                }
-                ExitCode::FAILURE
+    result.unwrap_or_else(|error| match error.downcast::<clap::Error>() {
+        Ok(answer) => tell(&answer),
+        Err(error) => {
+            if trains || ranks::is_spokesman() {
+                os::say(&format!("error: {error:#}"));
             }
-        },
-    }
+            ExitCode::FAILURE
+        }
+    })
 }
 
 /// Prints the help, the version or a usage error, and returns the exit code. One of several says it.
 fn tell(answer: &clap::Error) -> ExitCode {
-    if !ranks::is_spokesman() {
-        return ExitCode::from(answer.exit_code() as u8);
+    if ranks::is_spokesman()
+        && let Err(error) = answer.print()
+        && error.kind() != ErrorKind::BrokenPipe
+    {
+        os::say(&format!("error: cannot write to stdout: {error}"));
+        return ExitCode::FAILURE;
     }
-    match answer.print() {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            os::say(&format!("error: cannot write to stdout: {error}"));
-            ExitCode::FAILURE
-        }
-        _ => ExitCode::from(answer.exit_code() as u8),
-    }
+    ExitCode::from(answer.exit_code() as u8)
 }

@@ -1,20 +1,16 @@
 //! The command line as texts for other programs: shell completions and a manual page.
 
 use anyhow::Result;
+use clap_complete::Shell;
 
-use crate::cli::{CompletionsArgs, Shell, command};
+use crate::cli::command;
 use crate::os;
 
 /// Prints completions for a shell.
 ///
 /// # Errors
 /// Fails if stdout cannot be written to.
-pub fn completions(args: &CompletionsArgs) -> Result<()> {
-    let shell = match args.shell {
-        Shell::Bash => clap_complete::Shell::Bash,
-        Shell::Zsh => clap_complete::Shell::Zsh,
-        Shell::Fish => clap_complete::Shell::Fish,
-    };
+pub fn completions(shell: Shell) -> Result<()> {
     let mut text = Vec::new();
     clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
     os::print(&String::from_utf8(text)?)

@@ -3,8 +3,6 @@
 //! It is separate from the training, which decides how long to train, scores, reports and saves, so that benchmarks and tests
 //! run exactly the same iterations.
 
-mod collect;
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -12,12 +10,11 @@ use std::time::Instant;
 use anyhow::{Context, Result, ensure};
 
 use crate::config::{Config, PpoConfig};
-use crate::env::{Env, EnvPool, EnvState, Resumable};
-use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, UpdateStats};
+use crate::env::{End, Env, EnvBlock, EnvPool, EnvState, Resumable};
+use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
 use crate::schedule::in_rounds;
-use collect::{Collecting, Scratch};
 
 // The names under which a checkpoint stores the states of the environments.
 const NUMBERS: &str = "envs.numbers";
@@ -31,7 +28,8 @@ pub struct Agent<E: Env> {
     pub ppo: Ppo,
     /// The last rollout; its first observations are the ones to act on next.
     pub rollout: Rollout,
-    scratch: Vec<Scratch>,
+    /// What the policy needs to act, for each block.
+    work: Vec<Workspace>,
     /// The lesson at a given number of control steps.
     lessons: Box<dyn Fn(u64) -> E::Lesson + Send>,
     /// The number of finished iterations.
@@ -100,18 +98,17 @@ impl<E: Env> Agent<E> {
         exchange: Exchange,
         lessons: impl Fn(u64) -> E::Lesson + Send + 'static,
     ) -> Result<Self> {
-        let blocks = exchange.blocks(envs.len());
-        let mut pool = EnvPool::in_blocks(seed, envs, blocks);
+        let mut pool = EnvPool::new(seed, envs, &exchange);
         let ppo = Ppo::new(config, E::SPACES, seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
-        let scratch = Scratch::of_blocks(&pool, &ppo);
+        let work = pool.block_sizes().into_iter().map(|envs| ppo.workspace(envs)).collect();
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
         Ok(Self {
             pool,
             ppo,
             rollout,
-            scratch,
+            work,
             lessons: Box::new(lessons),
             iteration: 0,
             env_steps: 0,
@@ -148,18 +145,24 @@ impl<E: Env> Agent<E> {
         self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
         let (ppo, iteration, horizon) = (&self.ppo, self.iteration + 1, self.rollout.horizon());
         let acting = ppo.acting();
-        let parts = self.pool.blocks_mut().iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.scratch);
-        let blocks = parts.map(|((envs, rollout), scratch)| {
-            let noise = ppo.noise(iteration, envs.number());
-            Collecting { envs, rollout, scratch, noise, result: Ok(()) }
-        });
-        let collected = in_rounds(blocks, horizon, |block, t| {
-            if block.result.is_ok() && !stop.load(Ordering::Relaxed) {
-                acting.act(block.rollout, t, &mut block.noise, &mut block.scratch.work);
-                block.result = block.step(&acting, t, t + 1 == horizon);
+        let parts = self.pool.blocks.iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.work);
+        let blocks =
+            parts.map(|((envs, rollout), work)| (ppo.noise(iteration, envs.number), envs, rollout, work, Ok(())));
+        // Each block goes through its steps independently: no thread waits for the others before the rollout is complete.
+        let collected = in_rounds(blocks, horizon, |(noise, envs, rollout, work, result), t| {
+            if result.is_err() || stop.load(Ordering::Relaxed) {
+                return;
+            }
+            acting.act(rollout, t, noise, work);
+            *result = step_block(envs, rollout, t);
+            let cut_off = envs.ends.iter().map(|end| matches!(end, Some(End::Truncated | End::Redirected)));
+            let row = rollout.step(t, 1);
+            acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, &envs.final_observations, work);
+            if t + 1 == horizon {
+                acting.finish(rollout, horizon, work);
             }
         });
-        collected.into_iter().try_for_each(|block| block.result)?;
+        collected.into_iter().try_for_each(|(.., result)| result)?;
         Ok((!stop.load(Ordering::Relaxed)).then_some(lesson))
     }
 }
@@ -190,6 +193,18 @@ impl<E: Resumable> Agent<E> {
         let state = EnvState { numbers, counters: checkpoint.take_counters(COUNTERS)? };
         self.pool.restore(&state, self.rollout.first_observations_mut())
     }
+}
+
+/// Steps a block of environments with the actions of step `t` of its rollout, and writes there what they lead to.
+///
+/// # Errors
+/// Fails with the environment's number if an environment panics.
+pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t: usize) -> Result<()> {
+    let (row, actions) = (rollout.step(t, 1), rollout.step(t, E::SPACES.action_size));
+    let next = rollout.step(t + 1, E::SPACES.observation_size);
+    envs.step(&rollout.actions[actions], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
+    rollout.dones[row].iter_mut().zip(&envs.ends).for_each(|(done, end)| *done = end.is_some());
+    Ok(())
 }
 
 /// Checks that the number of steps and of environment states in a checkpoint match its configuration. This must be done before

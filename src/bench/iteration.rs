@@ -10,7 +10,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 
 use super::measure::{NEVER, median};
-use super::replay::{BarePool, RecordingEnv};
+use super::replay::{RecordingEnv, replay};
 use crate::agent::Agent;
 use crate::config::Config;
 use crate::env::Env;
@@ -26,21 +26,12 @@ const BEFORE: usize = 160;
 /// The number of iterations that are measured.
 const ROUNDS: usize = 9;
 
-/// A part of an iteration.
-#[derive(Clone, Copy)]
-pub(super) struct Part {
-    /// What a reader is told that it is.
-    pub name: &'static str,
-    /// Its key in JSON.
-    pub key: &'static str,
-}
-
-/// The parts of an iteration.
-pub(super) const PARTS: [Part; 4] = [
-    Part { name: "physics (MuJoCo)", key: "iteration_physics_s" },
-    Part { name: "observe, reward, reset", key: "iteration_environments_s" },
-    Part { name: "policy acts", key: "iteration_policy_s" },
-    Part { name: "learner", key: "iteration_learner_s" },
+/// The parts of an iteration: what a reader is told that it is, and its key in JSON.
+pub(super) const PARTS: [(&str, &str); 4] = [
+    ("physics (MuJoCo)", "iteration_physics_s"),
+    ("observe, reward, reset", "iteration_environments_s"),
+    ("policy acts", "iteration_policy_s"),
+    ("learner", "iteration_learner_s"),
 ];
 
 /// Returns the seconds of each of the [`PARTS`] of an iteration with these settings, as medians, while the policy of `origin`
@@ -61,16 +52,16 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Polic
     let mut agent = Agent::new(envs, &acting, config.run.seed, exchange(), move |_| at_end)?;
     agent.ppo.begin_with(&checkpoint)?;
     let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, exchange())?;
-    let mut bare = BarePool::new(task, randomization.as_ref(), config.env.num_envs);
     let mut seen = learner.rollout(&agent.pool.block_sizes());
     let mut found: [Vec<f64>; 4] = Default::default();
-    for round in 0..BEFORE.div_ceil(config.ppo.first_horizon()) + ROUNDS {
+    let before = BEFORE.div_ceil(config.ppo.first_horizon());
+    for round in 0..before + ROUNDS {
         agent.pool.envs_mut().for_each(RecordingEnv::begin);
         let collecting = Instant::now();
         agent.collect(&NEVER)?.context("nothing stops it")?;
         let collect_s = collecting.elapsed().as_secs_f64();
-        if round >= BEFORE.div_ceil(config.ppo.first_horizon()) {
-            let physics_s = bare.replay(&mut agent.pool)?;
+        if round >= before {
+            let physics_s = replay(&mut agent.pool)?;
             for (from, to) in agent.rollout.blocks.iter().zip(&mut seen.blocks) {
                 to.observations.copy_from_slice(&from.observations);
                 to.rewards.copy_from_slice(&from.rewards);
@@ -80,13 +71,11 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Polic
             let learning = Instant::now();
             learner.update(&mut seen, round as u64, &NEVER)?.context("nothing stops it")?;
             let learner_s = learning.elapsed().as_secs_f64();
-            agent.rollout.carry_over();
             let acting_s = act_again(&agent.ppo, &mut seen);
             let parts = [physics_s, collect_s - physics_s - acting_s, policy_s, learner_s];
             found.iter_mut().zip(parts).for_each(|(found, part)| found.push(part));
-        } else {
-            agent.rollout.carry_over();
         }
+        agent.rollout.carry_over();
         agent.iteration += 1;
     }
     Ok(found.map(median))

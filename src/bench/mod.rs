@@ -13,21 +13,21 @@ use anyhow::{Context, Result};
 use rand_distr::{Distribution, StandardNormal};
 use serde_json::json;
 
-use crate::agent::Agent;
+use crate::agent::{Agent, step_block};
 use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
 use crate::draw::{self, BarChart, HeatMap, NamedBar, Picture};
-use crate::env::{End, Env, EnvPool, StepBuffers};
+use crate::env::{Env, EnvPool};
 use crate::load::PolicySource;
 use crate::os::{self, OutputFile};
-use crate::ppo::{flops_per_sample, matmul_gflops, time_gradient_steps};
+use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::ranks::Exchange;
-use crate::repose::{ACTION_SIZE, Lesson, OBSERVATION_SIZE, Randomization, Task};
+use crate::repose::{Lesson, Randomization, Task};
 use crate::rng;
 use crate::schedule::in_rounds;
 use iteration::{PARTS, seconds_of_parts};
 use measure::{NEVER, median};
-use replay::{BarePool, RecordingEnv};
+use replay::{RecordingEnv, replay};
 
 /// The number of rounds of measuring physics and pool.
 const ROUNDS: usize = 5;
@@ -63,60 +63,39 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
-    let asked = |part: Part| args.only.is_none_or(|only| only == part);
-    let mut figures = Vec::new();
-    let mut lines = format!(
-        "{} threads, {} environments, nets {:?}, minibatches of {}\n",
-        rayon::current_num_threads(),
-        config.env.num_envs,
-        config.ppo.hidden,
-        config.samples_per_minibatch(),
-    );
-    if asked(Part::Physics) {
-        let (physics, pool, share) = physics_and_pool(&task, &config)?;
-        figures.extend([("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)]);
-        lines += &format!("physics alone (mj_step)   {physics:>10.0} steps/s\n");
-        lines += &format!("environments              {pool:>10.0} steps/s   {:.1} % of the physics\n", 100.0 * share);
-    }
-    if asked(Part::Learner) {
-        let (samples, gflops, matmul) = learner(&task, &config)?;
-        figures.extend([("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)]);
-        lines += &format!("learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n");
-        lines += &format!("its matrix products alone                      {matmul:.1} GFLOP/s\n");
-    }
-    if asked(Part::Training) {
-        let end_to_end = end_to_end(&task, &config)?;
-        figures.push(("end_to_end_steps_per_s", end_to_end));
-        let hours = config.run.total_steps as f64 / end_to_end / 3600.0;
-        let total = config.run.total_steps as f64 / 1e6;
-        figures.push(("default_training_hours", hours));
-        lines +=
-            &format!("end to end                {end_to_end:>10.0} steps/s   {total:.0} M steps take {hours:.1} h\n");
+    let (threads, num_envs, hidden) = (rayon::current_num_threads(), config.env.num_envs, &config.ppo.hidden);
+    let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
+    let samples = config.samples_per_minibatch();
+    let mut lines = format!("{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n");
+    let mut tell = |(found, text): Found| {
+        found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
+        lines += &text;
+    };
+    let measures: [(Part, Measure); 3] =
+        [(Part::Physics, physics_and_pool), (Part::Learner, learner), (Part::Training, end_to_end)];
+    for (_, measure) in measures.into_iter().filter(|(part, _)| args.only.is_none_or(|only| only == *part)) {
+        tell(measure(&task, &config)?);
     }
     if args.only == Some(Part::Iteration) {
         let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
         let seconds = seconds_of_parts(&task, &config, &origin)?;
-        figures.extend(PARTS.iter().zip(seconds).map(|(part, seconds)| (part.key, seconds)));
-        lines += &table(seconds);
+        tell((PARTS.iter().zip(seconds).map(|((_, key), seconds)| (*key, seconds)).collect(), table(seconds)));
         output.map_or(Ok(()), |output| picture(&config, seconds).write(output))?;
     }
-    if args.json {
-        let figures = figures.into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
-        let mut figures = serde_json::Map::from_iter(figures);
-        figures.insert("threads".into(), json!(rayon::current_num_threads()));
-        figures.insert("hidden".into(), json!(config.ppo.hidden));
-        figures.insert("num_envs".into(), json!(config.env.num_envs));
-        os::print(&format!("{}\n", serde_json::Value::Object(figures)))
-    } else {
-        os::print(&lines)
-    }
+    os::print(&if args.json { format!("{figures}\n") } else { lines })
 }
+
+/// Figures by their keys in JSON, and lines that tell them.
+type Found = (Vec<(&'static str, f64)>, String);
+
+/// The measurement of a part.
+type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
 
 /// Returns the seconds and shares of the parts of an iteration as lines.
 fn table(seconds: [f64; 4]) -> String {
     let all: f64 = seconds.iter().sum();
-    let line = |(part, seconds): (&iteration::Part, f64)| {
-        format!("{:<26}{:>10.1} ms        {:.1} %\n", part.name, 1e3 * seconds, 100.0 * seconds / all)
+    let line = |(&(name, _), seconds): (&(&str, &str), f64)| {
+        format!("{name:<26}{:>10.1} ms        {:.1} %\n", 1e3 * seconds, 100.0 * seconds / all)
     };
     PARTS.iter().zip(seconds).map(line).collect()
 }
@@ -124,9 +103,9 @@ fn table(seconds: [f64; 4]) -> String {
 /// Returns a picture of the shares of the parts of an iteration.
 fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
     let all: f64 = seconds.iter().sum();
-    let bar = |(part, seconds): (iteration::Part, f64)| {
+    let bar = |((name, _), seconds): ((&str, &str), f64)| {
         let (value, note) = (seconds / all, format!("{:.0} ms, {:.0} %", 1e3 * seconds, 100.0 * seconds / all));
-        NamedBar { name: part.name.to_owned(), value, interval: [value; 2], note }
+        NamedBar { name: name.to_owned(), value, interval: [value; 2], note }
     };
     let title =
         format!("one iteration of {} steps, nets {:?}: {:.2} s", config.steps_per_iteration(), config.ppo.hidden, all);
@@ -134,88 +113,58 @@ fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
     BarChart { title, bars: PARTS.into_iter().zip(seconds).map(bar).collect(), map }
 }
 
-/// The inputs and outputs of a block of environments in a burst.
-struct BlockRows {
-    /// The actions of all steps of the burst.
-    actions: Vec<f32>,
-    observations: Vec<f32>,
-    final_observations: Vec<f32>,
-    rewards: Vec<f32>,
-    ends: Vec<Option<End>>,
-}
-
-impl BlockRows {
-    fn new(envs: usize) -> Self {
-        Self {
-            actions: Vec::new(),
-            observations: vec![0.0; envs * OBSERVATION_SIZE],
-            final_observations: vec![0.0; envs * OBSERVATION_SIZE],
-            rewards: vec![0.0; envs],
-            ends: vec![None; envs],
-        }
-    }
-}
-
-/// Returns the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
-fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
+/// Measures the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
+fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let envs = config.env.num_envs;
     let bursts = STEPS.div_ceil(envs * BURST);
-    let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let mut draw =
-        || config.ppo.std.by_equal_factors(0) as f32 * Distribution::<f32>::sample(&StandardNormal, &mut noise);
     let randomization = Randomization::new(task, &config.randomization)?;
-    let randomization = randomization.as_ref();
-    let mut pool = EnvPool::new(config.run.seed, (0..envs).map(|_| RecordingEnv::new(task, randomization)).collect());
+    let recording = (0..envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
+    let mut pool = EnvPool::new(config.run.seed, recording, &Exchange::alone(1));
     let mut lesson = Lesson::task(&config.env);
     lesson.randomized = Lesson::at(0, config).randomized;
     pool.set_lesson(lesson);
-    let mut bare = BarePool::new(task, randomization, envs);
-    let mut rows: Vec<BlockRows> = pool.block_sizes().into_iter().map(BlockRows::new).collect();
-    pool.reset(rows.iter_mut().map(|rows| &mut rows.observations[..]).collect());
-    let mut burst = |pool: &mut EnvPool<RecordingEnv>, steps: usize| {
-        for rows in &mut rows {
-            rows.actions = (0..steps * rows.rewards.len() * ACTION_SIZE).map(|_| draw()).collect();
-        }
+    let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &RecordingEnv::SPACES);
+    pool.reset(rollout.first_observations_mut());
+    let mut noise = rng::stream(config.run.seed, "bench", 0);
+    let std = config.ppo.std.by_equal_factors(0) as f32;
+    // Returns the seconds that the steps took.
+    let mut burst = |pool: &mut EnvPool<RecordingEnv>| {
+        let actions = rollout.blocks.iter_mut().flat_map(|block| &mut block.actions);
+        actions.for_each(|action| *action = std * Distribution::<f32>::sample(&StandardNormal, &mut noise));
         pool.envs_mut().for_each(RecordingEnv::begin);
-        play(pool, &mut rows, steps)
+        let start = Instant::now();
+        let stepped = in_rounds(pool.blocks.iter_mut().zip(&mut rollout.blocks), BURST, |(envs, rollout), t| {
+            step_block(envs, rollout, t).expect("environments do not panic");
+        });
+        drop(stepped);
+        start.elapsed().as_secs_f64()
     };
     // Unmeasured steps first, so that most cubes lie in the hand; fewer of them for many environments.
-    burst(&mut pool, (2 * STEPS / envs).clamp(4, 64));
+    for _ in 0..(2 * STEPS / envs).clamp(4, 64) / BURST {
+        burst(&mut pool);
+    }
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
         let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
         for _ in 0..bursts {
-            pool_seconds += burst(&mut pool, BURST);
-            bare_seconds += bare.replay(&mut pool)?;
+            pool_seconds += burst(&mut pool);
+            bare_seconds += replay(&mut pool)?;
         }
         let done = (bursts * BURST * envs) as f64;
-        rates[0].push(done / bare_seconds);
-        rates[1].push(done / pool_seconds);
-        rates[2].push(bare_seconds / pool_seconds);
+        let found = [done / bare_seconds, done / pool_seconds, bare_seconds / pool_seconds];
+        rates.iter_mut().zip(found).for_each(|(rates, rate)| rates.push(rate));
     }
     let [physics, pool, share] = rates.map(median);
-    Ok((physics, pool, share))
+    let lines = format!(
+        "physics alone (mj_step)   {physics:>10.0} steps/s\n\
+         environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
+        100.0 * share
+    );
+    Ok((vec![("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)], lines))
 }
 
-/// Steps a pool with these actions, as a training does, and returns the seconds that the steps took.
-fn play<E: Env>(pool: &mut EnvPool<E>, rows: &mut [BlockRows], steps: usize) -> f64 {
-    let blocks: Vec<_> = pool.blocks_mut().iter_mut().zip(rows).collect();
-    let start = Instant::now();
-    in_rounds(blocks, steps, |(envs, rows), step| {
-        let size = envs.count() * ACTION_SIZE;
-        let buffers = StepBuffers {
-            rewards: &mut rows.rewards,
-            ends: &mut rows.ends,
-            observations: &mut rows.observations,
-            final_observations: &mut rows.final_observations,
-        };
-        envs.step(&rows.actions[step * size..][..size], buffers).expect("environments do not panic");
-    });
-    start.elapsed().as_secs_f64()
-}
-
-/// Returns the samples per second and GFLOP/s of gradient steps, and the GFLOP/s of their matrix products alone.
-fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
+/// Measures the samples per second and GFLOP/s of gradient steps, and the GFLOP/s of their matrix products alone.
+fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut agent = Agent::for_task(task, config, Exchange::alone(config.shards()))?;
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
@@ -223,13 +172,17 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<(f64, f64, f64)> {
     let flops = flops_per_sample(ppo.policy());
     time_gradient_steps(ppo, rollout, 2)?;
     let samples = size as f64 / median(time_gradient_steps(ppo, rollout, REPEATS)?);
-    let matmul = median(matmul_gflops(ppo, size, REPEATS));
-    Ok((samples, 1e-9 * flops * samples, matmul))
+    let (gflops, matmul) = (1e-9 * flops * samples, median(matmul_gflops(ppo, size, REPEATS)));
+    let lines = format!(
+        "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
+         its matrix products alone                      {matmul:.1} GFLOP/s\n"
+    );
+    Ok((vec![("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)], lines))
 }
 
-/// Returns the env steps per second of whole iterations of a training with these settings, without the first one if there are
+/// Measures the env steps per second of whole iterations of a training with these settings, without the first one if there are
 /// more.
-fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
+fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut agent = Agent::for_task(task, config, Exchange::alone(config.shards()))?;
     let begun = Instant::now();
     let mut rates = Vec::new();
@@ -239,5 +192,9 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<f64> {
             break;
         }
     }
-    Ok(median(if rates.len() > 1 { rates.split_off(1) } else { rates }))
+    let speed = median(if rates.len() > 1 { rates.split_off(1) } else { rates });
+    let total = config.run.total_steps as f64;
+    let (hours, millions) = (total / speed / 3600.0, total / 1e6);
+    let line = format!("end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n");
+    Ok((vec![("end_to_end_steps_per_s", speed), ("default_training_hours", hours)], line))
 }

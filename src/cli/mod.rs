@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use clap::builder::RangedU64ValueParser;
 use clap::error::ErrorKind;
-use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use clap::{ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, Override};
 use crate::sim::{self, Camera, Quality};
@@ -27,57 +27,60 @@ const TASK: &str = "Task";
 const OUTPUT: &str = "Output";
 const PICTURE: &str = "Film, picture and window";
 
+/// Two examples for the end of a help.
+macro_rules! examples {
+    ($first:literal, $second:literal) => {
+        concat!("Examples:\n  shadow-repose ", $first, "\n  shadow-repose ", $second)
+    };
+}
+
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 #[derive(Debug, Parser)]
-#[command(arg_required_else_help = true)]
+#[command(arg_required_else_help = true, disable_help_flag = true, max_term_width = 100)]
+#[command(after_help = examples!("play --ckpt builtin", "train"))]
 pub struct Cli {
     /// The command to run.
     #[command(subcommand)]
     pub command: Command,
+    /// Print help
+    #[arg(short, long, global = true, action = ArgAction::HelpShort)]
+    help: Option<bool>,
 }
 
 /// The commands of the program.
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
+    #[command(after_help = examples!("train --seed 1 --name first", "train --resume"))]
     Train(TrainArgs),
     /// Play a policy in a window, as a film, or for its score alone
+    #[command(after_help = examples!("play --ckpt builtin --headless", "play --video film.mp4"))]
     Play(PlayArgs),
     /// Show the scene without a policy
+    #[command(after_help = examples!("view --actions wave", "view --screenshot hand.png"))]
     View(ViewArgs),
     /// Write a policy as an ONNX file, for programs in other languages
+    #[command(after_help = examples!("export --out policy.onnx", "export --ckpt builtin --out builtin.onnx"))]
     Export(ExportArgs),
     /// Plot the learning curves of runs as SVG or PNG
+    #[command(after_help = examples!("plot runs/shadow-hand-repose/*", "plot RUN --metric eval/goals --out goals.png"))]
     Plot(PlotArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
+    #[command(after_help = examples!("bench", "bench --only training --threads 4"))]
     Bench(BenchArgs),
     /// Print completions for a shell
-    Completions(CompletionsArgs),
+    #[command(after_help = examples!(
+        "completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
+        "completions zsh > ~/.zfunc/_shadow-repose"
+    ))]
+    Completions {
+        /// The shell that completes
+        shell: clap_complete::Shell,
+    },
     /// Print a manual page
+    #[command(after_help = examples!("man | man -l -", "man > ~/.local/share/man/man1/shadow-repose.1"))]
     Man,
 }
-
-/// Two examples for the end of the help of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, [&str; 2]); 9] = [
-    ("", ["shadow-repose play --ckpt builtin", "shadow-repose train"]),
-    ("train", ["shadow-repose train --seed 1 --name first", "shadow-repose train --resume"]),
-    ("play", ["shadow-repose play --ckpt builtin --headless", "shadow-repose play --video film.mp4"]),
-    ("view", ["shadow-repose view --actions wave", "shadow-repose view --screenshot hand.png"]),
-    ("export", ["shadow-repose export --out policy.onnx", "shadow-repose export --ckpt builtin --out builtin.onnx"]),
-    (
-        "plot",
-        ["shadow-repose plot runs/shadow-hand-repose/*", "shadow-repose plot RUN --metric eval/goals --out goals.png"],
-    ),
-    ("bench", ["shadow-repose bench", "shadow-repose bench --only training --threads 4"]),
-    (
-        "completions",
-        [
-            "shadow-repose completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
-            "shadow-repose completions zsh > ~/.zfunc/_shadow-repose",
-        ],
-    ),
-    ("man", ["shadow-repose man | man -l -", "shadow-repose man > ~/.local/share/man/man1/shadow-repose.1"]),
-];
 
 /// Returns the command line with what is only known at run time: version, examples, defaults that are settings.
 pub fn command() -> clap::Command {
@@ -89,8 +92,7 @@ pub fn command() -> clap::Command {
     ];
     let with_defaults = |arg: clap::Arg| {
         let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
-        let filled = defaults.iter().fold(help.clone(), |help, (key, value)| help.replace(key, value));
-        if filled == help { arg } else { arg.help(filled) }
+        arg.help(defaults.iter().fold(help, |help, (key, value)| help.replace(key, value)))
     };
     without_defaults().mut_subcommands(|command| command.mut_args(with_defaults))
 }
@@ -100,29 +102,16 @@ fn without_defaults() -> clap::Command {
     let (program, commit) = (env!("CARGO_PKG_VERSION"), env!("SHADOW_REPOSE_COMMIT"));
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
     // `view` makes no films.
-    let picture = |view: clap::Command| {
-        let set = "Change one env.* setting, e.g. env.model=my_scene.xml; repeatable, overrides the file";
-        view.mut_arg("set", |arg| arg.help(set))
-            .mut_arg("size", |arg| arg.help("Size of the picture in pixels [default: 1280x720]"))
-            .mut_arg("quality", |arg| {
-                arg.help("Rendering quality; high adds shadows, reflections and smooth edges [default: high]")
-            })
+    let of_view = [
+        ("set", "Change one env.* setting, e.g. env.model=my_scene.xml; repeatable, overrides the file"),
+        ("size", "Size of the picture in pixels [default: 1280x720]"),
+        ("quality", "Rendering quality; high adds shadows, reflections and smooth edges [default: high]"),
+    ];
+    let with_helps = |command: clap::Command| match command.get_name() {
+        "view" => of_view.into_iter().fold(command, |view, (arg, help)| view.mut_arg(arg, |arg| arg.help(help))),
+        _ => command,
     };
-    let mut command = Cli::command().version(version).max_term_width(100).mut_subcommand("view", picture);
-    // The same help for -h and --help, and for all commands.
-    let with_help = |command: clap::Command| {
-        let help = clap::Arg::new("help").short('h').long("help").action(clap::ArgAction::HelpShort).help("Print help");
-        command.disable_help_flag(true).arg(help)
-    };
-    command = with_help(command);
-    for (name, examples) in EXAMPLES {
-        let examples = format!("Examples:\n  {}", examples.join("\n  "));
-        command = match name {
-            "" => command.after_help(examples),
-            _ => command.mut_subcommand(name, |command| with_help(command.after_help(examples))),
-        };
-    }
-    command
+    Cli::command().version(version).mut_subcommands(with_helps)
 }
 
 /// Parses the command line of this process.
@@ -413,23 +402,4 @@ pub enum Part {
     Training,
     /// The parts of an iteration, while a trained policy acts; only if asked for
     Iteration,
-}
-
-/// The options of `completions`.
-#[derive(Args, Debug)]
-pub struct CompletionsArgs {
-    /// The shell that completes
-    #[arg(value_enum)]
-    pub shell: Shell,
-}
-
-/// A shell that can complete the command line.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Shell {
-    /// The Bourne again shell
-    Bash,
-    /// The Z shell
-    Zsh,
-    /// The friendly interactive shell
-    Fish,
 }

@@ -9,25 +9,31 @@ use anyhow::{Context, Result, bail, ensure};
 use rayon::prelude::*;
 
 use super::{End, Env, EnvState, Resumable, Transition};
-use crate::ranks::{Blocks, Exchange};
+use crate::ranks::Exchange;
 use crate::rng;
-use crate::schedule::panic_message;
+use crate::schedule::{block_sizes, panic_message};
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
-/// N environments that start their next episode automatically.
+/// N environments that start their next episode automatically; O is the observation size.
 pub struct EnvPool<E: Env> {
-    blocks: Vec<EnvBlock<E>>,
+    /// Its blocks, in the order of the environments. None spans two shards.
+    pub blocks: Vec<EnvBlock<E>>,
 }
 
-/// A part of a pool that is stepped by one thread at a time.
+/// The n environments of a pool that are stepped by one thread at a time.
 pub struct EnvBlock<E: Env> {
+    /// The number of this block, counted over all that exchange.
+    pub number: usize,
+    /// The number of its first environment, counted likewise.
+    pub first: usize,
+    /// The ends `[n]` of the last step.
+    pub ends: Vec<Option<End>>,
+    /// Final observations `[n, O]` of the episodes that were truncated in the last step, and under goals that were replaced; other
+    /// rows are older.
+    pub final_observations: Vec<f32>,
     slots: Vec<Slot<E>>,
     seed: u64,
-    /// The number of this block, counted over all that exchange.
-    number: usize,
-    /// The number of its first environment, counted likewise.
-    first: usize,
     /// The number of all environments, by which the episode numbers of one environment increase.
     stride: u64,
     finished: Vec<E::Episode>,
@@ -38,42 +44,44 @@ struct Slot<E: Env> {
     next_episode: u64,
 }
 
-/// The outputs of a step of a block, with one row for each of its n environments; O is the observation size.
-pub struct StepBuffers<'a> {
-    /// Rewards `[n]`.
-    pub rewards: &'a mut [f32],
-    /// Ends `[n]`.
-    pub ends: &'a mut [Option<End>],
-    /// Observations `[n, O]` to act on next: the first of the new episode where one ended, under the new goal where the goal
-    /// was replaced.
-    pub observations: &'a mut [f32],
-    /// Final observations `[n, O]` of episodes that were truncated, or under goals that were replaced; other rows are not
-    /// written.
-    pub final_observations: &'a mut [f32],
-}
-
 impl<E: Env> EnvPool<E> {
-    /// Creates a pool of at least one environment, all of one kind, whose episodes are drawn from `seed`.
-    pub fn new(seed: u64, envs: Vec<E>) -> Self {
-        let blocks = Exchange::alone(1).blocks(envs.len());
-        Self::in_blocks(seed, envs, blocks)
-    }
-
-    /// Creates a pool of environments in these blocks.
-    pub fn in_blocks(seed: u64, envs: Vec<E>, blocks: Blocks) -> Self {
-        let (mut first, stride) = (blocks.first_env, blocks.envs as u64);
-        let mut slots = envs.into_iter().map(|env| Slot { env, next_episode: 0 });
+    /// Creates a pool of these environments, all of one kind, which are those that `exchange` deals. Their episodes are drawn from
+    /// `seed`.
+    ///
+    /// # Panics
+    /// Panics if they do not divide evenly into the shards of this rank.
+    pub fn new(seed: u64, envs: Vec<E>, exchange: &Exchange) -> Self {
+        let shards = exchange.own_shards();
+        let in_shard = envs.len() / shards.len();
+        assert_eq!(
+            in_shard * shards.len(),
+            envs.len(),
+            "environments do not divide evenly into {} shards",
+            shards.len()
+        );
+        let all = in_shard * exchange.shards();
+        let sizes = block_sizes(in_shard, all);
+        let (first_block, mut first) = (shards.start * sizes.len(), shards.start * in_shard);
+        let mut slots = (first as u64..).zip(envs).map(|(next_episode, env)| Slot { env, next_episode });
         let block = |(number, size)| {
-            let slots = slots.by_ref().take(size).collect();
             first += size;
-            EnvBlock { slots, seed, number, first: first - size, stride, finished: Vec::new() }
+            EnvBlock {
+                number,
+                first: first - size,
+                ends: vec![None; size],
+                final_observations: vec![0.0; size * E::SPACES.observation_size],
+                slots: slots.by_ref().take(size).collect(),
+                seed,
+                stride: all as u64,
+                finished: Vec::new(),
+            }
         };
-        Self { blocks: (blocks.first_block..).zip(blocks.sizes).map(block).collect() }
+        Self { blocks: (first_block..).zip(sizes.repeat(shards.len())).map(block).collect() }
     }
 
     /// Returns the number of environments.
     pub fn count(&self) -> usize {
-        self.blocks.iter().map(EnvBlock::count).sum()
+        self.block_sizes().iter().sum()
     }
 
     /// Returns the number of environments in each block.
@@ -81,18 +89,10 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter().map(EnvBlock::count).collect()
     }
 
-    /// Returns the blocks in order.
-    pub fn blocks_mut(&mut self) -> &mut [EnvBlock<E>] {
-        &mut self.blocks
-    }
-
     /// Starts the first episode of every environment, at a random age so that they do not all end together, and writes the
     /// `observations` `[n, O]` of each block.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = E::SPACES.observation_size;
-        for block in &mut self.blocks {
-            (block.first as u64..).zip(&mut block.slots).for_each(|(episode, slot)| slot.next_episode = episode);
-        }
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
             for (i, (slot, row)) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)).enumerate() {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
@@ -112,14 +112,9 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// Returns the number of the first environment.
-    pub fn first(&self) -> usize {
-        self.blocks[0].first
-    }
-
     /// Returns the environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
-        self.blocks.iter_mut().flat_map(|block| &mut block.slots).map(|slot| &mut slot.env)
+        self.blocks.iter_mut().flat_map(EnvBlock::envs_mut)
     }
 }
 
@@ -140,14 +135,11 @@ impl<E: Resumable> EnvPool<E> {
     /// # Errors
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let (size, of_all) = (E::SPACES.observation_size, self.blocks[0].stride as usize);
-        let mut rows = state.rows(of_all)?.skip(self.first());
-        let first = self.first();
+        let (size, first) = (E::SPACES.observation_size, self.blocks[0].first);
+        let states = state.rows(self.blocks[0].stride as usize)?.skip(first);
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
-        for (i, (slot, row)) in
-            slots.zip(observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size))).enumerate()
-        {
-            let mut state = rows.next().expect("one row per environment");
+        let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
+        for (number, ((slot, row), mut state)) in (first..).zip(slots.zip(rows).zip(states)) {
             let restore = || {
                 let [next_episode] = state.counters()?;
                 ensure!(next_episode < 1 << 60, "episode number {next_episode} is out of range");
@@ -155,7 +147,7 @@ impl<E: Resumable> EnvPool<E> {
                 slot.env.restore(&mut state, row)?;
                 state.finish()
             };
-            stepping("environment", first + i, restore).with_context(|| format!("environment {}", first + i))?;
+            stepping("environment", number, restore).with_context(|| format!("environment {number}"))?;
         }
         self.blocks.iter_mut().for_each(|block| block.finished.clear());
         Ok(())
@@ -163,29 +155,28 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// Returns the number of this block.
-    pub fn number(&self) -> usize {
-        self.number
-    }
-
     /// Returns the number n of environments in this block.
     pub fn count(&self) -> usize {
         self.slots.len()
     }
 
+    /// Returns the environments in order.
+    pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
+        self.slots.iter_mut().map(|slot| &mut slot.env)
+    }
+
     /// Steps every environment with its row of `actions` `[n, A]`. Where an episode ended, starts a new one; where a goal was
-    /// replaced, continues under another.
+    /// replaced, continues under another. Writes the `rewards` `[n]`, and the `observations` `[n, O]` to act on next: the first of
+    /// the new episode where one ended, under the new goal where the goal was replaced.
     ///
     /// # Errors
     /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
-    pub fn step(&mut self, actions: &[f32], buffers: StepBuffers) -> Result<()> {
+    pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
         let Spaces { observation_size: size, action_size, .. } = E::SPACES;
-        assert_eq!(actions.len(), self.count() * action_size, "length of the block's actions");
-        assert!(buffers.rewards.len() == self.count() && buffers.ends.len() == self.count(), "rows of a block");
-        let both = [buffers.observations.len(), buffers.final_observations.len()];
-        assert_eq!(both, [self.count() * size; 2], "lengths of the block's observations");
-        let rows = buffers.observations.chunks_exact_mut(size).zip(buffers.final_observations.chunks_exact_mut(size));
-        let results = buffers.rewards.iter_mut().zip(buffers.ends).zip(rows);
+        let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());
+        assert_eq!(found, [n * action_size, n, n * size], "lengths of the block's actions, rewards and observations");
+        let rows = observations.chunks_exact_mut(size).zip(self.final_observations.chunks_exact_mut(size));
+        let results = rewards.iter_mut().zip(&mut self.ends).zip(rows);
         let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
         for (i, ((slot, action), ((reward, end), (row, final_row)))) in slots.zip(results).enumerate() {
             let step = || {

@@ -24,13 +24,12 @@ pub struct SavedEnv<'a> {
 impl EnvState {
     /// Returns the states of these environments, one part after another.
     pub fn joined(parts: Vec<Self>) -> Self {
-        let mut parts = parts.into_iter();
-        let mut all = parts.next().unwrap_or_default();
-        for Self { numbers, counters } in parts {
-            all.numbers.extend(numbers);
-            all.counters.extend(counters);
-        }
-        all
+        let join = |mut all: Self, part: Self| {
+            all.numbers.extend(part.numbers);
+            all.counters.extend(part.counters);
+            all
+        };
+        parts.into_iter().reduce(join).unwrap_or_default()
     }
 
     /// Returns the rows of each of `count` environments.
@@ -53,9 +52,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let (first, rest) = self.numbers.split_first_chunk().context("the state has too few numbers")?;
-        self.numbers = rest;
-        Ok(*first)
+        let next = self.numbers.split_off(..N).and_then(|next| next.first_chunk().copied());
+        next.context("the state has too few numbers")
     }
 
     /// Returns how many numbers are left.
@@ -68,10 +66,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer than `kept` are left.
     pub fn numbers_but(&mut self, kept: usize) -> Result<&'a [f64]> {
-        let count = self.numbers.len().checked_sub(kept).context("the state has too few numbers")?;
-        let (first, rest) = self.numbers.split_at(count);
-        self.numbers = rest;
-        Ok(first)
+        let count = self.numbers.len().checked_sub(kept);
+        count.and_then(|count| self.numbers.split_off(..count)).context("the state has too few numbers")
     }
 
     /// Reads the next `N` counters.
@@ -79,9 +75,8 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let (first, rest) = self.counters.split_first_chunk().context("the state has too few counters")?;
-        self.counters = rest;
-        Ok(*first)
+        let next = self.counters.split_off(..N).and_then(|next| next.first_chunk().copied());
+        next.context("the state has too few counters")
     }
 
     /// Checks that everything has been read.

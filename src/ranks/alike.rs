@@ -1,17 +1,9 @@
 //! What must be the same on all ranks of a training, and what one of them may be bound to.
 
 use anyhow::{Result, ensure};
-use serde::{Deserialize, Serialize};
 
 use super::{Exchange, launched_by_mpirun};
 use crate::os::{self, Machine};
-
-#[derive(Serialize, Deserialize)]
-struct Member {
-    program: u32,
-    scene: String,
-    machine: Machine,
-}
 
 /// The most processors that a rank which is bound to one core may use: two, where a core runs two threads.
 const ONE_CORE: usize = 2;
@@ -27,18 +19,18 @@ impl Exchange {
             return Ok(None);
         }
         let program = if self.is_alone() { 0 } else { os::program_checksum() };
-        let all = self.all_gather(Member { program, scene: scene.to_owned(), machine: Machine::this() });
-        for (rank, member) in all.iter().enumerate() {
-            ensure!(member.program == all[0].program, "rank {rank} runs another program than rank 0");
-            ensure!(member.scene == all[0].scene, "rank {rank} has another scene than rank 0");
+        let all = self.all_gather((program, scene.to_owned(), Machine::this()));
+        for (rank, (program, scene, _)) in all.iter().enumerate() {
+            ensure!(*program == all[0].0, "rank {rank} runs another program than rank 0");
+            ensure!(*scene == all[0].1, "rank {rank} has another scene than rank 0");
         }
         let is_bound = |Machine { name, allowed, processors }: &Machine| {
-            let here = all.iter().filter(|other| other.machine.name == *name).count();
+            let here = all.iter().filter(|(.., other)| other.name == *name).count();
             *allowed <= ONE_CORE && allowed * here < *processors
         };
-        let bound = all.iter().position(|member| is_bound(&member.machine));
+        let bound = all.iter().position(|(.., machine)| is_bound(machine));
         Ok(bound.map(|rank| {
-            let Machine { allowed, processors, .. } = all[rank].machine;
+            let Machine { allowed, processors, .. } = all[rank].2;
             format!(
                 "rank {rank} may use only {allowed} of the {processors} processors of its machine: start with mpirun --bind-to none, \
                  or --map-by ppr:1:node:PE={processors}, or srun --cpus-per-task"

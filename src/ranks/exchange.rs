@@ -10,48 +10,28 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::{Alone, Ranks};
+use super::Ranks;
 
 /// The shards of a training, those of them that this rank computes, and the exchange with the other ranks. All ranks make the same
 /// calls in the same order. Copies share the count of their traffic.
 #[derive(Clone)]
 pub struct Exchange {
     shards: usize,
-    ranks: Arc<dyn Ranks>,
-    sent: Arc<Counters>,
-}
-
-#[derive(Default)]
-struct Counters {
-    nanoseconds: AtomicU64,
-    bytes: AtomicU64,
-}
-
-/// The cost of the exchange.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Traffic {
-    /// The time spent, waiting for others included, s; `NaN` for a single rank.
-    pub seconds: f64,
-    /// The bytes that this rank has sent to others; `NaN` for a single rank.
-    pub bytes: f64,
-}
-
-impl Traffic {
-    /// Returns the traffic by name.
-    pub fn named(&self) -> [(&'static str, f64); 2] {
-        [("exchange_s", self.seconds), ("exchange_bytes", self.bytes)]
-    }
+    /// All ranks, if this is not the only one.
+    ranks: Option<Arc<dyn Ranks>>,
+    /// The nanoseconds spent, and the bytes sent.
+    sent: Arc<[AtomicU64; 2]>,
 }
 
 impl Exchange {
     /// Creates the exchange of a single shard.
     pub fn new(ranks: Arc<dyn Ranks>) -> Self {
-        Self { shards: 1, ranks, sent: Arc::default() }
+        Self { shards: 1, ranks: Some(ranks).filter(|ranks| ranks.size() > 1), sent: Arc::default() }
     }
 
     /// Creates the exchange of one rank that computes all shards.
     pub fn alone(shards: usize) -> Self {
-        Self::new(Arc::new(Alone)).over(shards).expect("one rank")
+        Self { shards: 1, ranks: None, sent: Arc::default() }.over(shards).expect("one rank")
     }
 
     /// Deals this number of shards, a power of two, to the ranks.
@@ -59,7 +39,7 @@ impl Exchange {
     /// # Errors
     /// Fails if the number of ranks is not a power of two, or if there are fewer shards.
     pub fn over(self, shards: usize) -> Result<Self> {
-        let ranks = self.ranks.size();
+        let ranks = self.ranks();
         ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
         ensure!(
             ranks <= shards,
@@ -70,48 +50,48 @@ impl Exchange {
     }
 
     /// Returns the number of all shards.
-    pub(super) fn shards(&self) -> usize {
+    pub fn shards(&self) -> usize {
         self.shards
     }
 
     /// Returns the shards of this rank.
-    pub(super) fn own_shards(&self) -> Range<usize> {
+    pub fn own_shards(&self) -> Range<usize> {
         self.own(self.shards)
     }
 
     /// Returns this rank's part of `count` things in a row: parts differ by one thing at most.
     pub fn own(&self, count: usize) -> Range<usize> {
-        part(count, self.ranks.rank(), self.ranks.size())
+        part(count, self.rank(), self.ranks())
     }
 
     /// Returns the number of things of all ranks, if each has `own` of them.
     pub fn of_all(&self, own: usize) -> usize {
-        own * self.ranks.size()
+        own * self.ranks()
     }
 
     /// Returns whether there is no other rank.
     pub fn is_alone(&self) -> bool {
-        self.ranks.size() == 1
+        self.ranks.is_none()
     }
 
     /// Returns whether this is the rank that reports and saves.
     pub fn is_first(&self) -> bool {
-        self.ranks.rank() == 0
+        self.rank() == 0
     }
 
     /// Returns the number of this rank.
     pub(super) fn rank(&self) -> usize {
-        self.ranks.rank()
+        self.ranks.as_ref().map_or(0, |ranks| ranks.rank())
     }
 
     /// Returns the number of all ranks.
     pub(super) fn ranks(&self) -> usize {
-        self.ranks.size()
+        self.ranks.as_ref().map_or(1, |ranks| ranks.size())
     }
 
-    /// Ends all ranks at once.
+    /// Ends all ranks at once, of which there are several.
     pub(super) fn abort(&self) -> ! {
-        self.ranks.abort()
+        self.ranks.as_ref().expect("there are several").abort()
     }
 
     /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts are those of this
@@ -132,44 +112,45 @@ impl Exchange {
 
     /// Returns the values of all ranks, in their order.
     pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
-        if self.is_alone() {
-            return vec![own];
-        }
+        let Some(ranks) = &self.ranks else { return vec![own] };
         let own = to_bytes(&own);
-        let all = self.timed(own.len() * (self.ranks.size() - 1), || self.ranks.all_gather(own));
+        let all = self.timed(own.len() * (ranks.size() - 1), || ranks.all_gather(own));
         all.iter().map(|bytes| from_bytes(bytes)).collect()
     }
 
     /// Returns the value of the first rank; the others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
-        match first {
-            Some(value) if self.is_alone() => value,
-            first => from_bytes(&self.ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value)))),
-        }
+        let Some(ranks) = &self.ranks else { return first.expect("this is the first rank") };
+        from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
     }
 
-    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them.
-    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Vec<f32> {
-        self.timed(4 * (numbers.len() - own), || self.ranks.all_to_all(numbers, slices))
+    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them. Returns `None` if there
+    /// are no others.
+    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Option<Vec<f32>> {
+        let ranks = self.ranks.as_ref()?;
+        Some(self.timed(4 * (numbers.len() - own), || ranks.all_to_all(numbers, slices)))
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
     pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>], own: usize) {
-        self.timed(4 * own * (self.ranks.size() - 1), || self.ranks.all_gather_slices(numbers, slices));
+        if let Some(ranks) = &self.ranks {
+            self.timed(4 * own * (ranks.size() - 1), || ranks.all_gather_slices(numbers, slices));
+        }
     }
 
-    /// Returns the traffic since the last call.
-    pub fn take_traffic(&self) -> Traffic {
-        let [nanoseconds, bytes] = [&self.sent.nanoseconds, &self.sent.bytes].map(|of| of.swap(0, Ordering::Relaxed));
+    /// Returns the traffic since the last call, by name: the time spent, waiting for others included, s, and the bytes that this
+    /// rank has sent to others. Both are `NaN` for a single rank.
+    pub fn take_traffic(&self) -> [(&'static str, f64); 2] {
+        let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));
         let known = |value: f64| if self.is_alone() { f64::NAN } else { value };
-        Traffic { seconds: known(nanoseconds as f64 * 1e-9), bytes: known(bytes as f64) }
+        [("exchange_s", known(nanoseconds as f64 * 1e-9)), ("exchange_bytes", known(bytes as f64))]
     }
 
     fn timed<T>(&self, bytes: usize, talk: impl FnOnce() -> T) -> T {
         let started = Instant::now();
         let result = talk();
-        self.sent.nanoseconds.fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
-        self.sent.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+        self.sent[0].fetch_add(started.elapsed().as_nanos() as u64, Ordering::Relaxed);
+        self.sent[1].fetch_add(bytes as u64, Ordering::Relaxed);
         result
     }
 }

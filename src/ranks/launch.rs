@@ -2,12 +2,11 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Result, anyhow, bail};
 
-use super::{Alone, Exchange};
+use super::Exchange;
 use crate::os;
 use crate::schedule::panic_message;
 
@@ -71,7 +70,8 @@ fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
 /// # Errors
 /// Fails if there should be several, but this process cannot talk to the others; or as `work` does, if this process is alone.
 pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<ExitCode> {
-    let Membership { exchange, .. } = &match join() {
+    // When the second value is dropped, this process leaves the others, which waits for them.
+    let (exchange, _membership) = &match join() {
         // All ranks hit the same error; only rank 0 reports it.
         Err(_) if !is_spokesman() => return Ok(ExitCode::FAILURE),
         joined => joined?,
@@ -95,46 +95,29 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
     })
 }
 
-/// This process as a member of its ranks. When it is dropped, it leaves them, which waits for the others.
-struct Membership {
-    exchange: Exchange,
-    #[cfg(feature = "mpi")]
-    _universe: Option<super::mpi::Universe>,
-}
-
-impl Membership {
-    fn alone() -> Self {
-        Self {
-            exchange: Exchange::new(Arc::new(Alone)),
-            #[cfg(feature = "mpi")]
-            _universe: None,
-        }
-    }
-}
-
 #[cfg(feature = "mpi")]
-fn join() -> Result<Membership> {
-    let Some(Launched { size, .. }) = launched() else { return Ok(Membership::alone()) };
+fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
+    let Some(Launched { size, .. }) = launched() else { return Ok((Exchange::alone(1), None)) };
     let (universe, ranks) = super::mpi::join()?;
-    let exchange = Exchange::new(Arc::new(ranks));
+    let exchange = Exchange::new(std::sync::Arc::new(ranks));
     if exchange.is_alone() {
         bail!(
             "{size} processes were started, but each finds itself alone; under Slurm, start them with srun --mpi=pmix, or with the \
              mpirun of the MPI that this program was built with"
         );
     }
-    Ok(Membership { exchange, _universe: Some(universe) })
+    Ok((exchange, Some(universe)))
 }
 
 #[cfg(not(feature = "mpi"))]
-fn join() -> Result<Membership> {
+fn join() -> Result<(Exchange, ())> {
     if let Some(Launched { size, .. }) = launched() {
         bail!(
             "{size} processes were started, but this build has no MPI: each would train on its own; build with --features mpi \
              (docs/CLUSTER.md), or start one process"
         );
     }
-    Ok(Membership::alone())
+    Ok((Exchange::alone(1), ()))
 }
 
 #[cfg(test)]

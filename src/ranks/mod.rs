@@ -11,7 +11,6 @@
 //! as bytes.
 
 mod alike;
-mod blocks;
 mod exchange;
 mod launch;
 mod minibatches;
@@ -23,8 +22,7 @@ use std::ops::Range;
 
 use pulp::Arch;
 
-pub use blocks::Blocks;
-pub use exchange::{Exchange, Traffic};
+pub use exchange::Exchange;
 pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
 pub use minibatches::{Minibatch, Minibatches};
 pub use slices::Slices;
@@ -51,37 +49,6 @@ pub trait Ranks: Send + Sync {
 
     /// Ends all ranks at once.
     fn abort(&self) -> !;
-}
-
-/// One rank that computes all shards.
-pub struct Alone;
-
-impl Ranks for Alone {
-    fn size(&self) -> usize {
-        1
-    }
-
-    fn rank(&self) -> usize {
-        0
-    }
-
-    fn all_to_all(&self, numbers: &[f32], _: &[Range<usize>]) -> Vec<f32> {
-        numbers.to_vec()
-    }
-
-    fn all_gather_slices(&self, _: &mut [f32], _: &[Range<usize>]) {}
-
-    fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
-        vec![bytes]
-    }
-
-    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
-        bytes
-    }
-
-    fn abort(&self) -> ! {
-        std::process::exit(1)
-    }
 }
 
 /// Writes the sum of `parts`, which have equal length and whose number is a power of two. They are added as a binary

@@ -85,11 +85,7 @@ impl Ranks for Mpi {
         world().all_gather_varcount_into(&bytes[..], &mut places);
         drop(places);
         let mut rest = &all[..];
-        let cut = |length: usize| {
-            let (bytes, after) = rest.split_at(length);
-            rest = after;
-            bytes.to_vec()
-        };
+        let cut = |length| rest.split_off(..length).expect("the bytes of all ranks").to_vec();
         lengths.into_iter().map(cut).collect()
     }
 

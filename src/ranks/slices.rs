@@ -52,10 +52,7 @@ impl Slices {
 
     /// Replaces this rank's slice of a sum over its shards by the slice of the sum over all ranks, added as a tree.
     pub fn reduce_scatter(&self, numbers: &mut [f32]) {
-        if self.exchange.is_alone() {
-            return;
-        }
-        let parts = self.exchange.all_to_all(numbers, &self.all, self.own.len());
+        let Some(parts) = self.exchange.all_to_all(numbers, &self.all, self.own.len()) else { return };
         let parts: Vec<&[f32]> = if self.own.is_empty() { Vec::new() } else { parts.chunks(self.own.len()).collect() };
         numbers[self.own()].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
             let range = i * CHUNK..i * CHUNK + out.len();
@@ -66,9 +63,7 @@ impl Slices {
 
     /// Replaces the slices of the other ranks by what these have computed.
     pub fn all_gather(&self, numbers: &mut [f32]) {
-        if !self.exchange.is_alone() {
-            self.exchange.all_gather_slices(numbers, &self.all, self.own.len());
-        }
+        self.exchange.all_gather_slices(numbers, &self.all, self.own.len());
     }
 
     /// Returns the values with the slices of all ranks.

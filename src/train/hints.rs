@@ -34,21 +34,17 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     if samples < SMALL_MINIBATCH {
         hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
     }
-    let scales = |of: &Config| {
-        let env = &of.env;
-        [
-            ("env.rot_reward_scale", env.rot_reward_scale),
-            ("env.dist_reward_scale", env.dist_reward_scale),
-            ("env.action_penalty_scale", env.action_penalty_scale),
-        ]
-    };
-    let weight = training.task_reward.to;
-    for ((key, value), (_, usual)) in scales(config).into_iter().zip(scales(default)) {
+    let (env, usual, weight) = (&config.env, &default.env, training.task_reward.to);
+    for (key, value, usual) in [
+        ("env.rot_reward_scale", env.rot_reward_scale, usual.rot_reward_scale),
+        ("env.dist_reward_scale", env.dist_reward_scale, usual.dist_reward_scale),
+        ("env.action_penalty_scale", env.action_penalty_scale, usual.action_penalty_scale),
+    ] {
         if value != usual && weight < LITTLE {
             hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight}"));
         }
     }
-    let models = scene.saturating_mul(config.env.num_envs);
+    let models = scene.saturating_mul(env.num_envs);
     let share = config.randomization.share;
     let randomizes = [0, total].into_iter().any(|steps| share.by_equal_steps(steps) > 0.0);
     if config.randomization.happens() && !randomizes && share != default.randomization.share {
@@ -59,7 +55,7 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         hints.push(format!(
             "[randomization]: each of {} hands gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
              (randomization.share=0 avoids this)",
-            config.env.num_envs, share.after
+            env.num_envs, share.after
         ));
     }
     hints

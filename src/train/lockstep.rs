@@ -19,10 +19,8 @@ pub(super) struct Decision {
     pub save: bool,
     /// Whether the state is handed to the saver. If nobody else waits, it always is: the next iteration may be cut short.
     pub hand_over: bool,
-    /// The exit code if the training is to stop here.
-    pub stop: Option<ExitCode>,
-    /// Whether the user has asked for that by a file.
-    pub by_file: bool,
+    /// The exit code and the reason if the training is to stop here.
+    pub stop: Option<(ExitCode, &'static str)>,
 }
 
 /// What all must know to decide.
@@ -38,7 +36,7 @@ struct Vote {
 /// Computes, and leaves reporting and saving to the first.
 pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
-    let plan = Plan::broadcast(None, exchange)?.context("a plan is sent")?;
+    let plan = Plan::receive(exchange)?;
     os::start_threads(plan.config.run.threads)?;
     let exchange = exchange.clone().over(plan.config.shards())?;
     let mut session = Session::new(plan, exchange)?;
@@ -52,7 +50,7 @@ pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCod
             session.checkpoint();
         }
         session.dumps();
-        if let Some(code) = done.decision.stop.filter(|_| !session.finished()) {
+        if let Some((code, _)) = done.decision.stop.filter(|_| !session.finished()) {
             return Ok(code);
         }
     }
@@ -80,11 +78,12 @@ impl Session {
         }
         let any = |of: fn(&Vote) -> bool| votes.iter().any(of);
         let signal = votes.iter().map(|vote| vote.signal).max().unwrap_or(0);
-        let stop = any(|vote| vote.stop).then(|| os::exit_code(signal));
+        let reason = if by_file { "stopped by the file `stop`" } else { "stopped" };
+        let stop = any(|vote| vote.stop).then(|| (os::exit_code(signal), reason));
         let save = any(|vote| vote.save) || self.agent.iteration.is_multiple_of(self.config.run.checkpoint_every);
         let last = self.finished() || stop.is_some();
         let hand_over = exchange.is_alone() || last || save || any(|vote| vote.improved);
-        Ok(Decision { save, hand_over, stop, by_file })
+        Ok(Decision { save, hand_over, stop })
     }
 
     /// Returns the steps that led to each divergence, as files with these names and texts.
@@ -92,7 +91,7 @@ impl Session {
         if !self.dumps {
             return Vec::new();
         }
-        let (iteration, first) = (self.agent.iteration, self.agent.pool.first());
+        let (iteration, first) = (self.agent.iteration, self.agent.pool.blocks[0].first);
         let mut own: Vec<(String, String)> = Vec::new();
         for (env, hand) in (first..).zip(self.agent.pool.envs_mut()) {
             let Some(diverged) = hand.take_diverged() else { continue };

@@ -2,6 +2,7 @@
 
 use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
+use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Score};
 use crate::run::{self, Descriptions, Histogram, histogram};
 use crate::tags::quantity;
@@ -46,14 +47,15 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     put("eval/", &mut evaluation.headline());
     put("", &mut iteration.update.named().into_iter());
     put("time/", &mut iteration.time_named().into_iter());
-    put("time/", &mut traffic.named().into_iter());
+    put("time/", &mut traffic.iter().copied());
     put("sim/", &mut [("diverged", steps.diverged as f64)].into_iter());
     row
 }
 
 /// Returns the names of the values of any iteration, in a training with or without randomised episodes.
 pub(super) fn tags(randomizes: bool) -> Vec<String> {
-    let empty = row(&Outcome::default(), &Ended::new(&[], randomizes));
+    let traffic = Exchange::alone(1).take_traffic();
+    let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], randomizes));
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -82,7 +84,6 @@ mod tests {
     use crate::agent::{Agent, Iteration};
     use crate::config::Config;
     use crate::ppo::{Losses, UpdateStats};
-    use crate::ranks::{Exchange, Traffic};
     use crate::repose::{Lesson, StepSums, Task, TaskReward, TrainingReward};
 
     #[test]
@@ -143,7 +144,7 @@ mod tests {
             loss/policy 1, loss/value 2, policy/entropy 4, policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, \
             policy/std 10, policy/excess 3, value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, \
             time/collect_s 13, time/update_s 17, time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
-        let traffic = Traffic { seconds: 29.0, bytes: 30.0 };
+        let traffic = [("exchange_s", 29.0), ("exchange_bytes", 30.0)];
         let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
         let row = |randomizes| {
             let row = row(&outcome, &ended(randomizes));

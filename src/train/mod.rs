@@ -26,6 +26,8 @@ use crate::ranks::{self, Exchange};
 use crate::repose::{Repose, Score, StepSums, divergence};
 use crate::run::{Media, Report, RunFolder};
 use crate::schedule::panic_message;
+#[cfg(feature = "video")]
+use films::film;
 use hints::hints;
 use lockstep::follow;
 use log::{Ended, described, histograms, row, tags};
@@ -49,9 +51,9 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
 /// Trains, reports and saves.
 fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     let (mut session, mut saver) = Session::lead(args, exchange)?;
-    let place = saver.folder().path().display().to_string();
+    let place = saver.held.folder.path().display().to_string();
     if session.finished() {
-        os::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.steps_made()));
+        os::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.held.steps_made()));
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(limit) = args.stop_after {
@@ -60,7 +62,8 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
     if !args.quiet {
-        say_hints(&session)?;
+        let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
+        hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if args.resume.is_none()
@@ -69,7 +72,11 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         saver.give_back();
         return Err(error);
     }
-    let code = run(&mut session, saver, &mut report, requests)?;
+    let code = run(&mut session, saver, &mut report, requests);
+    if session.warned {
+        os::say(&format!("warning: {} steps of this session diverged", session.diverged));
+    }
+    let code = code?;
     if session.finished() && !args.quiet {
         say_what_next(Path::new(&place));
     }
@@ -79,35 +86,27 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
 /// Iterates until all steps are made or a stop is requested, and returns the exit code.
 fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
     while !session.finished() {
-        let outcome = match session.iterate(requests, Some((report, saver.folder()))) {
+        let outcome = match session.iterate(requests, Some((report, &saver.held.folder))) {
             Ok(Some(outcome)) => outcome,
-            Ok(None) => {
-                session.count_divergence();
-                return stop(saver, report, os::exit_code(requests.signal()), "stopped");
-            }
-            Err(error) => {
-                session.count_divergence();
-                return Err(give_up(error, saver, report));
-            }
+            Ok(None) => return stop(saver, report, os::exit_code(requests.signal()), "stopped"),
+            Err(error) => return Err(give_up(error, saver, report)),
         };
         if outcome.decision.hand_over {
             saver.keep(session.checkpoint());
         }
         if let Err(error) = saver.open_folder(report) {
             report.finish();
-            return Err(saver.elsewhere(error));
+            return Err(saver.held.elsewhere(error));
         }
         for (name, text) in session.dumps() {
-            saver.folder().dump(&name, &text).unwrap_or_else(|error| report.warn(&format!("{error:#}")));
+            saver.held.folder.dump(&name, &text).unwrap_or_else(|error| report.warn(&format!("{error:#}")));
         }
         session.report(report, &outcome);
         if session.finished() {
             break;
         }
-        if let Some(code) = outcome.decision.stop {
-            session.count_divergence();
-            let stopped = if outcome.decision.by_file { "stopped by the file `stop`" } else { "stopped" };
-            return stop(saver, report, code, stopped);
+        if let Some((code, reason)) = outcome.decision.stop {
+            return stop(saver, report, code, reason);
         }
         if outcome.decision.save
             && let Err(error) = saver.save(report)
@@ -116,8 +115,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
         }
     }
     saver.save_at_last(report)?;
-    session.count_divergence();
-    os::say(&format!("finished: {}; {}", saver.steps_made(), saver.folder().path().display()));
+    os::say(&format!("finished: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -147,6 +145,11 @@ impl Session {
             let (pool, exchange) = (&mut self.agent.pool, &self.agent.exchange);
             let ended = exchange.all_gather(pool.take_finished()).concat();
             let sums: Vec<StepSums> = pool.envs_mut().map(Repose::take_sums).collect();
+            let total = |sums: &[StepSums]| {
+                let mut total = StepSums::default();
+                sums.iter().for_each(|sums| total += *sums);
+                total
+            };
             let steps = exchange.sum(&sums, total, |sum, more| *sum += more);
             let decision = self.decide(requests, place.is_some_and(|(_, folder)| folder.take_stop()), improved)?;
             Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, media, decision }))
@@ -166,9 +169,9 @@ impl Session {
             media.histograms = histograms(&self.agent.rollout);
         }
         #[cfg(feature = "video")]
-        if self.films.due(self.agent.iteration) {
+        if self.films.is_some() && self.agent.iteration.is_multiple_of(self.config.run.film_every) {
             let episodes = self.evaluation_episodes();
-            let film = self.films.film(self.agent.ppo.policy(), episodes, stop, report);
+            let film = film(&mut self.films, self.agent.ppo.policy(), episodes, stop, report);
             if stop.load(std::sync::atomic::Ordering::Relaxed) {
                 return None;
             }
@@ -219,27 +222,6 @@ impl Session {
         }
         report.iteration(self.agent.iteration, &row(outcome, &ended), media, &status);
     }
-
-    /// Prints the total number of diverged steps at the end, if there was a warning.
-    fn count_divergence(&self) {
-        if self.warned {
-            os::say(&format!("warning: {} steps of this session diverged", self.diverged));
-        }
-    }
-}
-
-fn total(sums: &[StepSums]) -> StepSums {
-    sums.iter().fold(StepSums::default(), |mut total, &more| {
-        total += more;
-        total
-    })
-}
-
-/// Prints notes about settings that are rarely intended.
-fn say_hints(session: &Session) -> Result<()> {
-    let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-    hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
-    Ok(())
 }
 
 /// Prints how to look at a run that has finished.
@@ -263,15 +245,15 @@ fn evaluates(iteration: u64, every: u64) -> bool {
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(session.config.randomization.happens());
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
-    Report::new(saver.folder().path(), &tags, progress).described(described(&tags), session.config.to_text())
+    Report::new(saver.held.folder.path(), &tags, progress).described(described(&tags), session.config.to_text())
 }
 
 /// Saves the state at the end of the last complete iteration after a request to stop, and returns the exit code.
-fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, stopped: &str) -> Result<ExitCode> {
+fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, reason: &str) -> Result<ExitCode> {
     saver.save_at_last(report)?;
-    if saver.wrote() {
-        os::say(&format!("{stopped} after {}; resume with", saver.steps_made()));
-        os::say(&format!("  {}", saver.how_to_resume()));
+    if saver.held.wrote {
+        os::say(&format!("{reason} after {}; resume with", saver.held.steps_made()));
+        os::say(&format!("  {}", saver.held.how_to_resume(&saver.held.folder)));
     } else {
         os::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
     }
@@ -281,7 +263,7 @@ fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, stopped: &str) ->
 /// Saves the state at the end of the last complete iteration after a failure, and returns the error.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
     match saver.save_at_last(report) {
-        Ok(()) if saver.wrote() => os::say(&format!("saved the state after {}", saver.steps_made())),
+        Ok(()) if saver.held.wrote => os::say(&format!("saved the state after {}", saver.held.steps_made())),
         Ok(()) => os::say("the run folder was not changed"),
         Err(error) => os::say(&format!("error: {error:#}")),
     }
@@ -292,12 +274,17 @@ fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
 mod tests {
     use super::*;
     use crate::config::Override;
+    use crate::os::Locked;
     use crate::ppo::Checkpoint;
     use crate::train::start::Plan;
 
     fn from_scratch(sets: &[Override]) -> Session {
-        let plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default());
+        let plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default()).unwrap();
         Session::new(plan, Exchange::alone(1)).unwrap()
+    }
+
+    fn saver_of(session: &Session, place: (RunFolder, Locked)) -> Saver {
+        Saver::new(place, &TrainArgs::default(), &session.config, session.checkpoint(), false)
     }
 
     #[test]
@@ -315,16 +302,15 @@ mod tests {
         let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]", "run.eval_every=1000"];
         let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
         let mut session = from_scratch(&sets);
-        let (folder, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        let mut saver = session.saver((folder, lock), &TrainArgs::default(), false);
+        let mut saver = saver_of(&session, RunFolder::create(Some(place.path()), None).unwrap());
         let (mut report, never) = (new_report(&session, &saver, true), Requests::none());
         saver.open_folder(&mut report).unwrap();
-        assert!(session.iterate(&never, Some((&report, saver.folder()))).unwrap().is_some(), "nothing stops it");
+        assert!(session.iterate(&never, Some((&report, &saver.held.folder))).unwrap().is_some(), "nothing stops it");
         saver.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, Some((&report, saver.folder()))).unwrap_err();
-        let latest = saver.folder().checkpoints().latest();
+        let error = session.iterate(&never, Some((&report, &saver.held.folder))).unwrap_err();
+        let latest = saver.held.folder.checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");
         let saved = os::read_bytes(&latest).unwrap();
@@ -338,8 +324,7 @@ mod tests {
         let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]"].map(|set| set.parse().unwrap());
         let session = from_scratch(&sets);
         let begin = || {
-            let (folder, lock) = RunFolder::create(Some(&path), None).unwrap();
-            let mut saver = session.saver((folder, lock), &TrainArgs::default(), false);
+            let mut saver = saver_of(&session, RunFolder::create(Some(&path), None).unwrap());
             saver.open_folder(&mut new_report(&session, &saver, true)).unwrap();
             saver
         };
@@ -349,6 +334,6 @@ mod tests {
         std::process::Command::new("rm").arg("-r").arg(&path).status().unwrap();
         let other = begin();
         lost.give_back();
-        assert!(other.folder().checkpoints().latest().exists());
+        assert!(other.held.folder.checkpoints().latest().exists());
     }
 }

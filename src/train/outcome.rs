@@ -2,7 +2,6 @@
 
 use super::lockstep::Decision;
 use crate::agent::Iteration;
-use crate::ranks::Traffic;
 use crate::repose::{EpisodeStats, Lesson, Score, StepSums};
 use crate::run::Media;
 
@@ -17,8 +16,8 @@ pub(super) struct Outcome {
     pub steps: StepSums,
     /// The score of its evaluation, which has no episodes if there was none.
     pub evaluation: Score,
-    /// The cost of the exchange while collecting and learning.
-    pub traffic: Traffic,
+    /// The cost of the exchange while collecting and learning, by name.
+    pub traffic: [(&'static str, f64); 2],
     /// Histograms and film of the environments here.
     pub media: Media,
     /// What follows.

@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use anyhow::{Error, Result, anyhow};
 
-use crate::load;
+use crate::cli::TrainArgs;
+use crate::config::Config;
+use crate::load::{self, MODEL};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
@@ -17,64 +19,61 @@ use crate::sim;
 /// Nothing in the folder of a resumed run is changed before the first iteration is done: until then, anyone who named the wrong
 /// run or checkpoint can stop.
 pub(super) struct Saver {
-    folder: RunFolder,
+    /// What is to be saved, and where.
+    pub held: Held,
     lock: Option<Locked>,
+    /// The state that this session started from.
+    initial: Arc<Checkpoint>,
+    /// Whether that is the newest checkpoint in the folder.
+    from_newest: bool,
+}
+
+/// What is to be saved, and where.
+#[derive(Clone)]
+pub(super) struct Held {
+    /// The run folder.
+    pub folder: RunFolder,
     keep: usize,
     /// The options with which this training is resumed.
     options: String,
     /// The state at the end of the last complete iteration.
     last: Arc<Checkpoint>,
-    /// The state that this session started from.
-    initial: Arc<Checkpoint>,
-    /// Whether that is the newest checkpoint in the folder.
-    from_newest: bool,
     /// Whether this session has written into the folder.
-    wrote: bool,
+    pub wrote: bool,
     /// The checkpoint of the best evaluation, if this session has found it.
     best: Option<Arc<Checkpoint>>,
     best_is_saved: bool,
 }
 
 impl Saver {
-    /// Creates the saver of a training at its `initial` state, which may be the newest checkpoint in the folder. It keeps the newest
-    /// `keep` checkpoints there; `options` are the options for resuming.
+    /// Creates the saver of a training with these options and settings at its `initial` state, which may be the newest checkpoint
+    /// in the folder.
     pub(super) fn new(
         (folder, lock): (RunFolder, Locked),
-        keep: Option<usize>,
-        options: String,
+        args: &TrainArgs,
+        config: &Config,
         initial: Checkpoint,
         from_newest: bool,
     ) -> Self {
+        let model = config.env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
+        let model = model.map_or(String::new(), |set| format!(" --set {set}"));
+        let options = format!("{model}{}", if args.dump_diverged { " --dump-diverged" } else { "" });
         // The newest, and one more in case that is damaged.
-        let keep = keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
-        let (lock, initial) = (Some(lock), Arc::new(initial));
-        let (last, wrote, best, best_is_saved) = (initial.clone(), false, None, true);
-        let saver = Self { folder, lock, keep, options, last, initial, from_newest, wrote, best, best_is_saved };
+        let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
+        let initial = Arc::new(initial);
+        let last = initial.clone();
+        let held = Held { folder, keep, options, last, wrote: false, best: None, best_is_saved: true };
+        let saver = Self { held, lock: Some(lock), initial, from_newest };
         saver.save_before_fatal_errors();
         saver
     }
 
-    /// Returns the run folder.
-    pub(super) fn folder(&self) -> &RunFolder {
-        &self.folder
-    }
-
-    /// Returns whether this session has written into the folder.
-    pub(super) fn wrote(&self) -> bool {
-        self.wrote
-    }
-
-    /// Returns the progress of the training as text.
-    pub(super) fn steps_made(&self) -> String {
-        format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
-    }
-
     /// Keeps the state at the end of another iteration, to save it. If its best evaluation has changed, it is itself the best checkpoint.
     pub(super) fn keep(&mut self, last: Checkpoint) {
-        let is_best = last.progress.best != self.last.progress.best;
-        self.last = Arc::new(last);
+        let is_best = last.progress.best != self.held.last.progress.best;
+        self.held.last = Arc::new(last);
         if is_best {
-            (self.best, self.best_is_saved) = (Some(self.last.clone()), false);
+            (self.held.best, self.held.best_is_saved) = (Some(self.held.last.clone()), false);
         }
         self.save_before_fatal_errors();
     }
@@ -85,27 +84,27 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to.
     pub(super) fn open_folder(&mut self, report: &mut Report) -> Result<()> {
-        if self.wrote {
+        if self.held.wrote {
             return Ok(());
         }
         let lock = match self.lock.take().filter(Locked::holds) {
             Some(lock) => lock,
             // The folder was deleted during the first iteration.
-            None => self.folder.lock()?,
+            None => self.held.folder.lock()?,
         };
-        self.lock = Some(self.folder.claim(lock)?);
-        let best = self.folder.checkpoints().best();
+        self.lock = Some(self.held.folder.claim(lock)?);
+        let best = self.held.folder.checkpoints().best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
-            let aside = self.folder.checkpoints().put_best_aside()?;
+            let aside = self.held.folder.checkpoints().put_best_aside()?;
             report.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
         }
-        if !self.from_newest || self.folder.checkpoints().newest_first().is_empty() {
-            write(&self.folder, None, &self.initial, self.keep)?;
+        if !self.from_newest || self.held.folder.checkpoints().newest_first().is_empty() {
+            write(&self.held.folder, None, &self.initial, self.held.keep)?;
         }
         let Progress { iteration, env_steps, fork, .. } = &self.initial.progress;
         report.open_logs(fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration, *env_steps);
         self.describe()?;
-        self.wrote = true;
+        self.held.wrote = true;
         self.save_before_fatal_errors();
         Ok(())
     }
@@ -113,16 +112,17 @@ impl Saver {
     /// Clears the folder of a run that could not begin, unless it belongs to another training by now.
     pub(super) fn give_back(&self) {
         if self.lock.as_ref().is_some_and(Locked::holds) {
-            self.folder.clear();
+            self.held.folder.clear();
         }
     }
 
     /// Writes the configuration and the versions into the folder.
     fn describe(&self) -> Result<()> {
-        let fork = self.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
-            format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
-        });
-        self.folder.describe(&format!("{fork}{}", self.last.config), &version())
+        let fork =
+            self.held.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
+                format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
+            });
+        self.held.folder.describe(&format!("{fork}{}", self.held.last.config), &version())
     }
 
     /// Writes the logs, the best policy and the checkpoint, each before anything that refers to it.
@@ -132,18 +132,13 @@ impl Saver {
     pub(super) fn save(&mut self, report: &mut Report) -> Result<()> {
         if !self.lock.as_ref().is_some_and(Locked::holds) {
             // The folder was deleted: create it again, unless another training has done so.
-            self.lock = Some(self.folder.claim(self.folder.lock()?)?);
+            self.lock = Some(self.held.folder.claim(self.held.folder.lock()?)?);
         }
         report.sync();
         self.describe()?;
-        self.write()?;
-        self.best_is_saved = true;
+        self.held.write(&self.held.folder, self.held.keep)?;
+        self.held.best_is_saved = true;
         Ok(())
-    }
-
-    fn write(&self) -> Result<()> {
-        let unsaved = !self.best_is_saved || !self.folder.checkpoints().best().exists();
-        write(&self.folder, self.best.as_deref().filter(|_| unsaved), &self.last, self.keep)
     }
 
     /// Saves for the last time and ends the report. If the folder cannot be written to, the state is saved elsewhere. Before the
@@ -152,43 +147,70 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to; the message states where the state is instead.
     pub(super) fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
-        let saved = if self.wrote { self.save(report) } else { Ok(()) };
+        let saved = if self.held.wrote { self.save(report) } else { Ok(()) };
         report.finish();
-        saved.map_err(|error| self.elsewhere(error))
-    }
-
-    /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
-    pub(super) fn elsewhere(&self, reason: Error) -> Error {
-        elsewhere(reason, self.best.as_deref(), &self.last, &self.options)
-    }
-
-    /// Returns the command that resumes this training.
-    pub(super) fn how_to_resume(&self) -> String {
-        how_to_resume(self.folder.path(), &self.options)
+        saved.map_err(|error| self.held.elsewhere(error))
     }
 
     /// Arranges for the state at the end of the last iteration to be saved if MuJoCo is about to end the process.
     fn save_before_fatal_errors(&self) {
-        let (last, folder, keep, wrote) = (self.last.clone(), self.folder.clone(), self.keep, self.wrote);
-        let holds = self.lock.as_ref().map(Locked::watch);
-        let best = self.best.clone().filter(|_| !self.best_is_saved);
-        let options = self.options.clone();
+        let (held, holds) = (self.held.clone(), self.lock.as_ref().map(Locked::watch));
         sim::before_fatal_error(move |said| {
             os::say(&format!("error: {said}"));
-            let replaced = || anyhow!("{} has been replaced", folder.path().display());
-            let held = holds.as_ref().is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
-            if !wrote {
+            if !held.wrote {
                 return os::say("the run folder was not changed");
             }
-            match held.and_then(|()| write(&folder, best.as_deref(), &last, keep)) {
+            let replaced = || anyhow!("{} has been replaced", held.folder.path().display());
+            let ours = holds.is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
+            match ours.and_then(|()| held.write(&held.folder, held.keep)) {
                 Ok(()) => {
-                    let iteration = last.progress.iteration;
-                    let command = how_to_resume(folder.path(), &options);
+                    let (iteration, command) = (held.last.progress.iteration, held.how_to_resume(&held.folder));
                     os::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
                 }
-                Err(error) => os::say(&format!("error: {:#}", elsewhere(error, best.as_deref(), &last, &options))),
+                Err(error) => os::say(&format!("error: {:#}", held.elsewhere(error))),
             }
         });
+    }
+}
+
+impl Held {
+    /// Returns the progress of the training as text.
+    pub(super) fn steps_made(&self) -> String {
+        format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
+    }
+
+    /// Writes the best policy, unless that is done, and the checkpoint into a run folder, in which the newest `keep` are kept.
+    fn write(&self, folder: &RunFolder, keep: usize) -> Result<()> {
+        let unsaved = !self.best_is_saved || !folder.checkpoints().best().exists();
+        write(folder, self.best.as_deref().filter(|_| unsaved), &self.last, keep)
+    }
+
+    /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
+    pub(super) fn elsewhere(&self, reason: Error) -> Error {
+        let saved = RunFolder::for_now().and_then(|run| match self.write(&run, 1) {
+            Ok(()) => Ok(run),
+            Err(error) => {
+                run.remove();
+                Err(error)
+            }
+        });
+        match saved {
+            Ok(run) => anyhow!(
+                "{reason:#}\nThe state after {} iterations is in {} instead; resume with\n  {}",
+                self.last.progress.iteration,
+                run.path().display(),
+                self.how_to_resume(&run)
+            ),
+            Err(error) => anyhow!(
+                "{reason:#}\nIt could not be saved elsewhere either: {error:#}\nSet TMPDIR=PATH to try another location; only the \
+                 previous checkpoint is left"
+            ),
+        }
+    }
+
+    /// Returns the command that resumes the run in this folder with the same options.
+    pub(super) fn how_to_resume(&self, run: &RunFolder) -> String {
+        format!("{} train --resume {}{}", os::called_as(), os::quoted_path(run.path()), self.options)
     }
 }
 
@@ -230,34 +252,6 @@ fn keep_policy(folder: &RunFolder, last: &Checkpoint) -> Result<()> {
         }
     };
     os::write_whole(&folder.policy(), &policy.to_bytes()?)
-}
-
-/// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
-fn elsewhere(reason: Error, best: Option<&Checkpoint>, last: &Checkpoint, options: &str) -> Error {
-    let saved = RunFolder::for_now().and_then(|run| match write(&run, best, last, 1) {
-        Ok(()) => Ok(run),
-        Err(error) => {
-            run.remove();
-            Err(error)
-        }
-    });
-    match saved {
-        Ok(run) => anyhow!(
-            "{reason:#}\nThe state after {} iterations is in {} instead; resume with\n  {}",
-            last.progress.iteration,
-            run.path().display(),
-            how_to_resume(run.path(), options)
-        ),
-        Err(error) => anyhow!(
-            "{reason:#}\nIt could not be saved elsewhere either: {error:#}\nSet TMPDIR=PATH to try another location; only the \
-             previous checkpoint is left"
-        ),
-    }
-}
-
-/// Returns the command that resumes the run in this folder with the same options.
-fn how_to_resume(run: &Path, options: &str) -> String {
-    format!("{} train --resume {}{options}", os::called_as(), os::quoted_path(run))
 }
 
 /// Returns the versions of the program and its parts, as written into a run folder.

@@ -21,78 +21,82 @@ use crate::run::{self, RunFolder};
 pub(super) struct Plan {
     /// The settings of the run.
     pub config: Config,
-    /// What it starts from.
-    pub from: StartFrom,
+    /// The checkpoint that it starts from, and what it takes from it; without one, it starts from random weights.
+    pub from: Option<(Takes, Checkpoint)>,
+    /// The best evaluation so far.
+    pub best: Option<Evaluation>,
     /// What cannot be done if it cannot start from that.
     pub context: Option<String>,
     /// Whether to write the steps that led to diverged states.
     pub dumps: bool,
 }
 
-/// What a training starts from.
-pub(super) enum StartFrom {
-    /// Random weights.
-    Scratch,
-    /// The policy of this checkpoint; all else is as in any new run.
-    Policy(Checkpoint),
-    /// The whole state in this checkpoint of a run.
-    State(Checkpoint),
-    /// The whole state in this checkpoint of another run, under settings that have changed from these.
-    Fork(Checkpoint, Box<Config>),
+/// What a training takes from the checkpoint that it starts from.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub(super) enum Takes {
+    /// The policy; all else is as in any new run.
+    Policy,
+    /// The whole state.
+    State,
+    /// The whole state, under settings that have changed from those in the checkpoint.
+    Fork,
 }
 
-/// The folder of a run that is resumed.
-pub(super) struct Existing {
-    /// The folder.
-    pub folder: RunFolder,
-    /// The lock on it.
-    pub lock: Locked,
-    /// Whether the checkpoint that is resumed is the newest one.
-    pub from_newest: bool,
-    /// The best evaluation so far.
-    pub best: Option<Evaluation>,
-}
+/// The folder of a run that is resumed, the lock on it, and whether the checkpoint that is resumed is the newest one.
+pub(super) type Existing = ((RunFolder, Locked), bool);
 
-/// A plan as it is sent.
-#[derive(Serialize, Deserialize)]
-struct Message {
-    config: String,
-    /// The file of the checkpoint.
-    checkpoint: Option<Vec<u8>>,
-    /// The settings of the parent of a fork.
-    parent: Option<String>,
-    starts_from_state: bool,
-    context: Option<String>,
-    dumps: bool,
-}
+/// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
+type Message = (String, Option<(Takes, Vec<u8>)>, Option<Evaluation>, Option<String>, bool);
 
 impl Plan {
+    /// Plans what the command line asks for, in the folder of a run if it exists.
+    ///
+    /// # Errors
+    /// Fails as [`Plan::new_run`], [`Plan::resume`] and [`Plan::fork`] do.
+    pub(super) fn of(args: &TrainArgs) -> Result<(Self, Option<Existing>)> {
+        match (&args.resume, &args.fork) {
+            (Some(place), _) => Self::resume(place.as_deref(), args).map(|(plan, existing)| (plan, Some(existing))),
+            (None, Some(place)) => Self::fork(place, args).map(|plan| (plan, None)),
+            (None, None) => Self::new_run(args).map(|plan| (plan, None)),
+        }
+    }
+
+    /// Returns the plan of a training that starts from random weights. The path of its scene is made absolute, so that the run does
+    /// not depend on the folder in which it was started.
+    ///
+    /// # Errors
+    /// Fails if the scene does not exist.
+    pub(super) fn new(mut config: Config, args: &TrainArgs) -> Result<Self> {
+        if let Some(model) = config.env.model_file() {
+            let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
+            config.env.model = model.display().to_string();
+        }
+        Ok(Self { config, from: None, best: None, context: None, dumps: args.dump_diverged })
+    }
+
     /// Plans a new training with the requested settings.
     ///
     /// # Errors
     /// Fails if the settings or the initial policy cannot be used.
-    pub(super) fn new_run(args: &TrainArgs) -> Result<Self> {
+    fn new_run(args: &TrainArgs) -> Result<Self> {
         let (user, overrides) = (user_file(args.settings.config.as_deref())?, overrides(args));
-        let Some(place) = &args.init else {
-            let mut config = Config::resolve(user.as_ref(), &overrides)?;
-            absolute_model_path(&mut config)?;
-            return Ok(Self::new(config, args));
-        };
+        let Some(place) = &args.init else { return Self::new(Config::resolve(user.as_ref(), &overrides)?, args) };
         let origin = PolicySource::find(place)?;
         let (checkpoint, PolicyConfig { net, .. }) = origin.load_for_any_scene()?;
-        let mut config = Config::resolve_around(&net, user.as_ref(), &overrides)?;
-        absolute_model_path(&mut config)?;
-        expect_net(&checkpoint, &net, &config).with_context(|| format!("cannot start from the policy {origin}"))?;
+        let plan = Self::new(Config::resolve_around(&net, user.as_ref(), &overrides)?, args)?;
+        expect_net(&checkpoint, &net, &plan.config)
+            .with_context(|| format!("cannot start from the policy {origin}"))?;
         let context = Some(format!("cannot start from the policy {}", place.display()));
-        Ok(Self { from: StartFrom::Policy(checkpoint), context, ..Self::new(config, args) })
+        Ok(Self { from: Some((Takes::Policy, checkpoint)), context, ..plan })
     }
 
     /// Plans to resume a training from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
     ///
     /// # Errors
     /// Fails if a setting is given that cannot be changed, or if the run cannot be resumed.
-    pub(super) fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<(Self, Existing)> {
-        let place = run_to_resume(place)?;
+    fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<(Self, Existing)> {
+        let place = place.map(Path::to_owned).or_else(run::newest_run);
+        let place = place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")?;
         if let Some(set) = args.settings.set.iter().find(|set| set.key != MODEL) {
             bail!(
                 "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
@@ -104,28 +108,20 @@ impl Plan {
         ensure!(!checkpoints.newest_first().is_empty(), "{} holds no checkpoint", place.display());
         let lock = folder.lock()?;
         let newest = checkpoints.newest_first();
-        let places = if place.is_dir() { newest.clone() } else { vec![place.clone()] };
-        let (path, checkpoint) =
-            load::newest_sound(&places).with_context(|| format!("cannot resume {}", place.display()))?;
+        let (path, checkpoint) = load::newest_sound(&checkpoints_at(&place)?)
+            .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
-        let config = || {
-            let config = load::for_training(&checkpoint, &path, &overrides(args))?;
-            expect_states(&checkpoint, &config).map(|()| config)
-        };
-        let mut config = config().context(context.clone())?;
+        let config = load::for_training(&checkpoint, &path, &overrides(args));
+        let config = config.and_then(|config| expect_states(&checkpoint, &config).map(|()| config));
+        let config = config.with_context(|| context.clone())?;
         expect_config(&folder, &config)?;
-        absolute_model_path(&mut config)?;
         // The best is the one in the folder. It may have been saved after the checkpoint that is resumed, and a worse one must
         // not replace it.
         let best = best_so_far(&folder, checkpoint.progress.best);
         let from_newest = os::same_file(&path, &newest[0]);
-        let plan = Self { from: StartFrom::State(checkpoint), context: Some(context), ..Self::new(config, args) };
-        Ok((plan, Existing { folder, lock, from_newest, best }))
-    }
-
-    /// Returns the plan of a training that starts from random weights.
-    pub(super) fn new(config: Config, args: &TrainArgs) -> Self {
-        Self { config, from: StartFrom::Scratch, context: None, dumps: args.dump_diverged }
+        let from = Some((Takes::State, checkpoint));
+        let plan = Self { from, best, context: Some(context), ..Self::new(config, args)? };
+        Ok((plan, ((folder, lock), from_newest)))
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
@@ -133,28 +129,26 @@ impl Plan {
     ///
     /// # Errors
     /// Fails if the checkpoint cannot be resumed from, or if the settings do not fit it.
-    pub(super) fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
+    fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
         if matches!(PolicySource::find(place), Ok(PolicySource::BuiltIn(_))) {
             let name = place.display();
             bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
         }
-        let places = if place.is_dir() {
-            RunFolder::containing(place)?.checkpoints().newest_first()
-        } else {
-            vec![place.to_owned()]
-        };
         let context = || format!("cannot fork {}", place.display());
-        let (path, checkpoint) = load::newest_sound(&places).with_context(context)?;
-        Self::forked(&path, checkpoint, args).with_context(|| format!("cannot fork {}", path.display()))
+        let (path, checkpoint) = load::newest_sound(&checkpoints_at(place)?).with_context(context)?;
+        let context = format!("cannot fork {}", path.display());
+        let plan = Self::forked(&path, checkpoint, args).with_context(|| context.clone())?;
+        Ok(Self { context: Some(context), ..plan })
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
         let user = user_file(args.settings.config.as_deref())?;
-        let (parent, mut config) = load::for_fork(&checkpoint, path, user.as_ref(), &overrides(args))?;
+        let (parent, config) = load::for_fork(&checkpoint, path, user.as_ref(), &overrides(args))?;
         expect_states(&checkpoint, &parent)?;
         expect_kept(&parent, &config)?;
-        absolute_model_path(&mut config)?;
-        expect_scene(&parent, &config, &checkpoint)?;
+        let plan = Self::new(config, args)?;
+        let config = &plan.config;
+        expect_scene(&parent, config, &checkpoint)?;
         checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), SPACES, config.run.seed)?;
         let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
         let progress = &mut checkpoint.progress;
@@ -167,59 +161,40 @@ impl Plan {
         progress.fork = Some(Fork { from, iteration: progress.iteration, env_steps: progress.env_steps });
         // Scores under different settings are not comparable, so the best one is not kept.
         progress.best = None;
-        let from_state = StartFrom::Fork(checkpoint, Box::new(parent));
-        let context = Some(format!("cannot fork {}", path.display()));
-        Ok(Self { from: from_state, context, ..Self::new(config, args) })
+        Ok(Self { from: Some((Takes::Fork, checkpoint)), ..plan })
     }
 
-    /// Sends the plan to all that pass `None`.
+    /// Sends the plan to the others, if there are any.
     ///
     /// # Errors
-    /// Fails if a value in the checkpoint is not finite, or if the sender runs another version of the program.
-    pub(super) fn broadcast(plan: Option<&Self>, exchange: &Exchange) -> Result<Option<Self>> {
-        if exchange.is_alone() {
-            return Ok(None);
+    /// Fails if a value in the checkpoint is not finite.
+    pub(super) fn send(&self, exchange: &Exchange) -> Result<()> {
+        if !exchange.is_alone() {
+            let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| checkpoint.to_bytes().map(|bytes| (*takes, bytes));
+            let (config, from) = (self.config.to_text(), self.from.as_ref().map(bytes).transpose()?);
+            exchange.broadcast::<Message>(Some((config, from, self.best, self.context.clone(), self.dumps)));
         }
-        let message = exchange.broadcast(plan.map(Self::message).transpose()?);
-        if plan.is_some() {
-            return Ok(None);
-        }
-        let Message { config, checkpoint, parent, starts_from_state, context, dumps } = message;
-        let parse = |text: &str| Config::from_text(Path::new("the settings that were sent"), text, &[]);
-        let checkpoint = checkpoint.map(|bytes| Checkpoint::parse(&bytes)).transpose()?;
-        let from = match (checkpoint, &parent) {
-            (None, _) => StartFrom::Scratch,
-            (Some(checkpoint), Some(parent)) => StartFrom::Fork(checkpoint, Box::new(parse(parent)?)),
-            (Some(checkpoint), None) if starts_from_state => StartFrom::State(checkpoint),
-            (Some(checkpoint), None) => StartFrom::Policy(checkpoint),
-        };
-        Ok(Some(Self { config: parse(&config)?, from, context, dumps }))
+        Ok(())
     }
 
-    fn message(&self) -> Result<Message> {
-        let (checkpoint, parent) = match &self.from {
-            StartFrom::Scratch => (None, None),
-            StartFrom::Policy(checkpoint) | StartFrom::State(checkpoint) => (Some(checkpoint), None),
-            StartFrom::Fork(checkpoint, parent) => (Some(checkpoint), Some(parent.to_text())),
-        };
-        Ok(Message {
-            config: self.config.to_text(),
-            checkpoint: checkpoint.map(Checkpoint::to_bytes).transpose()?,
-            parent,
-            starts_from_state: matches!(self.from, StartFrom::State(_)),
-            context: self.context.clone(),
-            dumps: self.dumps,
-        })
+    /// Returns the plan that the first has sent.
+    ///
+    /// # Errors
+    /// Fails if the sender runs another version of the program.
+    pub(super) fn receive(exchange: &Exchange) -> Result<Self> {
+        let (config, from, best, context, dumps) = exchange.broadcast::<Message>(None);
+        let config = Config::from_text(Path::new("the settings that were sent"), &config, &[])?;
+        let from = from.map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
+        Ok(Self { config, from: from.transpose()?, best, context, dumps })
     }
 }
 
-/// Returns the run or checkpoint to resume: the given one, or the newest run.
-///
-/// # Errors
-/// Fails if there is no run.
-fn run_to_resume(place: Option<&Path>) -> Result<PathBuf> {
-    let place = place.map(Path::to_owned).or_else(run::newest_run);
-    place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")
+/// Returns the checkpoint `place`, or those of the run there, the newest first.
+fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
+    if !place.is_dir() {
+        return Ok(vec![place.to_owned()]);
+    }
+    Ok(RunFolder::containing(place)?.checkpoints().newest_first())
 }
 
 /// Returns the single settings, including those that have their own options.
@@ -232,18 +207,6 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
     let given = options.into_iter().filter_map(|(key, value)| Some((key, value?)));
     let given = given.map(|(key, value)| Override { key: key.into(), value: value.to_string() });
     args.settings.set.iter().cloned().chain(given).collect()
-}
-
-/// Makes the path of the scene absolute, so that the run does not depend on the folder in which it was started.
-///
-/// # Errors
-/// Fails if the scene does not exist.
-fn absolute_model_path(config: &mut Config) -> Result<()> {
-    if let Some(model) = config.env.model_file() {
-        let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
-        config.env.model = model.display().to_string();
-    }
-    Ok(())
 }
 
 /// Checks that the settings in the folder are those of the checkpoint, because edits to them would be ignored.

@@ -1,7 +1,8 @@
 //! Pools of many environments.
 
 use rand::RngExt;
-use shadow_repose::env::{End, EnvBlock, EnvPool, StepBuffers};
+use shadow_repose::env::{End, EnvBlock, EnvPool};
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, Repose};
 use shadow_repose::rng;
 use shadow_repose::schedule::in_rounds;
@@ -20,9 +21,7 @@ struct Block<'a> {
     envs: &'a mut EnvBlock<Repose>,
     first: usize,
     observations: Vec<f32>,
-    final_observations: Vec<f32>,
     rewards: Vec<f32>,
-    ends: Vec<Option<End>>,
     seen: Vec<(Vec<f32>, Vec<f32>)>,
     truncated: usize,
 }
@@ -31,15 +30,9 @@ impl Block<'_> {
     /// Steps the block; `actions` are those of all environments.
     fn step(&mut self, actions: &[f32]) {
         let actions = &actions[self.first * ACTION_SIZE..][..self.envs.count() * ACTION_SIZE];
-        let buffers = StepBuffers {
-            rewards: &mut self.rewards,
-            ends: &mut self.ends,
-            observations: &mut self.observations,
-            final_observations: &mut self.final_observations,
-        };
-        self.envs.step(actions, buffers).unwrap();
+        self.envs.step(actions, &mut self.rewards, &mut self.observations).unwrap();
         self.seen.push((self.observations.clone(), self.rewards.clone()));
-        for (i, end) in self.ends.iter().enumerate() {
+        for (i, end) in self.envs.ends.iter().enumerate() {
             let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
             let previous_action = &self.observations[rows.clone()][137..];
             // Where an episode ended, a new one has begun: only there is the previous action zero.
@@ -48,7 +41,7 @@ impl Block<'_> {
                 // The final observation is that of this environment: it shows its last action.
                 let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-                assert_eq!(self.final_observations[rows][137..], last);
+                assert_eq!(self.envs.final_observations[rows][137..], last);
                 self.truncated += 1;
             }
         }
@@ -62,24 +55,15 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: im
     let actions: Vec<Vec<f32>> =
         (0..steps).map(|step| (0..envs * ACTION_SIZE).map(|i| action(step, i)).collect()).collect();
     threads.install(|| {
-        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect());
+        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect(), &Exchange::alone(1));
         let sizes = pool.block_sizes();
         let mut observations: Vec<Vec<f32>> = sizes.iter().map(|n| vec![0.0; n * OBSERVATION_SIZE]).collect();
         pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
         let mut first = 0;
-        let blocks = pool.blocks_mut().iter_mut().zip(observations).map(|(envs, observations)| {
+        let blocks = pool.blocks.iter_mut().zip(observations).map(|(envs, observations)| {
             let n = envs.count();
             first += n;
-            Block {
-                envs,
-                first: first - n,
-                final_observations: observations.clone(),
-                observations,
-                rewards: vec![0.0; n],
-                ends: vec![None; n],
-                seen: Vec::new(),
-                truncated: 0,
-            }
+            Block { envs, first: first - n, observations, rewards: vec![0.0; n], seen: Vec::new(), truncated: 0 }
         });
         let blocks: Vec<Block> = blocks.collect();
         let blocks = in_rounds(blocks, steps, |block, step| block.step(&actions[step]));
@@ -139,8 +123,9 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
     let task = task(&["env.max_episode_seconds=0.7"]);
     let threads = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
     threads.install(|| {
-        let new_pool = || EnvPool::new(5, (0..24).map(|_| Repose::new(&task)).collect());
-        let mut pool = new_pool();
+        let new_pool =
+            |envs: usize| EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect(), &Exchange::alone(1));
+        let mut pool = new_pool(24);
         let rows: Vec<usize> = pool.block_sizes().iter().map(|n| n * OBSERVATION_SIZE).collect();
         let mut observations: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
         pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
@@ -148,27 +133,20 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
         let step = |pool: &mut EnvPool<Repose>, observations: &mut [Vec<f32>], step: usize| {
             let mut first = 0;
             let mut seen = Vec::new();
-            for (block, rows) in pool.blocks_mut().iter_mut().zip(observations) {
+            for (block, rows) in pool.blocks.iter_mut().zip(observations) {
                 let n = block.count();
                 let actions: Vec<f32> = (0..n * ACTION_SIZE).map(|i| action(step, first + i)).collect();
-                let (mut rewards, mut ends) = (vec![0.0; n], vec![None; n]);
-                let mut last = rows.clone();
-                let buffers = StepBuffers {
-                    rewards: &mut rewards,
-                    ends: &mut ends,
-                    observations: rows,
-                    final_observations: &mut last,
-                };
-                block.step(&actions, buffers).unwrap();
+                let mut rewards = vec![0.0; n];
+                block.step(&actions, &mut rewards, rows).unwrap();
                 first += n * ACTION_SIZE;
-                seen.push((rewards, ends, rows.clone()));
+                seen.push((rewards, block.ends.clone(), rows.clone()));
             }
             seen
         };
         (0..100).for_each(|t| drop(step(&mut pool, &mut observations, t)));
         pool.take_finished();
         let state = pool.save();
-        let mut again = new_pool();
+        let mut again = new_pool(24);
         let mut restored: Vec<Vec<f32>> = rows.iter().map(|&n| vec![0.0; n]).collect();
         again.restore(&state, restored.iter_mut().map(|rows| &mut rows[..]).collect()).unwrap();
         assert!(restored == observations, "the observations to act on");
@@ -179,7 +157,7 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
         }
         let [ended, expected] = [again.take_finished(), pool.take_finished()];
         assert!(ended == expected && ended.len() > 24, "{} episodes ended", ended.len());
-        let other = EnvPool::new(5, (0..23).map(|_| Repose::new(&task)).collect::<Vec<_>>()).save();
+        let other = new_pool(23).save();
         let rows = restored.iter_mut().map(|rows| &mut rows[..]).collect();
         assert!(again.restore(&other, rows).is_err(), "the state of fewer environments must be refused");
     });

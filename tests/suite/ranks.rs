@@ -207,7 +207,7 @@ fn all_ranks_together_send_no_more_than_a_ring_would() {
         let mut agent = of_ranks(8, &settings(), 5, exchange);
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let steps = settings().epochs * settings().minibatches;
-        (agent.exchange.take_traffic().bytes, agent.ppo.policy().parameters.len(), steps)
+        (agent.exchange.take_traffic()[1].1, agent.ppo.policy().parameters.len(), steps)
     };
     for ranks in [2, 4] {
         let all = on_ranks(ranks, 8, work);

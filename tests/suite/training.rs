@@ -4,9 +4,10 @@ use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Symmetry;
-use shadow_repose::env::{End, Env, EnvPool, StepBuffers};
+use shadow_repose::env::{End, Env, EnvPool};
 use shadow_repose::ppo::Perception;
 use shadow_repose::quat::{self, Quat};
+use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, OBSERVATION_SIZE, Repose, SPACES};
 use shadow_repose::rng;
 
@@ -194,15 +195,14 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
         env.set_lesson(lesson);
         env
     });
-    let mut pool = EnvPool::new(3, envs.collect());
-    let (mut observations, mut last) = (vec![0.0; 8 * OBSERVATION_SIZE], vec![0.0; 8 * OBSERVATION_SIZE]);
+    let mut pool = EnvPool::new(3, envs.collect(), &Exchange::alone(1));
+    let mut observations = vec![0.0; 8 * OBSERVATION_SIZE];
     pool.reset(vec![&mut observations]);
     let mut redirected = 0;
     for _ in 0..200 {
         let before: Vec<_> = pool.envs_mut().map(|env| (env.goal(), env.episode().length)).collect();
-        let (rewards, ends) = (&mut [0.0; 8], &mut [None; 8]);
-        let buffers = StepBuffers { rewards, ends, observations: &mut observations, final_observations: &mut last };
-        pool.blocks_mut()[0].step(&[0.0; 160], buffers).unwrap();
+        pool.blocks[0].step(&[0.0; 160], &mut [0.0; 8], &mut observations).unwrap();
+        let (ends, last) = (pool.blocks[0].ends.clone(), pool.blocks[0].final_observations.clone());
         for (i, (env, (goal, length))) in pool.envs_mut().zip(before).enumerate() {
             let row = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
             let (seen, under_the_old) = (&observations[row.clone()], &last[row]);
