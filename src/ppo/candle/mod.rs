@@ -1,12 +1,13 @@
-//! The same computation with candle's tensors and automatic differentiation: slower, the reference for the
-//! kernels, and the place to try a change of the algorithm first. No other folder names candle's crate.
+//! The same computation with candle's tensors, layers and automatic differentiation: slower, the reference for the
+//! kernels, and the place to try a change of the algorithm first. No other folder names candle's crates.
 
 mod loss;
 
 use std::ops::Range;
 
 use anyhow::Result;
-use candle_core::{Device, Tensor, Var};
+use candle_core::{Device, Module, Tensor, Var};
+use candle_nn::Linear;
 
 use super::Policy;
 use super::backend::{GradientBackend, Losses};
@@ -85,8 +86,8 @@ fn forward(policy: &Policy, layers: &[Layer], x: &Tensor, variables: &mut Vec<(R
                 Activation::Tanh => x.tanh(),
             }?;
         }
-        let weight = variable(weight, &[*outputs, *inputs])?;
-        x = x.matmul(&weight.t()?)?.broadcast_add(&variable(bias, &[*outputs])?)?;
+        let layer = Linear::new(variable(weight, &[*outputs, *inputs])?, Some(variable(bias, &[*outputs])?));
+        x = layer.forward(&x)?;
     }
     Ok(x)
 }
