@@ -26,7 +26,7 @@ impl Acting<'_> {
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
         let (actions, means) = (&mut block.actions[acted.clone()], &mut block.means[acted]);
-        self.policy.both(observations, (means, &mut block.values[one.clone()]), work);
+        self.policy.actions_and_values(observations, (means, &mut block.values[one.clone()]), work);
         let std = self.policy.std();
         let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));

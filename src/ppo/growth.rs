@@ -94,7 +94,7 @@ mod tests {
     fn answers(ppo: &Ppo) -> Vec<f32> {
         let policy = ppo.policy().freeze();
         let (observations, mut means, mut values) = ([0.3, -2.0, 1.0, 0.0, 5.0, -0.1], [0.0; 4], [0.0; 2]);
-        policy.both(&observations, (&mut means, &mut values), &mut policy.workspace(2));
+        policy.actions_and_values(&observations, (&mut means, &mut values), &mut policy.workspace(2));
         means.into_iter().chain(values).collect()
     }
 

@@ -134,7 +134,12 @@ impl FrozenPolicy<'_> {
     }
 
     /// Writes both, mean actions and values, and reads the observations only once.
-    pub fn both(&self, observations: &[f32], (means, values): (&mut [f32], &mut [f32]), work: &mut Workspace) {
+    pub fn actions_and_values(
+        &self,
+        observations: &[f32],
+        (means, values): (&mut [f32], &mut [f32]),
+        work: &mut Workspace,
+    ) {
         self.forward(observations, &mut [(&self.actor, means), (&self.critic, values)], work);
     }
 
