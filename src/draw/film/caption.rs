@@ -1,32 +1,42 @@
 //! Text in the corner of a picture, on a darkened background.
 
-use anyhow::Result;
-use plotters::prelude::*;
-use plotters::style::register_font;
-
-/// The name of the font, whose letters are all of the same width.
-const FONT: &str = "monospace";
+use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 
 /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
-///
-/// # Errors
-/// Fails if the font cannot be used.
-pub(super) fn draw(rgb: &mut [u8], [width, height]: [u32; 2], lines: &[String]) -> Result<()> {
-    let _ = register_font(FONT, FontStyle::Normal, epaint_default_fonts::HACK_REGULAR);
-    let area = BitMapBackend::with_buffer(rgb, (width, height)).into_drawing_area();
-    let size = (f64::from(height) / 28.0).max(11.0);
-    let style = (FONT, size).into_font().color(&WHITE);
-    let (margin, spacing) = ((0.6 * size).ceil() as i32, (1.15 * size).ceil() as i32);
-    let mut longest = 0;
-    for line in lines {
-        longest = longest.max(style.font.box_size(line)?.0 as i32);
+pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
+    // All letters of this font have the same width.
+    let font = FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR).expect("the font is part of the program");
+    let [width, height] = size.map(|pixels| pixels as usize);
+    let scale = PxScale::from((height as f32 / 28.0).max(11.0));
+    let scaled = font.as_scaled(scale);
+    let (advance, spacing) = (scaled.h_advance(scaled.glyph_id('0')), (scaled.height() * 1.15).ceil());
+    let margin = (0.6 * scaled.height()).ceil();
+    let longest = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
+    let [across, down] = [longest as f32 * advance + 2.0 * margin, lines.len() as f32 * spacing + margin];
+    for row in rgb.chunks_exact_mut(3 * width).take(down as usize) {
+        let dark = &mut row[..3 * width.min(across as usize)];
+        dark.iter_mut().for_each(|channel| *channel = (u32::from(*channel) * 2 / 5) as u8);
     }
-    let corners = [(0, 0), (longest + 2 * margin, lines.len() as i32 * spacing + margin)];
-    area.draw(&Rectangle::new(corners, BLACK.mix(0.6).filled()))?;
     for (i, line) in lines.iter().enumerate() {
-        area.draw(&Text::new(&line[..], (margin, margin + spacing * i as i32), style.clone()))?;
+        let baseline = 0.5 * margin + i as f32 * spacing + scaled.ascent();
+        for (column, letter) in line.chars().enumerate() {
+            let place = point(margin + column as f32 * advance, baseline);
+            let Some(outline) = font.outline_glyph(scaled.glyph_id(letter).with_scale_and_position(scale, place))
+            else {
+                continue;
+            };
+            let corner = outline.px_bounds().min;
+            outline.draw(|x, y, cover| {
+                let (x, y) = (corner.x as i64 + i64::from(x), corner.y as i64 + i64::from(y));
+                if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
+                    let at = 3 * (y as usize * width + x as usize);
+                    let cover = cover.clamp(0.0, 1.0);
+                    let channels = &mut rgb[at..at + 3];
+                    channels.iter_mut().for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
+                }
+            });
+        }
     }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -37,10 +47,10 @@ mod tests {
     fn a_caption_changes_its_corner_only_and_what_does_not_fit_is_cut_off() {
         let size = [320, 240];
         let mut rgb = vec![100; 320 * 240 * 3];
-        draw(&mut rgb, size, &["goals 3".into(), "error 12°".into()]).unwrap();
+        draw(&mut rgb, size, &["goals 3".into(), "error 12°".into()]);
         assert!(rgb.iter().any(|&channel| channel > 200), "text is drawn");
         assert!(rgb[..3].iter().all(|&channel| channel == 40), "on a darkened background");
         assert!(rgb[rgb.len() / 2..].iter().all(|&channel| channel == 100), "the rest is unchanged");
-        draw(&mut rgb, size, &vec!["x".repeat(500); 100]).unwrap();
+        draw(&mut rgb, size, &vec!["x".repeat(500); 100]);
     }
 }

@@ -93,7 +93,7 @@ pub fn gif_of(frames: Vec<Frame>, format: FilmFormat) -> Result<Vec<u8>> {
 
 fn captioned(frames: impl IntoIterator<Item = Frame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
     frames.into_iter().map(move |(mut rgb, lines)| {
-        caption::draw(&mut rgb, format.size, &lines).expect("the font is part of the program");
+        caption::draw(&mut rgb, format.size, &lines);
         rgb
     })
 }
