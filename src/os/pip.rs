@@ -1,12 +1,20 @@
 //! Fetches wheels with pip, by package name and hash. The build script includes this file too, so it uses only the standard
 //! library.
+//!
+//! Neither the folder in which the program was started nor the user's settings of Python and pip change what is executed or
+//! fetched. Only what says where packages come from is taken from them.
 
-use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::{fs, io};
+use std::{env, fs, io};
+
+/// The settings of pip that say where packages come from.
+const SOURCES: [&str; 6] = ["index-url", "extra-index-url", "trusted-host", "cert", "client-cert", "proxy"];
+
+/// The variable that names pip's configuration file.
+const CONFIG: &str = "PIP_CONFIG_FILE";
 
 /// Downloads the wheel `package` (as `name==version`) with this sha256 and unpacks it into `folder`, which is recreated.
 ///
@@ -21,13 +29,43 @@ pub(crate) fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder
     fs::create_dir_all(folder).map_err(told)?;
     let requirement = folder.join("requirement.txt");
     fs::write(&requirement, format!("{package} --hash=sha256:{hash}\n")).map_err(told)?;
-    let pip = "-m pip download --quiet --disable-pip-version-check --retries 2 --no-deps --only-binary=:all: --require-hashes";
-    let places = ["-r".as_ref(), requirement.as_os_str(), "-d".as_ref(), folder.as_os_str()];
-    python(pip.split_whitespace().chain(selection.iter().copied()).map(OsStr::new).chain(places))?;
+    let mut pip = python(folder, "pip");
+    pip.args("download --quiet --disable-pip-version-check --retries 2 --no-deps --only-binary=:all:".split(' '));
+    pip.arg("--require-hashes").args(selection).arg("-r").arg(&requirement).arg("-d").arg(folder);
+    // With this name, pip reads no configuration file at all.
+    run(pip.envs(sources(folder)).env(CONFIG, "/dev/null"))?;
     let mut found = fs::read_dir(folder).map_err(told)?.flatten().map(|entry| entry.path());
     let wheel = found.find(|path| path.extension().is_some_and(|e| e == "whl"));
     let wheel = wheel.ok_or("pip reported success but left no wheel")?;
-    python(["-m".as_ref(), "zipfile".as_ref(), "-e".as_ref(), wheel.as_os_str(), folder.as_os_str()])
+    run(python(folder, "zipfile").arg("-e").arg(&wheel).arg(folder)).map(drop)
+}
+
+/// Returns the variables that tell pip where packages come from: the user's own or, where there is none, what the user's
+/// configuration files say.
+fn sources(folder: &Path) -> Vec<(String, String)> {
+    let config = env::var_os(CONFIG).map(|file| std::path::absolute(&file).unwrap_or(file.into()));
+    let listed = run(python(folder, "pip").args(["config", "list"]).envs(config.map(|file| (CONFIG, file))));
+    let listed = listed.unwrap_or_default();
+    let in_files = |name: &str| {
+        // One line is `section.name='value'`. What is said for this command alone counts more.
+        let of = |section: &str| {
+            let key = format!("{section}.{name}=");
+            listed
+                .lines()
+                .find_map(|line| line.strip_prefix(&key))
+                .map(|value| value.trim_matches(['\'', '"']).to_owned())
+        };
+        // Several values are separated by line feeds, which are shown escaped.
+        of("download").or_else(|| of("global")).map(|value| value.replace("\\n", " ").trim().to_owned())
+    };
+    let variable = |name: &str| format!("PIP_{}", name.replace('-', "_").to_uppercase());
+    let found = SOURCES.into_iter().filter_map(|name| {
+        let value = env::var(variable(name)).ok().or_else(|| in_files(name))?;
+        // The certificates are files, and pip runs in another folder.
+        let file = name.contains("cert").then(|| std::path::absolute(&value).ok()).flatten();
+        Some((variable(name), file.map_or(value, |file| file.display().to_string())))
+    });
+    found.collect()
 }
 
 /// The id of the running process, or 0. It leads its own process group, since python3 may be a script that starts another one.
@@ -42,11 +80,23 @@ pub(crate) fn stop() {
     }
 }
 
-/// Runs python3 with these arguments.
-fn python<'a>(args: impl IntoIterator<Item = &'a OsStr>) -> Result<(), String> {
+/// Returns the command that runs a module of Python, isolated from the user's folder, variables and own packages. It runs in
+/// `folder`, since the python3 of a version manager may look for its settings there.
+fn python(folder: &Path, module: &str) -> Command {
+    let mut command = Command::new("python3");
+    command.current_dir(folder).args(["-I", "-m", module]);
+    for (name, _) in env::vars_os() {
+        if ["PIP_", "PYTHON"].iter().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes())) {
+            command.env_remove(name);
+        }
+    }
+    command
+}
+
+/// Runs a command and returns what it prints.
+fn run(command: &mut Command) -> Result<String, String> {
     let told = |e: io::Error| format!("python3 could not be started ({e})");
-    let child = Command::new("python3")
-        .args(args)
+    let child = command
         .process_group(0)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -58,7 +108,7 @@ fn python<'a>(args: impl IntoIterator<Item = &'a OsStr>) -> Result<(), String> {
     AT_WORK.store(0, Ordering::Relaxed);
     let output = output.map_err(told)?;
     if output.status.success() {
-        return Ok(());
+        return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let lines: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).collect();

@@ -11,6 +11,8 @@ mod binary;
 mod docs;
 mod experiment;
 mod export;
+#[cfg(feature = "video")]
+mod fetching;
 mod fork;
 mod goal_times;
 mod mpi;

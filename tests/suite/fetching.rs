@@ -1,0 +1,80 @@
+//! Fetching the meshes: what Python runs, and what it is told.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use crate::support::{command, names};
+
+/// Draws a picture with an empty cache, for which the meshes are fetched. What the folder and the variables contain is hostile.
+fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) {
+    let args = ["view", "--screenshot", "hand.png", "--size", "64x64", "--quality", "fast"];
+    let mut command = command(folder, &args);
+    command.env("XDG_CACHE_HOME", cache).envs(variables.iter().copied());
+    command.output().unwrap();
+}
+
+#[test]
+fn no_file_in_the_users_folder_or_on_the_users_path_of_modules_is_executed() {
+    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let folder = place.path();
+    for module in ["pip", "zipfile", "typing", "random", "sitecustomize", "usercustomize"] {
+        fs::write(folder.join(format!("{module}.py")), "open('/proc/self/cwd/PWNED', 'w')\nraise SystemExit(0)\n")
+            .unwrap();
+    }
+    let before = names(folder);
+    let here = folder.to_str().unwrap();
+    // Nothing is fetched from an index where nobody listens.
+    let nowhere = ("PIP_INDEX_URL", "http://127.0.0.1:9/simple");
+    let startup = folder.join("pip.py");
+    draw(folder, cache.path(), &[nowhere, ("PYTHONPATH", here), ("PYTHONSTARTUP", startup.to_str().unwrap())]);
+    let made: Vec<String> = names(folder).into_iter().filter(|name| !before.contains(name)).collect();
+    assert!(made.iter().all(|name| name == "hand.png"), "{made:?}");
+}
+
+#[test]
+fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
+    let place = tempfile::tempdir().unwrap();
+    let [folder, bin, cache] = ["user", "bin", "cache"].map(|name| place.path().join(name));
+    [&folder, &bin, &cache].iter().for_each(|path| fs::create_dir(path).unwrap());
+    // A python3 that writes down how it was called, and answers as pip does.
+    let (python, log) = (bin.join("python3"), place.path().join("log"));
+    let script = format!(
+        "#!/bin/sh\n{{ echo \"RUN $*\"; echo \"IN $PWD\"; env | grep -E '^(PIP|PYTHON)'; }} >> '{}'\n\
+         [ \"$5\" = list ] || exit 1\n\
+         printf \"global.proxy='http://other'\\ndownload.proxy='http://proxy'\\nglobal.constraint='c'\\n\"\n\
+         printf \"global.extra-index-url='\\\\\\\\nhttp://a\\\\\\\\nhttp://b'\\n\"\n",
+        log.display()
+    );
+    fs::write(&python, script).unwrap();
+    fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", bin.display(), std::env::var("PATH").unwrap());
+    let kept =
+        [("PIP_INDEX_URL", "http://index"), ("PIP_CERT", "ca.pem"), ("PIP_CONFIG_FILE", "pip.conf"), ("PATH", &path)];
+    let dropped = [
+        ("PIP_CONSTRAINT", "c"),
+        ("PIP_REQUIRE_VIRTUALENV", "1"),
+        ("PIP_TARGET", "t"),
+        ("PIP_NO_INDEX", "1"),
+        ("PYTHONPATH", "p"),
+        ("PYTHONHOME", "h"),
+    ];
+    draw(&folder, &cache, &[&kept[..], &dropped].concat());
+    let log = fs::read_to_string(&log).unwrap();
+    let runs: Vec<&str> = log.split("RUN ").skip(1).collect();
+    let [list, download] = runs[..] else { panic!("{log}") };
+    for run in [list, download] {
+        assert!(run.starts_with("-I -m pip "), "{run}");
+        let place = run.lines().find_map(|line| line.strip_prefix("IN ")).unwrap();
+        assert!(Path::new(place).starts_with(cache.canonicalize().unwrap()), "{run}");
+        assert!(dropped.iter().all(|(name, _)| !run.contains(&format!("{name}="))), "{run}");
+    }
+    let conf = folder.join("pip.conf");
+    assert!(list.contains(&format!("PIP_CONFIG_FILE={}\n", conf.display())), "{list}");
+    let told =
+        ["CONFIG_FILE=/dev/null", "INDEX_URL=http://index", "EXTRA_INDEX_URL=http://a http://b", "PROXY=http://proxy"];
+    for line in told.map(|line| format!("PIP_{line}\n")) {
+        assert!(download.contains(&line), "{line}{download}");
+    }
+    assert!(download.contains(&format!("PIP_CERT={}\n", folder.join("ca.pem").display())), "{download}");
+}
