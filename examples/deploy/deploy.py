@@ -35,7 +35,10 @@ class Policy:
     def __init__(self, path):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # small products: more threads only wait for each other
-        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        try:
+            self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's errors have no common class
+            sys.exit(f"error: {path} is not an ONNX file that can be run: {error}")
         self.facts = self.session.get_modelmeta().custom_metadata_map
         if self.facts.get("hand") != HAND:
             sys.exit(f"error: {path} is for another hand: {self.facts.get('hand')}")
@@ -44,7 +47,10 @@ class Policy:
         return np.array([float(number) for number in self.facts[key].split(",")])
 
     def act(self, observation):
-        return self.session.run(["actions"], {"obs": observation[None]})[0][0]
+        action = self.session.run(["actions"], {"obs": observation[None]})[0][0]
+        if not np.isfinite(action).all():
+            sys.exit("error: the policy's actions are not finite")
+        return action
 
 
 class Hand:
@@ -251,11 +257,19 @@ def score(played):
 
 def check(policy, hand, trace):
     """Puts the hand into each state of a trace, and compares what is seen and done there. Returns the largest differences."""
-    header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
+    try:
+        header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {trace} is not a complete trace: {error}")
+    for key in header.keys() & hand.env.keys() - {"model"}:
+        if header[key] != hand.env[key]:
+            sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
     if header.get("noise") or header.get("bias"):
         sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
     largest, compared = [0.0, 0.0], 0
     for record, after in zip(records, records[1:] + [None]):
+        if not all(np.isfinite(record[key]).all() for key in ("qpos", "qvel", "obs", "action") if key in record):
+            sys.exit(f"error: {trace} has a value that is not finite")
         same = after is not None and after["episode"] == record["episode"]
         hand.place(record["qpos"], record["qvel"])
         # Where a goal was reached, the observation already shows the next one.
@@ -264,10 +278,11 @@ def check(policy, hand, trace):
         seen, expected = hand.observe(), np.array(record["obs"])
         if not same:  # the goal after an episode's last step is in no record
             seen[64:72] = expected[64:72]
-        largest[0] = max(largest[0], np.abs(seen - expected).max())
+        # Unlike max, this keeps a NaN.
+        largest[0] = np.maximum(largest[0], np.abs(seen - expected).max())
         if same:
             action = policy.act(seen)
-            largest[1] = max(largest[1], np.abs(action - np.clip(after["action"], -1, 1)).max())
+            largest[1] = np.maximum(largest[1], np.abs(action - np.clip(after["action"], -1, 1)).max())
             compared += 1
     print(f"{len(records)} observations: {largest[0]:.1e} off at most; {compared} actions: {largest[1]:.1e}")
     return largest[0] <= OBSERVATION_LIMIT and largest[1] <= ACTION_LIMIT and compared > 0
@@ -282,6 +297,8 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    if args.episodes < 1:
+        parser.error("--episodes must be at least 1")
     policy = Policy(args.policy)
     hand = Hand(policy, args.scene)
     if args.check:

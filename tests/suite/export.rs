@@ -99,6 +99,54 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
     assert!(!output.status.success() && stderr(&output).contains("noise or bias"), "{}", stderr(&output));
 }
 
+/// Writes copies of a policy and a trace with a NaN in them, in the way that the first argument names.
+const SPOIL: &str = "
+import json, sys
+import numpy, onnx
+model = onnx.load('policy.onnx')
+for initializer in model.graph.initializer:
+    if initializer.name == 'actor.3.bias':
+        initializer.CopyFrom(onnx.numpy_helper.from_array(numpy.full(20, numpy.nan, 'f4'), initializer.name))
+onnx.save(model, 'nan.onnx')
+header, *records = open('trace.jsonl').read().splitlines()
+for key in ('obs', 'action'):
+    record = json.loads(records[1])
+    record[key][3] = float('nan')
+    open(key, 'w').write('\\n'.join([header, records[0], json.dumps(record), *records[2:]]))
+open('cut', 'w').write('\\n'.join([header, *records])[:-50])
+open('empty', 'w').close()
+open('other', 'w').write('\\n'.join([header.replace('\"action_delay\":0', '\"action_delay\":2'), *records]))
+";
+
+#[test]
+fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another_task() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.5"];
+    succeeded(program(folder, &[&play[..], &["--trace", "trace.jsonl"]].concat()));
+    succeeded(program(folder, &["export", "--ckpt", "builtin", "--set", "env.max_episode_seconds=0.5"]));
+    runs(&python, folder, &["-c", SPOIL]);
+    let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
+    runs(&python, folder, &[deploy, "policy.onnx", "--check", "trace.jsonl"]);
+    let refused = [
+        (["nan.onnx", "--check", "trace.jsonl"], "actions are not finite"),
+        (["nan.onnx", "--episodes", "1"], "actions are not finite"),
+        (["policy.onnx", "--check", "obs"], "obs has a value that is not finite"),
+        (["policy.onnx", "--check", "action"], "action has a value that is not finite"),
+        (["policy.onnx", "--check", "other"], "env.action_delay = 2"),
+        (["policy.onnx", "--check", "cut"], "not a complete trace"),
+        (["policy.onnx", "--check", "empty"], "not a complete trace"),
+        (["policy.onnx", "--episodes", "0"], "at least 1"),
+        (["trace.jsonl", "--episodes", "1"], "not an ONNX file"),
+    ];
+    for (args, reason) in refused {
+        let output = Command::new(&python).arg(deploy).args(args).current_dir(folder).output().unwrap();
+        let said = stderr(&output);
+        assert!(!output.status.success() && said.contains(reason) && !said.contains("Traceback"), "{args:?}: {said}");
+    }
+}
+
 #[test]
 fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_know() {
     let folder = tempfile::tempdir().unwrap();
