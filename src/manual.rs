@@ -6,14 +6,22 @@ use clap_complete::Shell;
 use crate::cli::command;
 use crate::os;
 
+const PROGRAM: &str = "shadow-repose";
+
 /// Prints completions for a shell.
 ///
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn completions(shell: Shell) -> Result<()> {
-    let mut text = Vec::new();
-    clap_complete::generate(shell, &mut command(), "shadow-repose", &mut text);
-    os::print(&String::from_utf8(text)?)
+    let (mut text, mut program) = (Vec::new(), command());
+    if shell != Shell::Bash {
+        clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
+        return os::print(&String::from_utf8(text)?);
+    }
+    // For a name with a hyphen, clap_complete 4.6 writes a script whose commands have two names, and completes nothing after one.
+    clap_complete::generate(shell, &mut program.name("shadow_repose"), "shadow_repose", &mut text);
+    let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
+    os::print(&text)
 }
 
 /// Prints a manual page of all commands.
@@ -21,7 +29,7 @@ pub fn completions(shell: Shell) -> Result<()> {
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn man() -> Result<()> {
-    let mut program = command().name("shadow-repose");
+    let mut program = command().name(PROGRAM);
     program.build();
     let (mut page, whole) = (Vec::new(), clap_mangen::Man::new(program.clone()));
     whole.render_title(&mut page)?;

@@ -63,6 +63,43 @@ fn completions_and_a_manual_page_know_every_command() {
     assert!(page.starts_with(".ie") || page.starts_with(".TH"), "{page}");
 }
 
+/// Returns what a shell answers to a script.
+fn shell(name: &str, args: &[&str]) -> Option<String> {
+    let output = std::process::Command::new(name).args(args).output().ok()?;
+    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}
+
+#[test]
+fn shells_complete_options_and_values_after_a_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = |shell: &str| {
+        let path = folder.path().join(shell);
+        std::fs::write(&path, stdout(&["completions", shell])).unwrap();
+        path.display().to_string()
+    };
+    let (bash, fish) = (script("bash"), script("fish"));
+    let cases = [
+        (&["train", "--re"][..], "--resume"),
+        (&["play", "--rob"], "--robustness"),
+        (&["bench", "--only", "it"], "iteration"),
+        (&["completions", "zs"], "zsh"),
+        (&["pla"], "play"),
+    ];
+    for (words, expected) in cases {
+        let (line, last) = (words.join(" "), words.len());
+        let text = format!(
+            "source '{bash}'; f=$(complete -p shadow-repose | sed 's/.*-F \\([^ ]*\\).*/\\1/'); \
+             COMP_WORDS=(shadow-repose {line}); COMP_CWORD={last}; \
+             $f shadow-repose \"${{COMP_WORDS[{last}]}}\" \"${{COMP_WORDS[{last}-1]}}\"; echo \"${{COMPREPLY[*]}}\""
+        );
+        assert_eq!(shell("bash", &["-c", &text]).as_deref(), Some(expected), "bash: {line}");
+        let text = format!("source '{fish}'; complete -C 'shadow-repose {line}'");
+        if let Some(found) = shell("fish", &["--no-config", "-c", &text]) {
+            assert!(found.lines().any(|answer| answer.split('\t').next() == Some(expected)), "fish: {line}: {found}");
+        }
+    }
+}
+
 #[test]
 fn a_run_says_at_its_end_what_comes_next_in_the_way_it_was_called() {
     let folder = tempfile::tempdir().unwrap();
