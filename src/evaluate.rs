@@ -9,13 +9,13 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Result, anyhow};
+use anyhow::{Result, anyhow, ensure};
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use crate::env::{End, Env};
 use crate::os::Bar;
-use crate::ppo::{FrozenPolicy, Workspace};
+use crate::ppo::{FrozenPolicy, Policy, Workspace};
 use crate::ranks::Exchange;
 use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Score, Task};
 use crate::rng::{self, Rng};
@@ -118,12 +118,26 @@ pub struct Trial<'a> {
     pub stop: &'a AtomicBool,
 }
 
+/// What is said of a policy whose numbers overflow.
+const NOT_FINITE: &str = "the actions of the policy are not finite";
+
+/// Checks the policy's action at the start of an episode of this task: its weights may be finite and yet overflow.
+///
+/// # Errors
+/// Fails if the action is not finite.
+pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
+    let mut player = Player::new(task, Episodes::scored(0, 1));
+    player.step(&Actor::Mean(policy.freeze()));
+    ensure!(player.action.iter().all(|x| x.is_finite()), NOT_FINITE);
+    Ok(())
+}
+
 impl Trial<'_> {
     /// Plays the episodes and returns them in order, or `None` if they were interrupted. The observer sees the steps of one
     /// episode in order, interleaved with those of others.
     ///
     /// # Errors
-    /// Fails if the observer does, or, with the episode's number, if an episode panics.
+    /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics.
     pub fn play(&self, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<Option<Vec<EpisodeStats>>> {
         let played = self.play_lanes(0..LANES, observer)?;
         Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
@@ -185,6 +199,8 @@ impl Trial<'_> {
                     return Ok(None);
                 }
                 actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
+                let mut running = lanes.iter().zip(actions.chunks_exact(ACTION_SIZE)).filter(|(lane, _)| lane.running);
+                ensure!(running.all(|(_, action)| action.iter().all(|x| x.is_finite())), NOT_FINITE);
                 let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(ACTION_SIZE));
                 let rows = acted.zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE)).enumerate();
                 rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {

@@ -76,6 +76,14 @@ impl PolicySource {
         }
     }
 
+    /// Returns the file, unless it is built in.
+    pub fn file(&self) -> Option<&Path> {
+        match self {
+            Self::BuiltIn(_) => None,
+            Self::File(path) => Some(path),
+        }
+    }
+
     /// Reads the policy for use in any scene, whatever the one in which it was trained.
     ///
     /// # Errors

@@ -16,6 +16,7 @@ use crate::load::Loaded;
 use crate::os::{self, Requests, number};
 use crate::repose::{Score, Task};
 use crate::robustness::robustness;
+use crate::run;
 use crate::see;
 use crate::trace::Trace;
 
@@ -41,6 +42,10 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Some(loaded) => loaded.config.clone(),
         None => Config::resolve(None, &args.set)?.env,
     };
+    for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
+        let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
+        run::expect_output(output, policy.into_iter().chain(config.model_file()))?;
+    }
     os::start_threads(args.threads)?;
     if args.robustness {
         requests.wait_for_end();

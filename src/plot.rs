@@ -2,7 +2,7 @@
 //! evaluations are drawn at their own steps.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 
@@ -51,6 +51,8 @@ struct Run {
 /// be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
+    let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
+    run::expect_output(&args.out, tables.iter().map(PathBuf::as_path))?;
     let output = OutputFile::create(&args.out)?;
     draw::picture_format(&output)?;
     let asked = args.metric.iter().map(|name| (&name[..], None));

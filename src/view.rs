@@ -10,6 +10,7 @@ use crate::cli::{Motion, ViewArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
 use crate::os;
+use crate::run;
 use crate::see;
 
 /// The actors, and their names in a window.
@@ -31,6 +32,9 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
+    if let Some(path) = &args.screenshot {
+        run::expect_output(path, args.settings.config.as_deref().into_iter().chain(config.env.model_file()))?;
+    }
     let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
     let episodes = Episodes::scored(args.seed, usize::MAX);
     match &args.screenshot {

@@ -24,6 +24,7 @@ use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
 use crate::rng;
+use crate::run;
 use crate::schedule::in_rounds;
 use iteration::{PARTS, seconds_of_parts};
 use measure::{NEVER, median};
@@ -57,6 +58,10 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if args.only != Some(Part::Iteration) && (args.ckpt.is_some() || args.out.is_some()) {
         return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
     }
+    let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
+    if let Some(out) = &args.out {
+        run::expect_output(out, args.settings.config.as_deref().into_iter().chain(origin.file()))?;
+    }
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
     output.as_ref().map(draw::picture_format).transpose()?;
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
@@ -77,7 +82,6 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         tell(measure(&task, &config)?);
     }
     if args.only == Some(Part::Iteration) {
-        let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
         let seconds = seconds_of_parts(&task, &config, &origin)?;
         tell((PARTS.iter().zip(seconds).map(|((_, key), seconds)| (*key, seconds)).collect(), table(seconds)));
         output.map_or(Ok(()), |output| picture(&config, seconds).write(output))?;

@@ -9,9 +9,11 @@ use toml::{Table, Value};
 
 use crate::cli::ExportArgs;
 use crate::config::{EnvConfig, expect_used};
+use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os;
 use crate::repose::{ACTUATORS, Hand, OBSERVATION, Task};
+use crate::run;
 use graph::policy_graph;
 
 /// The hand that the policy was trained for, for programs that refuse another.
@@ -25,6 +27,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
+    expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
+    run::expect_output(&args.out, loaded.origin.file().into_iter().chain(loaded.config.model_file()))?;
     let output = os::OutputFile::create(&args.out)?;
     let bytes = policy_graph(&loaded.policy).file(metadata(&loaded, task.hand()));
     output.finish(&bytes)?;

@@ -80,8 +80,9 @@ impl Requests {
             if again || !self.patient.load(Ordering::Relaxed) {
                 pip::stop();
                 remove_unfinished();
-                if !saves {
-                    // Ends like a program that never caught the signal, so that the parent process sees the cause.
+                // Ends like a program that never caught the signal, so that the parent process sees the cause. The kernel
+                // does not let a signal end the first process of a container in this way.
+                if !saves && std::process::id() != 1 {
                     let _ = emulate_default_handler(signal);
                 }
                 exit(128 + signal);

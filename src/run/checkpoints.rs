@@ -9,6 +9,9 @@ use anyhow::Result;
 
 use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
 
+/// The folder of the checkpoints in that of a run.
+pub(super) const CHECKPOINTS: &str = "checkpoints";
+
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
 pub struct Checkpoints {
@@ -17,7 +20,7 @@ pub struct Checkpoints {
 
 impl Checkpoints {
     pub(super) fn new(run: &Path) -> Self {
-        Self { folder: run.join("checkpoints") }
+        Self { folder: run.join(CHECKPOINTS) }
     }
 
     /// Returns the path of the folder.

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::checkpoints::{Checkpoints, modified};
-use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
+use super::checkpoints::{CHECKPOINTS, Checkpoints, modified};
+use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, same_file, sync_folder, write_whole};
 
 /// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";
@@ -21,7 +21,9 @@ const DIVERGED: &str = "diverged";
 const STOP: &str = "stop";
 /// The prefixes of the names of a run's files.
 const OURS: [&str; 10] =
-    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", "checkpoints", OUR_PARTIAL];
+    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];
+/// The prefixes of the names of checkpoints and of dumps.
+const NUMBERED: [&str; 3] = ["iteration-", "latest.", "best."];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
@@ -237,6 +239,27 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     let checkpoints = RunFolder::containing(place)?.checkpoints();
     let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
+}
+
+/// Checks that an output replaces neither one of the files that are `read` nor a file that a run keeps. New names in the folder of
+/// a run are free.
+///
+/// # Errors
+/// Fails if it would, through whatever links.
+pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>) -> Result<()> {
+    if let Some(read) = read.into_iter().find(|read| same_file(path, read)) {
+        bail!("{}: would replace {}, which is read; choose another name", path.display(), read.display());
+    }
+    let Ok(whole) = path.canonicalize() else { return Ok(()) };
+    let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
+    let inner = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
+    let (run, names) = if inner { (folder.parent(), &NUMBERED[..]) } else { (Some(folder), &OURS[..]) };
+    let run = RunFolder { path: run.unwrap_or(folder).to_owned() };
+    let is_run = run.checkpoints().begun() || run.path.join(LOCK).exists();
+    let ours = names.iter().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()));
+    let place = run.path.display();
+    ensure!(!is_run || !ours, "{}: the run {place} keeps this file; choose another name", path.display());
+    Ok(())
 }
 
 /// Returns the folder of the newest run that has a checkpoint, if any.

@@ -12,8 +12,8 @@ mod table;
 
 pub use checkpoints::Checkpoints;
 pub use events::SETTINGS;
-pub use folder::{RunFolder, newest_run, resolve_checkpoint};
+pub use folder::{RunFolder, expect_output, newest_run, resolve_checkpoint};
 pub use histogram::{Histogram, histogram};
 pub use report::Report;
 pub use summary::{Animation, Descriptions, Media};
-pub use table::{MetricsTable, read_metrics};
+pub use table::{MetricsTable, read_metrics, table_of};

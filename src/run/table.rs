@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{BufReader, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 
@@ -36,13 +36,18 @@ pub struct MetricsTable {
     pub columns: HashMap<String, Vec<f64>>,
 }
 
+/// Returns the table that `place` means: a file, or that of a run folder.
+pub fn table_of(place: &Path) -> PathBuf {
+    if place.is_dir() { place.join(METRICS) } else { place.to_owned() }
+}
+
 /// Reads these columns of a table. A value is `NaN` if its cell is empty or cannot be drawn: infinite, or beyond 1e30. `place`
 /// is the file or its run folder.
 ///
 /// # Errors
 /// Fails if the file cannot be read, lacks a required column, has too many rows, or contains anything but numbers.
 pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<MetricsTable> {
-    let path = if place.is_dir() { place.join(METRICS) } else { place.to_owned() };
+    let path = table_of(place);
     let mut reader = BufReader::new(File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE));
     let mut line = Vec::new();
     next_row(&mut reader, &mut line).cannot("read", &path)?;

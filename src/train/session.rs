@@ -12,6 +12,7 @@ use super::start::{Plan, Takes};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
 use crate::config::Config;
+use crate::evaluate::expect_finite_actions;
 use crate::os;
 use crate::ppo::{Checkpoint, Evaluation};
 use crate::ranks::Exchange;
@@ -107,7 +108,8 @@ impl Session {
     fn start(&mut self, takes: Takes, mut checkpoint: Checkpoint) -> Result<()> {
         let agent = &mut self.agent;
         if let Takes::Policy = takes {
-            return agent.ppo.begin_with(&checkpoint);
+            agent.ppo.begin_with(&checkpoint)?;
+            return expect_finite_actions(&self.task, agent.ppo.policy());
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {

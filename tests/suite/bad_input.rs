@@ -6,7 +6,7 @@ use std::path::Path;
 
 use shadow_repose::ppo::{Array, Checkpoint};
 
-use crate::support::{program, stderr, succeeded, train};
+use crate::support::{names, program, stderr, succeeded, train};
 
 /// Fails unless the program exits with `code` and prints each of `parts` on stderr.
 #[track_caller]
@@ -251,4 +251,30 @@ fn usage_errors_exit_with_2() {
     refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["accepts only env.model"]);
     refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn a_policy_whose_actions_overflow_is_named_as_such_by_every_command() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let bytes = include_bytes!("../../assets/policies/repose.safetensors");
+    let header = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+    let facts: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).unwrap();
+    let offset = |i: usize| 8 + header + facts["actor.0.weight"]["data_offsets"][i].as_u64().unwrap() as usize;
+    let mut bytes = bytes.to_vec();
+    for (i, weight) in bytes[offset(0)..offset(1)].chunks_exact_mut(4).enumerate() {
+        let large = if i % 2 == 0 { 3e38_f32 } else { -3e38 };
+        weight.copy_from_slice(&large.to_le_bytes());
+    }
+    fs::write(folder.join("p.safetensors"), shadow_repose::ppo::sealed(&bytes).unwrap()).unwrap();
+    for args in [
+        &["play", "--ckpt", "p.safetensors", "--headless", "--episodes", "2"][..],
+        &["export", "--ckpt", "p.safetensors"],
+        &train(&["--init", "p.safetensors", "--run-dir", "run", "--set", "ppo.hidden=[512,256,128]"]),
+    ] {
+        let output = program(folder, args);
+        assert_eq!(output.status.code(), Some(1), "{args:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains("actions of the policy are not finite"), "{args:?}: {}", stderr(&output));
+    }
+    assert_eq!(names(folder), ["p.safetensors"]);
 }

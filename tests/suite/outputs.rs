@@ -4,11 +4,11 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::process::ExitStatusExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::support::{SCENE, command, names, program, stderr, succeeded, train};
+use crate::support::{SCENE, command, must_be_possible, names, program, stderr, succeeded, train};
 
 /// The arguments for very short episodes.
 const SHORT: [&str; 6] = ["play", "--policy", "zero", "--set", "env.max_episode_seconds=0.1", "--headless"];
@@ -106,6 +106,41 @@ fn a_trace_that_is_interrupted_leaves_nothing_behind() {
         );
         // As for a program without handlers; a shell reports 128 plus the signal's number.
         assert_eq!(child.wait().unwrap().signal(), Some(number));
+        assert_eq!(names(folder), [""; 0], "{signal}");
+    }
+}
+
+#[test]
+fn as_the_first_process_of_a_container_it_ends_with_128_and_the_number_of_the_signal() {
+    let isolates =
+        |flags: &str| Command::new("unshare").args([flags, "--fork", "true"]).status().is_ok_and(|s| s.success());
+    let Some(flags) = ["--pid", "-Urp"].into_iter().find(|flags| isolates(flags)) else {
+        must_be_possible("a container: unshare is missing or not permitted");
+        return;
+    };
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    for (signal, code) in [("TERM", 143), ("INT", 130), ("HUP", 129)] {
+        let mut unshare = Command::new("unshare");
+        unshare.args([
+            flags,
+            "--fork",
+            env!("CARGO_BIN_EXE_shadow-repose"),
+            "play",
+            "--policy",
+            "random",
+            "--headless",
+        ]);
+        unshare.args(["--episodes", "100000", "--trace", "trace"]).current_dir(folder).stderr(Stdio::null());
+        let mut unshare = unshare.spawn().unwrap();
+        let begun = Instant::now();
+        while names(folder).is_empty() && begun.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let id = unshare.id();
+        let child = fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap();
+        assert!(Command::new("kill").args([&format!("-{signal}"), child.trim()]).status().unwrap().success());
+        assert_eq!(unshare.wait().unwrap().code(), Some(code), "{signal}");
         assert_eq!(names(folder), [""; 0], "{signal}");
     }
 }
@@ -287,5 +322,54 @@ fn plot_ends_on_any_file_soon_and_says_little() {
     for file in ["one-line.csv", "/dev/zero"] {
         let (code, said) = plot(&[file]);
         assert!(code == Some(1) && said.len() < 500, "{file}: {} characters", said.len());
+    }
+}
+
+#[test]
+fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    succeeded(program(folder, &train(&["--total-steps", "256", "--run-dir", "run"])));
+    fs::copy(folder.join("run/policy.safetensors"), folder.join("p.safetensors")).unwrap();
+    fs::hard_link(folder.join("p.safetensors"), folder.join("hard.svg")).unwrap();
+    std::os::unix::fs::symlink("p.safetensors", folder.join("soft.svg")).unwrap();
+    std::os::unix::fs::symlink("run", folder.join("other")).unwrap();
+    fs::copy(folder.join("run/metrics.csv"), folder.join("table.svg")).unwrap();
+    fs::write(folder.join("scene.xml"), SCENE).unwrap();
+    let content = |path: PathBuf| (path.clone(), fs::read(path).unwrap());
+    let files = ["run", "run/checkpoints", "."].map(|inner| {
+        let names = names(&folder.join(inner)).into_iter().map(|name| folder.join(inner).join(name));
+        names.filter(|path| path.is_file()).map(content).collect::<Vec<_>>()
+    });
+    let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
+    let own = ["--ckpt", "p.safetensors"];
+    let refused: [(&[&str], &[&str], &str); 14] = [
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "p.safetensors"], "is read"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "./run/../p.safetensors"], "is read"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "is read"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "soft.svg"], "is read"),
+        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/best.safetensors"], "is read"),
+        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "keeps this file"),
+        (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "keeps this file"),
+        (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "keeps this file"),
+        (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "is read"),
+        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "keeps this file"),
+        (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "is read"),
+        (&["play", "--robustness", "--out", "hard.svg"], &own, "is read"),
+        (&["plot", "table.svg"], &["--out", "table.svg"], "is read"),
+        (&["bench", "--only", "iteration", "--out", "soft.svg"], &own, "is read"),
+    ];
+    for (command, more, reason) in refused {
+        let output = program(folder, &[command, more].concat());
+        assert_eq!(output.status.code(), Some(1), "{more:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(reason), "{more:?}: {}", stderr(&output));
+    }
+    for (path, before) in files.into_iter().flatten() {
+        assert!(fs::read(&path).unwrap() == before, "{} has changed", path.display());
+    }
+    // New names are free, and what is not the program's may be replaced.
+    for _ in 0..2 {
+        succeeded(program(folder, &["export", "--ckpt", "run", "--out", "run/policy.onnx"]));
+        succeeded(program(folder, &["export", "--ckpt", "run", "--out", "run/checkpoints/mine.onnx"]));
     }
 }
