@@ -45,7 +45,7 @@
 //!
 //! `env` and `ppo` do not depend on each other: they meet in `agent`, `evaluate` and the modules above. `run` depends on
 //! neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal) is
-//! confined to one folder, unsafe code to six files.
+//! confined to one folder, unsafe code to seven files.
 //!
 //! # Data path of an iteration
 //! There are N environments in blocks of n, T steps, and O and A values in an observation and an action. A block's arrays

@@ -10,7 +10,7 @@ use anyhow::{Context, Error, Result, bail};
 
 use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::os;
-use crate::ppo::{Checkpoint, Damaged, Policy};
+use crate::ppo::{Checkpoint, Damaged, Policy, expect_safetensors};
 use crate::repose::SPACES;
 use crate::run;
 
@@ -172,7 +172,8 @@ impl Loaded {
 /// # Errors
 /// Fails if the file cannot be read, is damaged, or is not one of this program.
 pub fn read(path: &Path) -> Result<Checkpoint> {
-    Checkpoint::parse(&os::read_bytes(path)?).with_context(|| cannot_use(path))
+    let bytes = os::read_bytes_if(path, |start| expect_safetensors(start).with_context(|| cannot_use(path)))?;
+    Checkpoint::parse(&bytes).with_context(|| cannot_use(path))
 }
 
 /// Returns the first of these files (newest first) that is not damaged, and prints a warning for each one before it. A file that

@@ -1,7 +1,7 @@
 //! Learning curves: metrics of one or more runs over control steps or hours. What training logs in each iteration is smoothed,
 //! evaluations are drawn at their own steps.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
@@ -90,7 +90,8 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         runs.iter().map(|run| run.name.clone()).collect()
     };
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
-    os::say(&format!("{}: {} runs", args.out.display(), runs.len()));
+    let plural = if runs.len() == 1 { "" } else { "s" };
+    os::say(&format!("{}: {} run{plural}", args.out.display(), runs.len()));
     Ok(())
 }
 
@@ -100,7 +101,13 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
 /// Fails if none of them can be drawn.
 fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
     let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
+    let mut known = HashSet::new();
     for (i, place) in args.runs.iter().enumerate() {
+        // A run by two names, e.g. through a link `latest`, is one run.
+        let whole = run::table_of(place).canonicalize();
+        if whole.is_ok_and(|whole| !known.insert(whole)) {
+            continue;
+        }
         let rows = run::read_metrics(place, &ALONG, wanted).and_then(|table| {
             ensure!(!table.columns[ALONG[0]].is_empty(), "{}: no rows yet", place.display());
             Ok(table)

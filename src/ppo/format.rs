@@ -100,18 +100,24 @@ fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) ->
     Ok(bytes)
 }
 
+/// Checks the beginning of a file, at least 8 bytes of it if it has as many: what is something else is called that.
+///
+/// # Errors
+/// Fails if the bytes do not begin as those of a safetensors file.
+pub fn expect_safetensors(bytes: &[u8]) -> Result<()> {
+    ensure!(!bytes.starts_with(b"version "), "a Git LFS pointer: `git lfs pull` fetches the file itself");
+    ensure!(!(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)), "an ONNX file, not a safetensors file");
+    let length = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
+    ensure!(length <= LARGEST_HEADER, Damaged("not a safetensors file".into()));
+    Ok(())
+}
+
 /// The texts of a file, and its arrays sorted by name.
 type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
 
 fn read(bytes: &[u8]) -> Result<Raw<'_>> {
+    expect_safetensors(bytes)?;
     let whole = |error| Damaged(format!("not a complete safetensors file ({error}); it may be cut off"));
-    if let Some(length) = bytes.first_chunk() {
-        let length = u64::from_le_bytes(*length);
-        ensure!(
-            length <= LARGEST_HEADER,
-            Damaged(format!("its header claims {length} bytes; at most {LARGEST_HEADER} are allowed"))
-        );
-    }
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
     let texts = header.metadata().clone().context("no metadata: not a file of this program")?;
     let mut views = SafeTensors::deserialize(bytes).map_err(whole)?.tensors();
@@ -256,7 +262,21 @@ mod tests {
         let mut bytes = content().to_bytes().unwrap();
         for length in [LARGEST_HEADER + 1, 1 << 40, u64::MAX] {
             bytes[..8].copy_from_slice(&length.to_le_bytes());
-            assert!(refusal(&bytes).contains("at most"));
+            assert!(refusal(&bytes).contains("not a safetensors file"));
+        }
+    }
+
+    #[test]
+    fn what_is_no_safetensors_file_is_called_what_it_is() {
+        for (text, what) in [
+            (&b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"[..], "a Git LFS pointer"),
+            (b"\x08\x08\x12\x0dshadow-repose", "an ONNX file"),
+            (b"<!DOCTYPE html><html></html>", "not a safetensors file"),
+            (b"PK\x03\x04\x14\x00\x00\x00\x08", "not a safetensors file"),
+            (b"iteration,env_steps\n", "not a safetensors file"),
+            (b"", "not a complete safetensors file"),
+        ] {
+            assert!(refusal(text).contains(what), "{}", refusal(text));
         }
     }
 

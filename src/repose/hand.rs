@@ -22,6 +22,9 @@ pub const ACTUATORS: [&str; ACTION_SIZE] = [
 /// The name of the body that the hand turns.
 pub(super) const CUBE: &str = "cube";
 
+/// The name of the body that shows the goal.
+const TARGET: &str = "target";
+
 /// Fingertip bodies in observation order, as named in the scene.
 pub const FINGERTIPS: [&str; 5] = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"];
 
@@ -47,8 +50,24 @@ impl Hand {
     /// Finds every name in `scene`, in whatever order they appear in its file.
     ///
     /// # Errors
-    /// Fails with the first name that is missing or belongs to something else.
+    /// Fails with all names that are missing, or with the first one that belongs to something else.
     pub fn bind(scene: &Scene) -> Result<Self> {
+        let named = |kind: &'static str, begin: &'static str, names: &'static [&'static str]| {
+            names.iter().map(move |name| (kind, format!("{begin}{name}")))
+        };
+        let lists = [
+            named("joint", "rh_", &JOINTS),
+            named("actuator", "rh_A_", &ACTUATORS),
+            named("body", "", &FINGERTIPS),
+            named("body", "", &[CUBE, TARGET]),
+        ];
+        let missing: Vec<String> = lists
+            .into_iter()
+            .flatten()
+            .filter(|(kind, name)| !scene.has(kind, name))
+            .map(|(kind, name)| format!("{kind} `{name}`"))
+            .collect();
+        ensure!(missing.is_empty(), "has no {}", missing.join(", "));
         let joints = each(JOINTS, |joint| scene.hinge(&format!("rh_{joint}")))?;
         let driven = each(ACTUATORS, |actuator| Ok(driven_by(actuator)))?;
         let actuators = each(ACTUATORS, |actuator| {
@@ -71,7 +90,7 @@ impl Hand {
             fingertips,
             root: scene.root(fingertips[0]),
             cube: scene.free_body(CUBE)?,
-            target: scene.mocap("target")?,
+            target: scene.mocap(TARGET)?,
         })
     }
 }

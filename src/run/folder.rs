@@ -4,6 +4,7 @@ use std::ffi::{OsStr, OsString};
 use std::fs::{self, DirEntry};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 
@@ -33,15 +34,22 @@ pub(super) const METRICS: &str = "metrics.csv";
 #[derive(Clone, Debug)]
 pub struct RunFolder {
     path: PathBuf,
+    /// The time of a file `stop` that was there before this session.
+    stop_before: Option<SystemTime>,
 }
 
 impl RunFolder {
+    fn at(path: PathBuf) -> Self {
+        let stop_before = modified(&path.join(STOP));
+        Self { path, stop_before }
+    }
+
     /// Creates the folder of a new run: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
     ///
     /// # Errors
     /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
-        let run = Self { path: path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))? };
+        let run = Self::at(path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))?);
         run.expect_free(None)?;
         let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
         created.cannot("create the run folder", &run.path)?;
@@ -58,7 +66,9 @@ impl RunFolder {
         let mut names = self.entries()?.into_iter().map(|entry| entry.file_name());
         // An unfinished trace does not belong to a run.
         let of_a_run = |name: &OsString| !name.as_encoded_bytes().starts_with(OUR_PARTIAL.as_bytes());
-        if let Some(name) = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but)) {
+        let half_begun = self.is_half_begun()?;
+        let name = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but));
+        if let Some(name) = name.filter(|_| !half_begun) {
             bail!(
                 "{} already holds a run, or part of one ({}); resume it with --resume, or choose another folder",
                 self.path.display(),
@@ -68,11 +78,21 @@ impl RunFolder {
         let whole = std::path::absolute(&self.path).cannot("find", &self.path)?;
         let there = whole.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
-        for folder in above.map(|path| Self { path: path.to_owned() }) {
+        for folder in above.map(|path| Self::at(path.to_owned())) {
             let holds_a_run = folder.checkpoints().begun() || folder.path.join(LOCK).exists();
             ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
         }
         Ok(())
+    }
+
+    /// Whether a training was killed here before its first checkpoint was complete: the same command may begin again.
+    fn is_half_begun(&self) -> Result<bool> {
+        let early = |name: &OsString| {
+            let begins = [LOCK, POLICY, CHECKPOINTS, OUR_PARTIAL].iter();
+            begins.clone().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()))
+        };
+        let all_early = self.entries()?.iter().all(|entry| early(&entry.file_name()));
+        Ok(all_early && self.path.join(LOCK).exists() && !self.checkpoints().begun())
     }
 
     /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
@@ -81,7 +101,7 @@ impl RunFolder {
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        Ok(Self { path: folder.cannot("create a folder in", &std::env::temp_dir())?.keep() })
+        Ok(Self::at(folder.cannot("create a folder in", &std::env::temp_dir())?.keep()))
     }
 
     /// Removes the files of a run that could not start, and its folder if nothing else is in it.
@@ -110,8 +130,8 @@ impl RunFolder {
         let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
         let run = folder.and_then(Path::parent).filter(|run| Some(Checkpoints::new(run).folder()) == folder);
         match run {
-            Some(run) => Ok(Self { path: run.to_owned() }),
-            None if place.is_dir() => Ok(Self { path: place.to_owned() }),
+            Some(run) => Ok(Self::at(run.to_owned())),
+            None if place.is_dir() => Ok(Self::at(place.to_owned())),
             None => bail!("{} does not lie in the checkpoints folder of a run", whole.display()),
         }
     }
@@ -169,9 +189,12 @@ impl RunFolder {
         Ok(found)
     }
 
-    /// Returns whether the user has asked the training to stop by a file with the name `stop`, and removes it.
+    /// Returns whether the user has asked the training to stop by an empty file with the name `stop`, and removes it. Any other
+    /// file of that name, and one that was there before, is the user's.
     pub fn take_stop(&self) -> bool {
-        fs::remove_file(self.path.join(STOP)).is_ok()
+        let path = self.path.join(STOP);
+        let is_request = fs::symlink_metadata(&path).is_ok_and(|facts| facts.is_file() && facts.len() == 0);
+        is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
     }
 
     /// Returns the path of the folder.
@@ -254,7 +277,7 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>) 
     let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
     let inner = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
     let (run, names) = if inner { (folder.parent(), &NUMBERED[..]) } else { (Some(folder), &OURS[..]) };
-    let run = RunFolder { path: run.unwrap_or(folder).to_owned() };
+    let run = RunFolder::at(run.unwrap_or(folder).to_owned());
     let is_run = run.checkpoints().begun() || run.path.join(LOCK).exists();
     let ours = names.iter().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()));
     let place = run.path.display();
@@ -264,7 +287,7 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>) 
 
 /// Returns the folder of the newest run that has a checkpoint, if any.
 pub fn newest_run() -> Option<PathBuf> {
-    let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder { path: entry.path() });
+    let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder::at(entry.path()));
     // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.
     runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, run.path))).max().map(|(_, path)| path)
 }
@@ -309,7 +332,7 @@ mod tests {
         let victim = place.path().join("victim");
         fs::write(&victim, "precious").unwrap();
         for name in ["run.lock", "metrics.csv", "events.out.tfevents.1.2.shadow-repose", "checkpoints/x.partial"] {
-            let run = RunFolder { path: place.path().join("run") };
+            let run = RunFolder::at(place.path().join("run"));
             run.checkpoints().create_folder().unwrap();
             std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
@@ -318,7 +341,7 @@ mod tests {
         }
         // A link that appears later is replaced, not written through.
         std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
-        RunFolder { path: place.path().into() }.describe("a = 1", "1").unwrap();
+        RunFolder::at(place.path().into()).describe("a = 1", "1").unwrap();
         assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
     }
 
@@ -337,20 +360,20 @@ mod tests {
         let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
         let left = run.checkpoints().folder().join(".shadow-repose-999999999-0.partial");
         fs::write(&left, "half").unwrap();
-        let living = place.path().join(format!(".shadow-repose-{}-9999.partial", std::process::id()));
-        fs::write(&living, "of a trace that is being written").unwrap();
+        let living = crate::os::OutputFile::create(&place.path().join("trace")).unwrap();
         assert!(run.checkpoints().newest_first().is_empty());
         drop(lock);
         let lock = run.lock().unwrap();
         assert!(left.exists(), "locking alone removes nothing");
         run.claim(lock).unwrap();
-        assert!(!left.exists() && living.exists());
+        assert!(!left.exists());
+        living.finish(b"all of a trace").unwrap();
     }
 
     #[test]
     fn a_folder_with_any_part_of_a_run_or_inside_one_is_not_taken() {
         let place = tempfile::tempdir().unwrap();
-        for name in ["policy.safetensors", "run.lock", "metrics.csv", "events.out.tfevents.1.1.x"] {
+        for name in ["policy.safetensors", "metrics.csv", "events.out.tfevents.1.1.x"] {
             let folder = place.path().join(format!("has-{name}"));
             fs::create_dir(&folder).unwrap();
             fs::write(folder.join(name), "foreign").unwrap();

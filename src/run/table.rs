@@ -48,6 +48,8 @@ pub fn table_of(place: &Path) -> PathBuf {
 /// Fails if the file cannot be read, lacks a required column, has too many rows, or contains anything but numbers.
 pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<MetricsTable> {
     let path = table_of(place);
+    let odd = place.is_dir() && path.exists() && !path.is_file();
+    ensure!(!odd, "cannot read {}: not a regular file", path.display());
     let mut reader = BufReader::new(File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE));
     let mut line = Vec::new();
     next_row(&mut reader, &mut line).cannot("read", &path)?;

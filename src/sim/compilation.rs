@@ -1,9 +1,14 @@
 //! How a scene is compiled: what MuJoCo cannot change in a compiled model, and the options.
 
+#![expect(unsafe_code, reason = "the wrapper cuts off what MuJoCo says of a file")]
+
+use std::ffi::{CStr, CString};
 use std::fmt::Display;
 use std::path::Path;
+use std::ptr;
 
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
+use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
 use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
 use serde::{Deserialize, Serialize};
@@ -50,10 +55,16 @@ impl Compilation {
     /// # Errors
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
+        let is_folder = file.is_some_and(Path::is_dir);
+        ensure!(!is_folder, "env.model must name a MuJoCo scene, but this is a folder");
         let exists = file.is_none_or(Path::is_file);
         ensure!(exists, "env.model must name a MuJoCo scene, but there is no such file");
         if self.size == 1.0 && !self.shifts {
-            return file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml).map_err(refused);
+            let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
+            if let Ok(model) = model {
+                return Ok(model);
+            }
+            // The wrapper cuts off the message of this way at 100 bytes; the other way gives it whole.
         }
         self.spec(file)?.compile().map_err(refused)
     }
@@ -64,7 +75,10 @@ impl Compilation {
     /// Fails if MuJoCo cannot read the scene, if it has no such body, or if the body has a mesh.
     pub(super) fn spec(&self, file: Option<&Path>) -> Result<MjSpec> {
         let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
-        let mut spec = spec.map_err(refused)?;
+        let mut spec = spec.map_err(|error| match file.and_then(parse_error) {
+            Some(whole) => refused(whole),
+            None => refused(error),
+        })?;
         if self.size == 1.0 && !self.shifts {
             return Ok(spec);
         }
@@ -88,6 +102,22 @@ impl Compilation {
             Cone::Elliptic => model.opt_mut().cone = MjtCone::mjCONE_ELLIPTIC as i32,
         }
     }
+}
+
+/// Returns all that MuJoCo says of a file that it cannot parse. The wrapper's message has at most 99 bytes.
+fn parse_error(file: &Path) -> Option<String> {
+    let name = CString::new(file.to_str()?).ok()?;
+    let mut message = [0_u8; 4096];
+    // SAFETY: the name ends with a zero, and MuJoCo writes no more than so many bytes. What it returns is deleted once.
+    unsafe {
+        let spec = mj_parseXML(name.as_ptr(), ptr::null(), message.as_mut_ptr().cast(), message.len() as i32);
+        if !spec.is_null() {
+            mj_deleteSpec(spec);
+            return None;
+        }
+    }
+    let message = CStr::from_bytes_until_nul(&message).ok()?;
+    Some(message.to_string_lossy().trim().to_owned())
 }
 
 fn refused(error: impl Display) -> Error {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 use mujoco_rs::prelude::{
-    MjModel, MjtBias, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
+    MjModel, MjtBias, MjtDyn, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
 };
 
 use super::Look;
@@ -206,10 +206,25 @@ impl Scene {
         }
         let is_servo = self.is_position_servo(id);
         ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
+        let is_angle = self.model.actuator_gear()[id][0] == 1.0;
+        ensure!(is_angle, "actuator `{name}` must have a gear of 1: its control is an angle");
+        let is_direct =
+            self.model.actuator_dyntype()[id] == MjtDyn::mjDYN_NONE && self.model.actuator_delay()[id] == 0.0;
+        ensure!(is_direct, "actuator `{name}` must act at once: without activation dynamics (timeconst) and delay");
         let ctrl = self.model.actuator_ctrladr()[id] as usize;
         let one_limited = self.model.actuator_ctrlnum()[id] == 1 && self.model.actuator_ctrllimited()[ctrl];
         ensure!(one_limited, "actuator `{name}` must have one control with a ctrlrange");
         Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
+    }
+
+    /// Returns whether the scene has a joint, an actuator or a body of this name.
+    pub fn has(&self, kind: &str, name: &str) -> bool {
+        let kind = match kind {
+            "joint" => MjtObjBase::mjOBJ_JOINT,
+            "actuator" => MjtObjBase::mjOBJ_ACTUATOR,
+            _ => MjtObjBase::mjOBJ_BODY,
+        };
+        self.model.name_to_id(kind, name).is_some()
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {

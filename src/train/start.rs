@@ -105,7 +105,11 @@ impl Plan {
         }
         let folder = RunFolder::containing(&place)?;
         let checkpoints = folder.checkpoints();
-        ensure!(!checkpoints.newest_first().is_empty(), "{} holds no checkpoint", place.display());
+        ensure!(
+            !checkpoints.newest_first().is_empty(),
+            "{} holds no checkpoint; what ended before its first one is begun again by the command that began it",
+            place.display()
+        );
         let lock = folder.lock()?;
         let newest = checkpoints.newest_first();
         let (path, checkpoint) = load::newest_sound(&checkpoints_at(&place)?)

@@ -395,7 +395,7 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     let header = fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap().lines().next().unwrap().to_owned();
     fs::write(folder.path().join("begun/metrics.csv"), header + "\n").unwrap();
     let said = stderr(&succeeded(program(folder.path(), &["plot", "begun", "run", "nowhere"])));
-    for part in ["begun: no rows yet; skipped", "warning: cannot read nowhere", "1 runs"] {
+    for part in ["begun: no rows yet; skipped", "warning: cannot read nowhere", ": 1 run\n"] {
         assert!(said.contains(part), "{part} is not in {said}");
     }
     let refused = program(folder.path(), &["plot", "nowhere", "begun"]);
@@ -410,6 +410,14 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
         assert!(stderr(&refused).contains(part), "{}", stderr(&refused));
         assert!(!stderr(&refused).contains("warning"), "it is said once: {}", stderr(&refused));
     }
+    // One run by two names is one run, and a table that is no file is not waited for.
+    std::os::unix::fs::symlink("run", folder.path().join("latest")).unwrap();
+    let said = stderr(&succeeded(program(folder.path(), &["plot", "run", "latest", "run/metrics.csv"])));
+    assert!(said.contains(": 1 run\n"), "{said}");
+    fs::create_dir(folder.path().join("pipe")).unwrap();
+    let made = std::process::Command::new("mkfifo").arg(folder.path().join("pipe/metrics.csv")).status().unwrap();
+    let refused = program(folder.path(), &["plot", "pipe"]);
+    assert!(made.success() && stderr(&refused).contains("not a regular file"), "{}", stderr(&refused));
     // A column that only one of them has.
     let table = fs::read_to_string(folder.path().join("other/metrics.csv")).unwrap().replace("loss/value", "loss/old");
     fs::write(folder.path().join("other/metrics.csv"), table).unwrap();

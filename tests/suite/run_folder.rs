@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
-use crate::support::{command, names, program, stderr, succeeded, train};
+use crate::support::{command, must_be_possible, names, program, stderr, succeeded, train};
 use crate::survival::{begun, ended_by, endless, iterations, result, resume, send};
 
 #[test]
@@ -93,6 +93,85 @@ fn two_trainings_in_one_folder_are_refused_and_a_crash_leaves_no_lock() {
     child.wait().unwrap();
     drop(lines);
     succeeded(resume(folder.path(), &["--total-steps", "128"]));
+}
+
+/// Compiles a library that makes file locks fail, as on a file system without them.
+fn without_locks(folder: &Path) -> Option<String> {
+    let (source, library) = (folder.join("no_locks.c"), folder.join("no_locks.so"));
+    let text = "#include <errno.h>\nint flock(int f, int o) { (void)f; (void)o; errno = ENOLCK; return -1; }\n";
+    fs::write(&source, text).unwrap();
+    let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&library, &source]).status();
+    if !compiled.is_ok_and(|status| status.success()) {
+        must_be_possible("a file system without locks: there is no C compiler");
+        return None;
+    }
+    Some(library.display().to_string())
+}
+
+#[test]
+fn where_there_are_no_locks_a_second_training_is_kept_out_as_well() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(library) = without_locks(folder.path()) else { return };
+    let run = |args: &[&str]| {
+        let mut command = command(folder.path(), args);
+        command.env("LD_PRELOAD", &library);
+        command
+    };
+    let args = train(&["--total-steps", "100000000", "--run-dir", "run"]);
+    let (child, lines) = begun(run(&args));
+    let second = run(&["train", "--resume", "run"]).output().unwrap();
+    assert_eq!(second.status.code(), Some(1));
+    let who = format!("another program: process {} on ", child.id());
+    assert!(stderr(&second).contains(&who) && stderr(&second).contains("no file locks"), "{}", stderr(&second));
+    // After it has ended, the next one need not wait.
+    let (code, _) = ended_by("TERM", child, lines);
+    assert_eq!(code, Some(143));
+    let third = succeeded(run(&["train", "--resume", "run", "--total-steps", "128"]).output().unwrap());
+    let said = stderr(&third);
+    assert!(said.contains("is finished") || said.contains("there are no file locks in run"), "{said}");
+}
+
+#[test]
+fn a_training_that_was_killed_before_its_first_checkpoint_is_begun_again_by_the_same_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let args = train(&["--total-steps", "128", "--run-dir", "run"]);
+    for left in [&["run.lock"][..], &["run.lock", "policy.safetensors", "checkpoints/.shadow-repose-1-0.partial"]] {
+        fs::create_dir_all(run.join("checkpoints")).unwrap();
+        left.iter().for_each(|name| fs::write(run.join(name), "").unwrap());
+        let refused = resume(folder.path(), &[]);
+        assert!(stderr(&refused).contains("begun again by the command that began it"), "{}", stderr(&refused));
+        succeeded(program(folder.path(), &args));
+        assert!(!run.join("checkpoints/.shadow-repose-1-0.partial").exists());
+        fs::remove_dir_all(&run).unwrap();
+    }
+    // What has settings and logs has lost its checkpoints, but is a run.
+    fs::create_dir_all(&run).unwrap();
+    ["run.lock", "config.toml"].iter().for_each(|name| fs::write(run.join(name), "").unwrap());
+    assert_eq!(program(folder.path(), &args).status.code(), Some(1));
+}
+
+#[test]
+fn a_file_stop_that_was_there_before_or_is_not_empty_is_the_users() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    fs::create_dir(&run).unwrap();
+    for content in ["kill $(cat pid)", ""] {
+        fs::write(run.join("stop"), content).unwrap();
+        let args = train(&["--total-steps", "384", "--run-dir", "run"]);
+        let output = succeeded(program(folder.path(), &args));
+        assert!(stderr(&output).contains("finished: 3 iterations"), "{}", stderr(&output));
+        assert_eq!(fs::read_to_string(run.join("stop")).unwrap(), content);
+        names(&run)
+            .iter()
+            .filter(|name| *name != "checkpoints")
+            .for_each(|name| fs::remove_file(run.join(name)).unwrap());
+        fs::remove_dir_all(run.join("checkpoints")).unwrap();
+    }
+    let (mut child, lines) = endless(folder.path(), &[]);
+    fs::write(run.join("stop"), "").unwrap();
+    assert!(lines.map_while(|line| line.ok()).any(|line| line.contains("stopped by the file `stop`")));
+    assert!(child.wait().unwrap().success() && !run.join("stop").exists());
 }
 
 #[test]

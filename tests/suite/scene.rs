@@ -159,6 +159,25 @@ fn what_is_missing_in_an_own_scene_is_named_with_its_file() {
 }
 
 #[test]
+fn all_names_that_are_missing_come_in_one_message() {
+    let message = refusal(&SCENE.replace("rh_", "lh_"));
+    for name in ["joint `rh_THJ5`", "joint `rh_WRJ1`", "actuator `rh_A_FFJ0`", "body `rh_thdistal`"] {
+        assert!(message.contains(name), "{name}: {message}");
+    }
+    assert!(!message.contains("`cube`"), "{message}");
+}
+
+#[test]
+fn what_mujoco_says_of_a_scene_is_not_cut_off() {
+    let file = format!("{}thumb.stl", "a_long_folder/".repeat(20));
+    let mesh = format!("<asset>\n    <mesh name=\"m\" file=\"{file}\"/>");
+    assert!(refusal(&edited("<asset>", &mesh)).contains(&file));
+    let text =
+        edited("name=\"rh_A_THJ4\"", "name=\"rh_A_THJ4\" dampratio_of_the_thumb_joint_that_is_no_attribute=\"1\"");
+    assert!(refusal(&text).contains("line "), "{}", refusal(&text));
+}
+
+#[test]
 fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
     for (from, to, rule) in [
         ("<joint name=\"rh_THJ3\"", "<joint name=\"rh_THJ3\" type=\"slide\"", "`rh_THJ3` must be a hinge"),
@@ -167,6 +186,10 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
         ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive the joint `rh_FFJ3`"),
         ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_MFJ0` must be the sum"),
         ("ctrlrange=\"0 3.1415\"", "", "must have one control with a ctrlrange"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"2\"/>", "`rh_A_FFJ3` must have a gear of 1"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"-1\"/>", "`rh_A_FFJ3` must have a gear of 1"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" timeconst=\".1\"/>", "`rh_A_FFJ3` must act at once"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" delay=\".02\" nsample=\"4\"/>", "`rh_A_FFJ3` must act at once"),
         (
             "<position name=\"rh_A_THJ4\" class=\"hand\" joint=\"rh_THJ4\" forcerange=\"-2 2\"/>",
             "<motor name=\"rh_A_THJ4\" joint=\"rh_THJ4\" ctrlrange=\"-1 1\"/>",
