@@ -192,6 +192,12 @@ pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     Ok((last.clone(), read(last)?))
 }
 
+/// Returns whether the file is not there.
+pub fn is_absence(error: &Error) -> bool {
+    let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+    kinds.map(std::io::Error::kind).any(|kind| kind == std::io::ErrorKind::NotFound)
+}
+
 /// Returns whether the bytes of the file are damaged, as opposed to intact but unusable.
 pub fn is_damage(error: &Error) -> bool {
     error.is::<Damaged>()

@@ -30,6 +30,9 @@ const ALONG: [&str; 3] = ["env_steps", "time/collect_s", "time/update_s"];
 /// The group of the metrics of evaluations.
 const EVALUATION: &str = "eval/";
 
+/// The most iterations that are averaged into a point by default.
+const SMOOTH: usize = 50;
+
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
@@ -119,9 +122,11 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
         }
     }
     // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
+    let shortest = tables.iter().map(|(_, table)| table.columns[ALONG[0]].len()).min().unwrap_or(0);
+    let smooth = args.smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
     let steps = tables.iter().map(|(_, table)| &table.columns[ALONG[0]]);
     let in_row = steps.filter_map(|steps| Some(steps.get(1)? - steps[0]));
-    let window = args.smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
+    let window = smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
     let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
         let [steps, collect_s, update_s] = ALONG.map(|name| &columns[name]);
         let along = match args.along {

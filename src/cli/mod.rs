@@ -348,9 +348,10 @@ pub struct PlotArgs {
     /// Quantity on the x axis: control steps, or hours of collecting and learning
     #[arg(long, value_enum, default_value_t = Along::Steps)]
     pub along: Along,
-    /// Iterations averaged into each point; if runs differ in iteration length, the shortest counts
-    #[arg(long, value_name = "N", default_value_t = 50, value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
-    pub smooth: usize,
+    /// Iterations averaged into each point, by default up to 50 and a tenth of the shortest run; if runs differ in iteration length,
+    /// the shortest counts
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    pub smooth: Option<usize>,
     /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest
     #[arg(long)]
     pub seeds: bool,

@@ -140,10 +140,17 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
 const LONGEST_SHOWN: usize = 64;
 
 fn unknown(name: &str) -> String {
-    // A section is never suggested for a setting.
-    let sections = DEFAULTS.keys().filter(|_| !name.contains('.')).cloned();
-    let known: Vec<String> = sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect();
-    let nearest = similar(name, known.iter().map(String::as_str), '.').into_iter().next();
+    // Within a section that is known, or a ramp, only what belongs there is suggested.
+    let (whole, last) = name.rsplit_once('.').unwrap_or(("", name));
+    let inside = lookup(&DEFAULTS, whole).and_then(Value::as_table);
+    let parts = inside.map(|table| table.keys().map(|key| format!("{whole}.{key}")).collect::<Vec<_>>());
+    let sections = DEFAULTS.keys().filter(|_| whole.is_empty()).cloned();
+    let known = parts.unwrap_or_else(|| sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect());
+    let alike = similar(name, known.iter().map(String::as_str), '.');
+    let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
+    let holds = known.iter().map(String::as_str).find(|key| last.len() > 2 && end(key).contains(last));
+    let near = alike.into_iter().find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
+    let nearest = near.or(holds);
     let hint = nearest.map(|nearest| format!("did you mean {nearest}?"));
     let hint = hint.unwrap_or_else(|| "configs/repose.toml lists all of them".into());
     let cut = if name.len() > LONGEST_SHOWN { "…" } else { "" };

@@ -128,7 +128,13 @@ pub(super) fn draw_text<B: DrawingBackend<ErrorType: 'static>>(
     (across, size, colour): (HPos, i32, RGBColor),
 ) -> Result<()> {
     let style = ("sans-serif", size).into_font().color(&colour).pos(Pos::new(across, VPos::Center));
-    Ok(area.draw(&Text::new(text, at, style))?)
+    Ok(area.draw(&Text::new(printable(text), at, style))?)
+}
+
+/// Returns a text without the characters that XML does not allow.
+fn printable(text: &str) -> String {
+    let allowed = |c: char| !c.is_control() && !matches!(c, '\u{fffe}' | '\u{ffff}');
+    text.chars().map(|c| if allowed(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
 }
 
 impl Picture for Chart {
@@ -223,7 +229,7 @@ impl Subplot {
     ) -> Result<()> {
         let y = range(self.curves.iter().flat_map(Curve::values));
         let mut chart = ChartBuilder::on(part)
-            .caption(&self.title, ("sans-serif", 17))
+            .caption(printable(&self.title), ("sans-serif", 17))
             .margin(8)
             .x_label_area_size(if along.is_some() { 46 } else { 24 })
             .y_label_area_size(56)

@@ -9,7 +9,7 @@ use std::time::SystemTime;
 use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::{CHECKPOINTS, Checkpoints, modified};
-use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, same_file, sync_folder, write_whole};
+use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";
@@ -17,14 +17,25 @@ const RUNS: &str = "runs/shadow-hand-repose";
 const CONFIG: &str = "config.toml";
 const VERSION: &str = "version.txt";
 const POLICY: &str = "policy.safetensors";
-const DIVERGED: &str = "diverged";
+pub(super) const DIVERGED: &str = "diverged";
 /// A file with this name asks the training to stop.
 const STOP: &str = "stop";
+/// A file with this name says that the training is not to be continued.
+const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
-const OURS: [&str; 10] =
-    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];
-/// The prefixes of the names of checkpoints and of dumps.
-const NUMBERED: [&str; 3] = ["iteration-", "latest.", "best."];
+pub(super) const OURS: [&str; 11] = [
+    FINISHED,
+    CONFIG,
+    VERSION,
+    POLICY,
+    LOCK,
+    METRICS,
+    DIVERGED,
+    "metrics.before-",
+    "events.out.",
+    CHECKPOINTS,
+    OUR_PARTIAL,
+];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
@@ -39,7 +50,7 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    fn at(path: PathBuf) -> Self {
+    pub(super) fn at(path: PathBuf) -> Self {
         let stop_before = modified(&path.join(STOP));
         Self { path, stop_before }
     }
@@ -125,6 +136,18 @@ impl RunFolder {
     /// # Errors
     /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
+        let run = Self::around(place)?;
+        // A folder that may not be read would look empty.
+        match fs::read_dir(run.checkpoints().folder()) {
+            Err(error) if error.kind() != ErrorKind::NotFound => {
+                Err(error).cannot("read", run.checkpoints().folder())?
+            }
+            _ => {}
+        }
+        Ok(run)
+    }
+
+    fn around(place: &Path) -> Result<Self> {
         ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
         let whole = place.canonicalize().cannot("read", place)?;
         let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
@@ -197,6 +220,13 @@ impl RunFolder {
         is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
     }
 
+    /// Writes or removes the file that says to scripts that the training is not to be continued: all steps are made, or a file
+    /// `stop` has ended it. If that fails, a script at most continues what is finished.
+    pub fn mark_finished(&self, finished: bool) {
+        let path = self.path.join(FINISHED);
+        let _ = if finished { write_whole(&path, b"") } else { fs::remove_file(path).map_err(Into::into) };
+    }
+
     /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
@@ -262,27 +292,6 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     let checkpoints = RunFolder::containing(place)?.checkpoints();
     let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
-}
-
-/// Checks that an output replaces neither one of the files that are `read` nor a file that a run keeps. New names in the folder of
-/// a run are free.
-///
-/// # Errors
-/// Fails if it would, through whatever links.
-pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>) -> Result<()> {
-    if let Some(read) = read.into_iter().find(|read| same_file(path, read)) {
-        bail!("{}: would replace {}, which is read; choose another name", path.display(), read.display());
-    }
-    let Ok(whole) = path.canonicalize() else { return Ok(()) };
-    let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
-    let inner = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let (run, names) = if inner { (folder.parent(), &NUMBERED[..]) } else { (Some(folder), &OURS[..]) };
-    let run = RunFolder::at(run.unwrap_or(folder).to_owned());
-    let is_run = run.checkpoints().begun() || run.path.join(LOCK).exists();
-    let ours = names.iter().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()));
-    let place = run.path.display();
-    ensure!(!is_run || !ours, "{}: the run {place} keeps this file; choose another name", path.display());
-    Ok(())
 }
 
 /// Returns the folder of the newest run that has a checkpoint, if any.

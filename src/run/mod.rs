@@ -4,6 +4,7 @@ mod checkpoints;
 mod events;
 mod folder;
 mod histogram;
+mod kept;
 mod metrics;
 mod records;
 mod report;
@@ -12,8 +13,9 @@ mod table;
 
 pub use checkpoints::Checkpoints;
 pub use events::SETTINGS;
-pub use folder::{RunFolder, expect_output, newest_run, resolve_checkpoint};
+pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use histogram::{Histogram, histogram};
+pub use kept::expect_output;
 pub use report::Report;
 pub use summary::{Animation, Descriptions, Media};
 pub use table::{MetricsTable, read_metrics, table_of};

@@ -1,43 +1,73 @@
 //! The check for infinite or NaN values in a scene: MuJoCo accepts them, and the physics then diverges immediately.
 
-use std::fmt::Debug;
+use std::io::Read;
 
+use anyhow::{Context, Result, anyhow};
 use mujoco_rs::prelude::{MjModel, MjtObjBase};
+use tempfile::NamedTempFile;
 
-/// Lists the arrays of a model by kind of object: the kind, its name, the array's name, and the first object with a value that is
-/// not finite.
-macro_rules! arrays {
-    ($model:ident, $($kind:ident $of:literal: $($array:ident)*;)*) => {
-        [$($((MjtObjBase::$kind, $of, stringify!($array), first_odd($model.$array()))),*),*]
-    };
+/// Returns a description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
+/// prints every array of a model, so that none is forgotten here.
+///
+/// # Errors
+/// Fails if there is no room for a temporary file.
+pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
+    let context =
+        "cannot check that the numbers of the scene are finite; set TMPDIR=PATH to a folder for a temporary file";
+    let file = NamedTempFile::new().context(context)?;
+    model.print(file.path()).map_err(|error| anyhow!("{error}")).context(context)?;
+    let mut text = Vec::new();
+    file.reopen().and_then(|mut file| file.read_to_end(&mut text)).context(context)?;
+    let found = first_in(&String::from_utf8_lossy(&text));
+    Ok(found.map(|(quantity, object)| {
+        // A degree of freedom has no name, but it belongs to a joint that may have one.
+        let of_joint = object.strip_prefix("DOF ").and_then(|dof| model.dof_jntid().get(dof.parse::<usize>().ok()?));
+        let joint = of_joint.and_then(|&joint| model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint as usize));
+        let object = joint.map_or(object, |name| format!("joint `{name}`"));
+        if object.is_empty() { quantity } else { format!("{quantity} of {object}") }
+    }))
 }
 
-/// Returns a description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to.
-pub(super) fn not_finite(model: &MjModel) -> Option<String> {
-    let by_object = arrays! { model,
-        mjOBJ_BODY "body": body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp;
-        mjOBJ_JOINT "joint": jnt_pos jnt_axis jnt_range jnt_stiffness jnt_margin jnt_solref jnt_solimp jnt_actfrcrange;
-        mjOBJ_GEOM "geom": geom_pos geom_quat geom_size geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp;
-        mjOBJ_SITE "site": site_pos site_quat;
-        mjOBJ_TENDON "tendon": tendon_range tendon_stiffness tendon_damping tendon_frictionloss tendon_armature;
-        mjOBJ_ACTUATOR "actuator": actuator_gainprm actuator_biasprm actuator_ctrlrange actuator_forcerange actuator_gear;
-    };
-    let by_dof = arrays! { model, mjOBJ_JOINT "joint": dof_damping dof_armature dof_frictionloss; };
-    let joint = |dof: usize| model.dof_jntid()[dof] as usize;
-    let by_dof = by_dof.map(|(kind, of, array, dof)| (kind, of, array, dof.map(joint)));
-    let found = by_object.into_iter().chain(by_dof).find_map(|(kind, of, array, at)| Some((kind, of, array, at?)));
-    if let Some((kind, of, array, at)) = found {
-        let name = model.id_to_name(kind, at).map_or_else(|| format!("number {at}"), |name| format!("`{name}`"));
-        return Some(format!("{array} of {of} {name}"));
+/// What MuJoCo computes when it compiles a model, besides what has a name that ends with 0.
+const DERIVED: [&str; 5] = ["body_subtreemass", "dof_length", "geom_aabb", "geom_rbound", "bvh_aabb"];
+
+/// Returns the first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
+fn first_in(text: &str) -> Option<(String, String)> {
+    let (mut heading, mut name, mut derived) = ("", None, None);
+    for line in text.lines() {
+        let mut words = line.split_whitespace();
+        let (first, indented) = (words.next().unwrap_or_default(), line.starts_with(' '));
+        let mut odd = || words.any(|word| ["nan", "inf"].contains(&word.trim_start_matches('-')));
+        if !indented && (line.ends_with(':') || line == first) {
+            (heading, name) = (line.trim_end_matches(':'), None);
+        } else if let Some(named) = line.strip_prefix("  name ") {
+            name = Some(named.trim());
+        } else if heading != "STATISTIC" && odd() {
+            let kind = heading.split(' ').next().unwrap_or_default().to_lowercase();
+            let object = name.map_or(heading.to_owned(), |name| format!("{kind} `{name}`"));
+            if indented && !first.ends_with('0') && !DERIVED.contains(&first) {
+                return Some((first.to_owned(), object));
+            }
+            // What MuJoCo has computed follows from something else, and so may what stands for the whole model.
+            let object = if indented { object } else { String::new() };
+            derived = derived.or(Some((first.to_owned(), object)));
+        }
     }
-    let options = model.opt();
-    let others = [&options.gravity[..], &options.wind, &[options.density, options.viscosity, options.impratio]];
-    let found = first_odd(&others.concat()).or(first_odd(model.qpos0()));
-    found.map(|_| "an option (gravity, wind, density, viscosity, impratio) or a joint's reference".into())
+    derived
 }
 
-/// Returns the first object with a value that is not finite.
-fn first_odd(objects: &[impl Debug]) -> Option<usize> {
-    let is_odd = |text: String| text.contains("NaN") || text.contains("inf");
-    objects.iter().position(|values| is_odd(format!("{values:?}")))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_value_that_is_not_finite_is_found_with_its_heading_and_name() {
+        let text = "MuJoCo version 3\n\nOPTION\n  gravity  0 0 -9.8\n\nqpos0  0 1\n\nBODY 0:\n  name  nan\n  body_pos  0 0 0\n";
+        assert_eq!(first_in(text), None);
+        let found =
+            |more: &str| first_in(&format!("{text}{more}")).map(|(quantity, object)| format!("{quantity}|{object}"));
+        assert_eq!(found("  body_mass  nan\n").as_deref(), Some("body_mass|body `nan`"));
+        assert_eq!(found("DOF 3:\n  dof_damping  1 -inf\n").as_deref(), Some("dof_damping|DOF 3"));
+        assert_eq!(found("qpos_spring  0 -nan 1\n").as_deref(), Some("qpos_spring|"));
+    }
 }

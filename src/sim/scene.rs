@@ -69,7 +69,14 @@ impl Scene {
     /// Fails with the file's name and MuJoCo's own message if MuJoCo refuses the scene.
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
         quieten_mujoco();
-        let compiled = compilation.compile(file).and_then(|model| Self::checked(model, compilation));
+        let compiled = compilation.compile(file).and_then(|model| {
+            // The built-in scene has been looked at.
+            let culprit = file.map_or(Ok(None), |_| not_finite(&model))?;
+            if let Some(culprit) = culprit {
+                bail!("{culprit} is not a finite number");
+            }
+            Self::checked(model, compilation)
+        });
         compiled.with_context(|| origin(file))
     }
 
@@ -103,9 +110,6 @@ impl Scene {
     }
 
     fn checked(mut model: MjModel, compilation: &Compilation) -> Result<Self> {
-        if let Some(culprit) = not_finite(&model) {
-            bail!("{culprit} is not a finite number");
-        }
         compilation.set_options(&mut model);
         let halves = model.opt().integrator != MjtIntegrator::mjINT_RK4 as i32;
         ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");

@@ -12,6 +12,9 @@ use crate::os::{self, Requests};
 use crate::ranks::Exchange;
 use crate::sim;
 
+/// Why a training has ended that was told to stop, other than by a file.
+pub(super) const STOPPED: &str = "stopped";
+
 /// What follows an iteration.
 #[derive(Debug, Default)]
 pub(super) struct Decision {
@@ -78,7 +81,7 @@ impl Session {
         }
         let any = |of: fn(&Vote) -> bool| votes.iter().any(of);
         let signal = votes.iter().map(|vote| vote.signal).max().unwrap_or(0);
-        let reason = if by_file { "stopped by the file `stop`" } else { "stopped" };
+        let reason = if by_file { "stopped by the file `stop`" } else { STOPPED };
         let stop = any(|vote| vote.stop).then(|| (os::exit_code(signal), reason));
         let save = any(|vote| vote.save) || self.agent.iteration.is_multiple_of(self.config.run.checkpoint_every);
         let last = self.finished() || stop.is_some();

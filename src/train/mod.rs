@@ -29,7 +29,7 @@ use crate::schedule::panic_message;
 #[cfg(feature = "video")]
 use films::film;
 use hints::hints;
-use lockstep::follow;
+use lockstep::{STOPPED, follow};
 use log::{Ended, described, histograms, row, tags};
 use outcome::Outcome;
 use saver::Saver;
@@ -88,7 +88,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
     while !session.finished() {
         let outcome = match session.iterate(requests, Some((report, &saver.held.folder))) {
             Ok(Some(outcome)) => outcome,
-            Ok(None) => return stop(saver, report, os::exit_code(requests.signal()), "stopped"),
+            Ok(None) => return stop(saver, report, os::exit_code(requests.signal()), STOPPED),
             Err(error) => return Err(give_up(error, saver, report)),
         };
         if outcome.decision.hand_over {
@@ -115,6 +115,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
         }
     }
     saver.save_at_last(report)?;
+    saver.held.folder.mark_finished(true);
     os::say(&format!("finished: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
     Ok(ExitCode::SUCCESS)
 }
@@ -220,6 +221,15 @@ impl Session {
             self.warned = true;
             report.warn(&warning);
         }
+        let desired_kl = self.config.ppo.desired_kl.by_equal_factors(env_steps);
+        let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
+        self.far = if is_far { self.far.saturating_add(1) } else { 0 };
+        if self.far == FAR_FOR {
+            report.warn(&format!(
+                "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: steps are too \
+                 large; lower ppo.learning_rate_range or ppo.learning_rate"
+            ));
+        }
         report.iteration(self.agent.iteration, &row(outcome, &ended), media, &status);
     }
 }
@@ -233,6 +243,10 @@ fn say_what_next(run: &Path) {
 
 /// The iteration after which there is an early evaluation where the next one would come much later.
 const EARLY: u64 = 50;
+
+/// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
+const FAR: f64 = 10.0;
+const FAR_FOR: u32 = 20;
 
 /// The iterations between two sets of histograms.
 const HISTOGRAMS_EVERY: u64 = 50;
@@ -252,6 +266,7 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
 fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, reason: &str) -> Result<ExitCode> {
     saver.save_at_last(report)?;
     if saver.held.wrote {
+        saver.held.folder.mark_finished(reason != STOPPED);
         os::say(&format!("{reason} after {}; resume with", saver.held.steps_made()));
         os::say(&format!("  {}", saver.held.how_to_resume(&saver.held.folder)));
     } else {

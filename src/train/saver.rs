@@ -104,6 +104,7 @@ impl Saver {
         let Progress { iteration, env_steps, fork, .. } = &self.initial.progress;
         report.open_logs(fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration, *env_steps);
         self.describe()?;
+        self.held.folder.mark_finished(false);
         self.held.wrote = true;
         self.save_before_fatal_errors();
         Ok(())

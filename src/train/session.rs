@@ -38,6 +38,8 @@ pub(super) struct Session {
     pub diverged: u64,
     /// Whether the warning about them was printed.
     pub warned: bool,
+    /// The iterations in a row after which the policy had moved far more than it should.
+    pub far: u32,
     /// Whether the steps that led to them are written.
     pub dumps: bool,
     /// The fingerprint of the scene.
@@ -95,6 +97,7 @@ impl Session {
                 films,
                 diverged: 0,
                 warned: false,
+                far: 0,
                 dumps,
             };
             from.map_or(Ok(()), |(takes, checkpoint)| session.start(takes, checkpoint))?;

@@ -97,12 +97,6 @@ impl Plan {
     fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<(Self, Existing)> {
         let place = place.map(Path::to_owned).or_else(run::newest_run);
         let place = place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")?;
-        if let Some(set) = args.settings.set.iter().find(|set| set.key != MODEL) {
-            bail!(
-                "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
-                set.key
-            );
-        }
         let folder = RunFolder::containing(&place)?;
         let checkpoints = folder.checkpoints();
         ensure!(
@@ -117,6 +111,7 @@ impl Plan {
         let context = format!("cannot resume from {}", path.display());
         let config = load::for_training(&checkpoint, &path, &overrides(args));
         let config = config.and_then(|config| expect_states(&checkpoint, &config).map(|()| config));
+        expect_same(&checkpoint, &path, args)?;
         let config = config.with_context(|| context.clone())?;
         expect_config(&folder, &config)?;
         // The best is the one in the folder. It may have been saved after the checkpoint that is resumed, and a worse one must
@@ -139,7 +134,10 @@ impl Plan {
             bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
         }
         let context = || format!("cannot fork {}", place.display());
-        let (path, checkpoint) = load::newest_sound(&checkpoints_at(place)?).with_context(context)?;
+        let newest = || load::newest_sound(&checkpoints_at(place)?).with_context(context);
+        // Where a training goes on, a checkpoint may vanish between listing and reading.
+        let (path, checkpoint) =
+            newest().or_else(|error| if load::is_absence(&error) { newest() } else { Err(error) })?;
         let context = format!("cannot fork {}", path.display());
         let plan = Self::forked(&path, checkpoint, args).with_context(|| context.clone())?;
         Ok(Self { context: Some(context), ..plan })
@@ -211,6 +209,20 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
     let given = options.into_iter().filter_map(|(key, value)| Some((key, value?)));
     let given = given.map(|(key, value)| Override { key: key.into(), value: value.to_string() });
     args.settings.set.iter().cloned().chain(given).collect()
+}
+
+/// Checks that each `--set` of a resumed run says what its checkpoint says already.
+fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result<()> {
+    for set in args.settings.set.iter().filter(|set| set.key != MODEL) {
+        let own = Config::from_text(path, &checkpoint.config, &[])?;
+        let same = Config::from_text(path, &checkpoint.config, std::slice::from_ref(set)).is_ok_and(|with| with == own);
+        ensure!(
+            same,
+            "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
+            set.key
+        );
+    }
+    Ok(())
 }
 
 /// Checks that the settings in the folder are those of the checkpoint, because edits to them would be ignored.

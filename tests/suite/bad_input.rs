@@ -248,7 +248,7 @@ fn usage_errors_exit_with_2() {
         1,
         &["`play` does not use ppo.gamma"],
     );
-    refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["accepts only env.model"]);
+    refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["no such run folder"]);
     refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }

@@ -262,3 +262,24 @@ fn a_training_whose_disk_fills_up_goes_on_and_its_last_checkpoint_is_whole() {
     assert!(lines[1].contains("\"episodes\":2"), "the last whole checkpoint plays: {printed}");
     assert_eq!(lines[2], "code 0", "{}", stderr(&output));
 }
+
+#[test]
+fn a_file_tells_scripts_whether_a_training_is_to_be_continued() {
+    let folder = tempfile::tempdir().unwrap();
+    let finished = folder.path().join("run/finished");
+    succeeded(program(folder.path(), &train(&["--total-steps", "256", "--run-dir", "run"])));
+    assert!(finished.exists());
+    let (child, lines) = begun(command(folder.path(), &["train", "--resume", "run", "--total-steps", "100000000"]));
+    assert!(!finished.exists());
+    assert_eq!(ended_by("TERM", child, lines).0, Some(143));
+    assert!(!finished.exists());
+    let (mut child, lines) = begun(command(folder.path(), &["train", "--resume", "run", "--total-steps", "100000000"]));
+    fs::write(folder.path().join("run/stop"), "").unwrap();
+    lines.for_each(drop);
+    assert!(child.wait().unwrap().success() && finished.exists());
+    // A resumed run accepts its own settings, and no others.
+    let same = resume(folder.path(), &["--total-steps", "128", "--set", "env.num_envs=16"]);
+    assert!(stderr(&succeeded(same)).contains("is finished"));
+    let other = resume(folder.path(), &["--set", "env.num_envs=32"]);
+    assert!(stderr(&other).contains("--set env.num_envs: a resumed run accepts only"), "{}", stderr(&other));
+}

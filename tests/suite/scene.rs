@@ -236,6 +236,14 @@ fn a_number_that_is_none_in_an_own_scene_is_named() {
         ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "body_pos of body `cube`"),
         ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "geom_friction of geom `cube`"),
         ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "dof_damping of joint `rh_FFJ3`"),
+        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" springref=\"nan\" stiffness=\"1\" class", "qpos_spring"),
+        (
+            "</worldbody>",
+            "</worldbody><equality><weld body1=\"cube\" relpose=\"nan 0 0 1 0 0 0\"/></equality>",
+            "eq_data",
+        ),
+        ("</worldbody>", "</worldbody><equality><weld body1=\"cube\" solref=\"nan 1\"/></equality>", "eq_solref"),
+        ("<option ", "<option o_margin=\"nan\" ", "o_margin of OPTION"),
     ] {
         let text = edited(from, to);
         let message = refusal(&text);
