@@ -107,8 +107,8 @@ fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) ->
 pub fn expect_safetensors(bytes: &[u8]) -> Result<()> {
     ensure!(!bytes.starts_with(b"version "), "a Git LFS pointer: `git lfs pull` fetches the file itself");
     ensure!(!(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)), "an ONNX file, not a safetensors file");
-    let length = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
-    ensure!(length <= LARGEST_HEADER, Damaged("not a safetensors file".into()));
+    let length = bytes.first_chunk().map_or(1, |length| u64::from_le_bytes(*length));
+    ensure!((1..=LARGEST_HEADER).contains(&length), Damaged("not a safetensors file".into()));
     Ok(())
 }
 
@@ -274,6 +274,7 @@ mod tests {
             (b"<!DOCTYPE html><html></html>", "not a safetensors file"),
             (b"PK\x03\x04\x14\x00\x00\x00\x08", "not a safetensors file"),
             (b"iteration,env_steps\n", "not a safetensors file"),
+            (&[0; 100], "not a safetensors file"),
             (b"", "not a complete safetensors file"),
         ] {
             assert!(refusal(text).contains(what), "{}", refusal(text));

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 
 use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
 
@@ -77,6 +77,7 @@ impl Checkpoints {
     }
 
     pub(super) fn create_folder(&self) -> Result<()> {
+        expect_no_link(&self.folder)?;
         fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder)).cannot("create", &self.folder)
     }
 
@@ -116,6 +117,15 @@ impl Checkpoints {
     pub(super) fn begun(&self) -> bool {
         self.best().exists() || !self.newest_first().is_empty()
     }
+}
+
+/// Checks that what is about to be written into is no link: a run folder may have been changed since the training began.
+///
+/// # Errors
+/// Fails if it is.
+pub(super) fn expect_no_link(folder: &Path) -> Result<()> {
+    ensure!(!folder.is_symlink(), "cannot write {}: links in a run folder are not followed", folder.display());
+    Ok(())
 }
 
 /// Returns the time when a file was written, if it is there.

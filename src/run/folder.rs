@@ -8,7 +8,7 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result, bail, ensure};
 
-use super::checkpoints::{CHECKPOINTS, Checkpoints, modified};
+use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
 use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
@@ -248,6 +248,7 @@ impl RunFolder {
     /// Fails if the folder cannot be written to.
     pub fn dump(&self, name: &str, text: &str) -> Result<()> {
         let folder = self.path.join(DIVERGED);
+        expect_no_link(&folder)?;
         fs::create_dir_all(&folder).cannot("create", &folder)?;
         if fs::read_dir(&folder).is_ok_and(|entries| entries.count() >= MOST_DUMPS) {
             return Ok(());

@@ -283,3 +283,16 @@ fn a_file_tells_scripts_whether_a_training_is_to_be_continued() {
     let other = resume(folder.path(), &["--set", "env.num_envs=32"]);
     assert!(stderr(&other).contains("--set env.num_envs: a resumed run accepts only"), "{}", stderr(&other));
 }
+
+#[test]
+fn a_link_that_takes_the_place_of_the_checkpoints_is_not_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (child, lines) = endless(folder.path(), &[]);
+    let run = folder.path().join("run");
+    fs::create_dir(folder.path().join("victim")).unwrap();
+    fs::rename(run.join("checkpoints"), run.join("old")).unwrap();
+    std::os::unix::fs::symlink("../victim", run.join("checkpoints")).unwrap();
+    let (code, said) = ended_by("TERM", child, lines);
+    assert!(said.contains("links in a run folder are not followed") && said.contains("is in "), "{said}");
+    assert_eq!((code, names(&folder.path().join("victim")).len()), (Some(1), 0));
+}
