@@ -153,7 +153,10 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 
 impl Source {
     fn table(&self) -> Result<(&Path, Table)> {
-        let table = self.text.parse().map_err(|error| anyhow!("{}: not a TOML file: {error}", self.path.display()))?;
+        let table = self.text.parse().map_err(|error: toml::de::Error| {
+            let lines: Vec<String> = error.to_string().lines().map(os::shortened).collect();
+            anyhow!("{}: not a TOML file: {}", self.path.display(), lines.join("\n"))
+        })?;
         Ok((&self.path, table))
     }
 }
@@ -177,7 +180,8 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
         let mut alone = DEFAULTS.clone();
         alone[section][key] = merged[section][key].clone();
         if let Err(error) = Config::deserialize(Value::Table(alone)) {
-            problems.push(format!("{name} = {}: {}", merged[section][key], error.message().trim()));
+            let (value, message) = (merged[section][key].to_string(), error.message().trim());
+            problems.push(format!("{name} = {}: {}", os::shortened(&value), os::shortened(message)));
             merged[section][key] = default.clone();
         }
     }

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use toml::{Table, Value};
 
 use super::BASE;
-use crate::os::similar;
+use crate::os::{shortened, similar};
 
 /// The base as tables.
 pub(super) static DEFAULTS: LazyLock<Table> =
@@ -88,7 +88,10 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
         }
         match typed(expected, value) {
             Ok(value) => drop(merged.insert(key.clone(), value)),
-            Err(rule) => problems.push(format!("{name} = {value}: must be {rule}")),
+            Err(rule) => {
+                let [name, value] = [&name, &value.to_string()].map(|text| shortened(text));
+                problems.push(format!("{name} = {value}: must be {rule}"));
+            }
         }
     }
 }

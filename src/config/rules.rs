@@ -6,6 +6,7 @@ use toml::{Table, Value};
 
 use super::overlay::{is_ramp, lookup, number, settings};
 use super::settings::{Backend, Config, Precision};
+use crate::os::shortened;
 
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule, and so must all values by group.
 
@@ -180,7 +181,7 @@ struct Rules(Vec<String>);
 impl Rules {
     fn check(&mut self, holds: bool, key: &str, value: impl std::fmt::Display, rule: &str) {
         if !holds {
-            self.0.push(format!("{key} = {value}: must {rule}"));
+            self.0.push(format!("{} = {}: must {rule}", shortened(key), shortened(&value.to_string())));
         }
     }
 

@@ -18,6 +18,16 @@ pub fn print(text: &str) -> Result<()> {
     }
 }
 
+/// The most characters of a foreign text that a message quotes.
+const LONGEST_QUOTE: usize = 100;
+
+/// Returns a text from a file of anybody's, short enough for a message and on one line.
+pub fn shortened(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
+    if text.chars().nth(LONGEST_QUOTE).is_some() { format!("{start}…") } else { start }
+}
+
 /// Returns a number with these decimals, or `-` if it is not known (NaN).
 pub fn number(value: f64, decimals: usize) -> String {
     if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") }

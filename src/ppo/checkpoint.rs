@@ -10,6 +10,7 @@ use super::format::{Array, Content};
 use super::parameters::{Layout, View};
 use super::{Normalizer, Policy, Ppo, Progress};
 use crate::config::NetConfig;
+use crate::os::shortened;
 use crate::spaces::Spaces;
 
 /// The text `format` of a file.
@@ -59,14 +60,14 @@ impl Checkpoint {
         if let Some((_, version)) = OLDER.iter().find(|(older, _)| *older == format) {
             bail!("made by version {version}, whose files this version does not read");
         }
-        ensure!(format == FORMAT, "its format is `{format}`; this program reads `{FORMAT}`");
+        ensure!(format == FORMAT, "its format is `{}`; this program reads `{FORMAT}`", shortened(&format));
         let config = text("config")?;
         let long = config.len();
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
         let [provenance, scene] = [PROVENANCE, SCENE].map(|key| content.texts.remove(key));
         if let Some(key) = content.texts.keys().next() {
-            bail!("its metadata has an unknown `{key}`");
+            bail!("its metadata has an unknown `{}`", shortened(key));
         }
         Ok(Self { config, progress, provenance, scene, content })
     }
@@ -193,7 +194,7 @@ impl Checkpoint {
     /// Fails if one is left, and names it.
     pub fn finish(self) -> Result<()> {
         match self.content.arrays.keys().next() {
-            Some(name) => bail!("tensor `{name}` is not part of this policy"),
+            Some(name) => bail!("tensor `{}` is not part of this policy", shortened(name)),
             None => Ok(()),
         }
     }

@@ -9,6 +9,8 @@ use std::fmt;
 use anyhow::{Context, Result, bail, ensure};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
+use crate::os::shortened;
+
 /// The metadata key of the checksum.
 const CHECKSUM: &str = "checksum";
 
@@ -74,10 +76,13 @@ impl Content {
         let stored =
             texts.remove(CHECKSUM).context("no checksum: not a file of this program, or one of an older version")?;
         let found = checksum(&texts, &views);
-        ensure!(stored == found, Damaged(format!("damaged: its checksum is {found} instead of {stored}")));
+        ensure!(
+            stored == found,
+            Damaged(format!("damaged: its checksum is {found} instead of {}", shortened(&stored)))
+        );
         let mut arrays = BTreeMap::new();
         for (name, view) in views {
-            let array = Array::read(&view).with_context(|| format!("tensor `{name}`"))?;
+            let array = Array::read(&view).with_context(|| format!("tensor `{}`", shortened(&name)))?;
             arrays.insert(name, array);
         }
         Ok(Self { texts: texts.into_iter().collect(), arrays })

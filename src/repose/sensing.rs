@@ -6,6 +6,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::hand::FINGERTIPS;
 use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, OBSERVATION, RELATIVE_QUAT, TIP_QUAT, TIP_SIZE, TIPS};
 use crate::config::ByGroup;
+use crate::os::shortened;
 use crate::quat::{self, Quat};
 use crate::rng::Rng;
 
@@ -27,7 +28,7 @@ impl NoiseStd {
             if !MEASURED.contains(&name.as_str()) {
                 let known = OBSERVATION.iter().any(|group| group.name == name);
                 let what = if known { "is not measured" } else { "is not a group of the observation" };
-                bail!("`{name}` {what}; those that can have noise are {}", MEASURED.join(", "));
+                bail!("`{}` {what}; those that can have noise are {}", shortened(name), MEASURED.join(", "));
             }
         }
         let of_group = |Group { name, start, length, .. }: Group| {

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 
 use super::folder::METRICS;
 use super::metrics::next_row;
-use crate::os::Cannot;
+use crate::os::{Cannot, shortened};
 
 /// The most bytes that are read of a table; a million rows take half of this.
 const LARGEST_TABLE: u64 = 1 << 30;
@@ -19,9 +19,6 @@ const MOST_ROWS: usize = 2_000_000;
 
 /// The largest value that is drawn. No metric comes near it, and a chart cannot be laid out far beyond.
 const LARGEST_VALUE: f64 = 1e30;
-
-/// The most characters of a file that a message quotes.
-const LONGEST_QUOTE: usize = 100;
 
 /// The most columns whose names are kept, and the most characters of such a name.
 const MOST_NAMES: usize = 1000;
@@ -56,7 +53,7 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
     let names: Vec<&str> = header.split(',').collect();
     if let Some(column) = required.iter().find(|column| !names.contains(column)) {
-        bail!("{} has no column {column}; it has {}", path.display(), beginning(&header));
+        bail!("{} has no column {column}; it has {}", path.display(), shortened(&header));
     }
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
     let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
@@ -71,7 +68,7 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
                 let cell = String::from_utf8_lossy(cells[*place]);
                 let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
                 let number: f64 = number
-                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), beginning(&cell)))?;
+                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell)))?;
                 column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
             }
         }
@@ -79,13 +76,6 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let columns = columns.into_iter().map(|(place, values)| (names[place].to_owned(), values)).collect();
     let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
     Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
-}
-
-/// Returns the beginning of a text, short enough for a message.
-fn beginning(text: &str) -> String {
-    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
-    let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
-    if text.chars().count() > LONGEST_QUOTE { format!("{start}…") } else { start }
 }
 
 #[cfg(test)]

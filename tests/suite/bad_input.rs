@@ -278,3 +278,40 @@ fn a_policy_whose_actions_overflow_is_named_as_such_by_every_command() {
     }
     assert_eq!(names(folder), ["p.safetensors"]);
 }
+
+#[test]
+fn what_comes_from_a_foreign_file_is_quoted_in_a_hundred_characters() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let long = "9".repeat(200_000);
+    let configs = [
+        format!("[run]\nseed = {long}\n"),
+        format!("a = {}", "[".repeat(10_000)),
+        format!("{}\n", "[[env]]\n".repeat(1000)),
+        format!("[ppo]\nactivation = \"{long}\"\n"),
+        format!("[ppo]\nhidden = [{}]\n", "1.5,".repeat(10_000)),
+        format!("[env]\ngoal_position = [{}]\n", "1,".repeat(10_000)),
+        format!("[env]\n{long} = 1\n"),
+        format!("[env.noise]\n{long} = -1\n"),
+        format!("[env.noise]\n{long} = 1\n"),
+    ];
+    for text in configs {
+        fs::write(folder.join("own.toml"), &text).unwrap();
+        let output = program(folder, &["train", "--config", "own.toml"]);
+        let said = stderr(&output);
+        assert!(output.status.code() == Some(1) && said.len() < 2000, "{}: {} bytes", &text[..30], said.len());
+    }
+    let (mut texts, mut names) = (std::collections::HashMap::new(), Vec::new());
+    for (key, name) in [("checksum", "a"), ("other", "a"), ("checksum", &long[..])] {
+        texts.clear();
+        names.clear();
+        texts.insert(key.to_owned(), long.clone());
+        let view = safetensors::tensor::TensorView::new(safetensors::tensor::Dtype::I8, vec![1], &[0]).unwrap();
+        names.push((name.to_owned(), view));
+        let bytes = safetensors::serialize(names.clone(), Some(texts.clone())).unwrap();
+        fs::write(folder.join("p.safetensors"), bytes).unwrap();
+        let output = program(folder, &["play", "--ckpt", "p.safetensors", "--headless"]);
+        let said = stderr(&output);
+        assert!(output.status.code() == Some(1) && said.len() < 1000, "{} bytes", said.len());
+    }
+}
