@@ -102,7 +102,7 @@ fn fail(reason: &str) -> ! {
     eprintln!(
         "\nMuJoCo {VERSION} (libmujoco.so.{VERSION}) is missing and could not be fetched: {reason}\n\
          Two ways to fix this:\n  \
-         1. make `python3 -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index) and rebuild;\n  \
+         1. make `python3 -I -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index) and rebuild;\n  \
          2. unpack a MuJoCo {VERSION} release yourself and build with MUJOCO_DYNAMIC_LINK_DIR=/absolute/path/to/its/lib\n"
     );
     std::process::exit(1);

@@ -35,7 +35,7 @@ pub struct Locked {
     path: PathBuf,
     file: File,
     /// Without locks: as long as this lives, the lock file is renewed.
-    renewal: Option<Renewal>,
+    _renewal: Option<Renewal>,
 }
 
 /// The renewal of a lock file.
@@ -63,7 +63,7 @@ impl Locked {
             // Some network file systems do not support locks.
             Err(TryLockError::Error(_)) => Some(Renewal::begin(folder, path.clone())?),
         };
-        Ok(Self { path, file, renewal })
+        Ok(Self { path, file, _renewal: renewal })
     }
 
     /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
@@ -79,11 +79,9 @@ impl Locked {
             fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
-        if self.renewal.is_none() {
-            // Best effort: tells others who holds the lock.
-            let said = name();
-            let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
-        }
+        // Best effort: tells others who holds the lock. Where there are no locks, a file without a name holds nobody off.
+        let said = name();
+        let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)
     }
 
@@ -136,8 +134,10 @@ impl Renewal {
 
 impl Drop for Renewal {
     fn drop(&mut self) {
-        // The next one need not wait.
-        let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_len(0));
+        // The next one need not wait, unless the file is another's by now.
+        if holder(&self.path) == name() {
+            let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_len(0));
+        }
     }
 }
 
@@ -165,6 +165,21 @@ mod tests {
         assert!(refusal.contains(&format!("another program: process {} on ", std::process::id())), "{refusal}");
         drop(first.sign().unwrap());
         Locked::acquire(place.path()).unwrap();
+    }
+
+    #[test]
+    fn where_there_are_no_locks_the_name_stays_in_a_lock_file_of_its_own_and_anothers_is_left() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(LOCK);
+        fs::write(&path, "").unwrap();
+        fs::hard_link(&path, place.path().join("copy")).unwrap();
+        let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
+        let renewal = Some(Renewal::begin(place.path(), path.clone()).unwrap());
+        let lock = Locked { path: path.clone(), file, _renewal: renewal }.sign().unwrap();
+        assert_eq!(holder(&path), name());
+        fs::write(&path, ": process 1 on another").unwrap();
+        drop(lock);
+        assert_eq!(holder(&path), ": process 1 on another");
     }
 
     #[test]

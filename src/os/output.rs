@@ -71,7 +71,9 @@ fn remove(path: &Path) {
 /// nothing on another machine or in another container. Where there are no locks, a day must have passed.
 pub fn is_abandoned(entry: &DirEntry) -> bool {
     let name = entry.file_name().to_string_lossy().into_owned();
-    if !(name.starts_with(OUR_PARTIAL) && name.ends_with(".partial")) {
+    // A pipe would be waited for.
+    let is_plain = entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_dir());
+    if !(is_plain && name.starts_with(OUR_PARTIAL) && name.ends_with(".partial")) {
         return false;
     }
     match File::open(entry.path()).map(|file| file.try_lock()) {

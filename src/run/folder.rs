@@ -23,19 +23,8 @@ const STOP: &str = "stop";
 /// A file with this name says that the training is not to be continued.
 const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
-pub(super) const OURS: [&str; 11] = [
-    FINISHED,
-    CONFIG,
-    VERSION,
-    POLICY,
-    LOCK,
-    METRICS,
-    DIVERGED,
-    "metrics.before-",
-    "events.out.",
-    CHECKPOINTS,
-    OUR_PARTIAL,
-];
+pub(super) const OURS: [&str; 10] =
+    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
@@ -224,6 +213,10 @@ impl RunFolder {
     /// `stop` has ended it. If that fails, a script at most continues what is finished.
     pub fn mark_finished(&self, finished: bool) {
         let path = self.path.join(FINISHED);
+        // A file with content is the user's.
+        if fs::metadata(&path).is_ok_and(|facts| facts.len() > 0) {
+            return;
+        }
         let _ = if finished { write_whole(&path, b"") } else { fs::remove_file(path).map_err(Into::into) };
     }
 

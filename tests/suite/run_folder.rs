@@ -277,6 +277,11 @@ fn a_file_tells_scripts_whether_a_training_is_to_be_continued() {
     fs::write(folder.path().join("run/stop"), "").unwrap();
     lines.for_each(drop);
     assert!(child.wait().unwrap().success() && finished.exists());
+    // A file with content is the user's.
+    fs::write(&finished, "mine").unwrap();
+    let (child, lines) = begun(command(folder.path(), &["train", "--resume", "run", "--total-steps", "100000000"]));
+    assert_eq!(ended_by("TERM", child, lines).0, Some(143));
+    assert_eq!(fs::read_to_string(&finished).unwrap(), "mine");
     // A resumed run accepts its own settings, and no others.
     let same = resume(folder.path(), &["--total-steps", "128", "--set", "env.num_envs=16"]);
     assert!(stderr(&succeeded(same)).contains("is finished"));
