@@ -16,8 +16,8 @@
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, evaluate, load, os, ppo, ranks, repose, run, schedule, see, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, repose, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
-//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, run, see, sim |
-//! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
+//! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
+//! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, quat, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |

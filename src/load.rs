@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Error, Result, bail};
 
-use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
+use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source, Symmetry};
 use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy, expect_safetensors};
 use crate::repose::SPACES;
@@ -128,6 +128,8 @@ pub struct Loaded {
     pub name: String,
     /// The settings of the task.
     pub config: EnvConfig,
+    /// The states that it takes for the same.
+    pub symmetry: Symmetry,
     /// The policy.
     pub policy: Policy,
     /// The checkpoint that holds it.
@@ -155,7 +157,7 @@ impl Loaded {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
             PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
-        Ok(Self { origin, name, config: config.env, policy, checkpoint })
+        Ok(Self { origin, name, symmetry: config.net.symmetry, config: config.env, policy, checkpoint })
     }
 
     /// Returns the settings of its task, overlaid with other `overrides` than those with which it was loaded.

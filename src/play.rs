@@ -2,6 +2,7 @@
 //! the first episodes.
 
 use std::process::ExitCode;
+use std::sync::Arc;
 
 #[cfg(not(feature = "video"))]
 use anyhow::bail;
@@ -42,6 +43,8 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Some(loaded) => loaded.config.clone(),
         None => Config::resolve(None, &args.set)?.env,
     };
+    let task = Task::new(&config)?;
+    let config = task.config();
     for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
         let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
         run::expect_output(output, policy.into_iter().chain(config.model_file()))?;
@@ -53,20 +56,26 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if let (Some(loaded), false) = (&loaded, args.json) {
         os::say(&format!("playing {}", loaded.name));
     }
+    if !args.json {
+        task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+    }
+    let warning = loaded.as_ref().and_then(|loaded| task.symmetry_warning(loaded.symmetry));
+    warning.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if let (Some(loaded), true) = (&loaded, args.robustness) {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
     }
     #[cfg(not(feature = "viewer"))]
     ensure!(!wants_window(args), see::NO_WINDOWS);
     #[cfg(feature = "viewer")]
-    if wants_window(args) && show(args, &config, loaded.as_ref())? {
+    if wants_window(args) && show(args, config, loaded.as_ref())? {
         return Ok(ExitCode::SUCCESS);
     }
-    play_unseen(args, requests, &config, loaded.as_ref())
+    play_unseen(args, requests, &task, loaded.as_ref())
 }
 
 /// Plays without a window and prints the score.
-fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<ExitCode> {
+fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: Option<&Loaded>) -> Result<ExitCode> {
+    let config = task.config();
     let actor = match (loaded, args.policy) {
         (Some(loaded), _) => actor_of(loaded, args),
         (None, Some(Baseline::Random)) => Actor::Random,
@@ -87,9 +96,9 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, config: &EnvConfig, loaded:
         }
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
-        let (task, episodes) = (Task::new(config)?, episodes(args, 256));
+        let episodes = episodes(args, 256);
         let bar = os::progress_bar(episodes.count as u64, "episodes", actor.name());
-        Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
+        Trial { task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
     };
     let played = match &args.video {
         #[cfg(not(feature = "video"))]

@@ -1,9 +1,27 @@
 //! Unit quaternions as `[w, x, y, z]`, the order that MuJoCo uses. A quaternion and its negative are the same rotation.
 
+use std::f32::consts::FRAC_1_SQRT_2;
 use std::ops::{Add, Mul, Sub};
 
 /// A unit quaternion w, x, y, z.
 pub type Quat = [f64; 4];
+
+const H: f32 = 0.5;
+const R: f32 = FRAC_1_SQRT_2;
+
+/// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
+#[rustfmt::skip]
+pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
+    // None, and half turns about an axis through the centres of two faces.
+    [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0],
+    // Quarter turns about the same axes.
+    [R, R, 0.0, 0.0], [R, -R, 0.0, 0.0], [R, 0.0, R, 0.0], [R, 0.0, -R, 0.0], [R, 0.0, 0.0, R], [R, 0.0, 0.0, -R],
+    // Half turns about an axis through the midpoints of two edges.
+    [0.0, R, R, 0.0], [0.0, R, -R, 0.0], [0.0, R, 0.0, R], [0.0, R, 0.0, -R], [0.0, 0.0, R, R], [0.0, 0.0, R, -R],
+    // Third turns about an axis through two corners.
+    [H, H, H, H], [H, -H, H, H], [H, H, -H, H], [H, H, H, -H],
+    [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
+];
 
 /// Returns the Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
 pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
@@ -21,6 +39,12 @@ pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
 /// Returns the inverse rotation.
 pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
+}
+
+/// Returns `q` with length 1.
+pub fn normalized(q: Quat) -> Quat {
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    q.map(|x| x / length)
 }
 
 /// Returns `v` rotated by `q`.

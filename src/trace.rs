@@ -30,6 +30,7 @@ impl Trace {
             "max_consecutive_successes": config.max_consecutive_successes,
             "max_episode_steps": config.max_episode_steps(),
             "model": config.model,
+            "goal_position": config.goal_position.value,
             "checkpoint": checkpoint,
             "observation": OBSERVATION.map(|Group { name, start, length, unit }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })

@@ -1,6 +1,8 @@
 //! Showing the scene without a policy: in a window, or as one picture.
 
 use std::path::Path;
+#[cfg(any(feature = "video", feature = "viewer"))]
+use std::sync::Arc;
 
 #[cfg(not(all(feature = "video", feature = "viewer")))]
 use anyhow::bail;
@@ -10,6 +12,8 @@ use crate::cli::{Motion, ViewArgs, usage_error};
 use crate::config::{Config, EnvConfig, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
 use crate::os;
+#[cfg(any(feature = "video", feature = "viewer"))]
+use crate::repose::Task;
 use crate::run;
 use crate::see;
 
@@ -43,9 +47,17 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
 }
 
+/// Loads the task, and tells what of the user's scene the settings replace.
+#[cfg(any(feature = "video", feature = "viewer"))]
+fn task_for_display(config: &EnvConfig, args: &ViewArgs) -> Result<Arc<Task>> {
+    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+    Ok(task)
+}
+
 #[cfg(feature = "video")]
 fn draw(path: &Path, args: &ViewArgs, config: &EnvConfig, actor: &Actor, episodes: Episodes) -> Result<()> {
-    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    let task = task_for_display(config, args)?;
     let [width, height] = see::screenshot(path, &task, actor, episodes, args.at)?;
     os::say(&format!("{}: {width}x{height}", path.display()));
     Ok(())
@@ -58,7 +70,7 @@ fn draw(_: &Path, _: &ViewArgs, _: &EnvConfig, _: &Actor, _: Episodes) -> Result
 
 #[cfg(feature = "viewer")]
 fn show(args: &ViewArgs, config: &EnvConfig, first: usize, episodes: Episodes) -> Result<()> {
-    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    let task = task_for_display(config, args)?;
     let window = see::Window::open(&task, ACTORS.iter().map(|(_, name, _)| *name).collect(), first)?;
     os::say(&window.play(&task, &ACTORS.map(|(.., actor)| actor), episodes)?);
     Ok(())

@@ -68,6 +68,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env)?;
+    config.env = task.config().clone();
     let (threads, num_envs, hidden) = (rayon::current_num_threads(), config.env.num_envs, &config.ppo.hidden);
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();

@@ -1,18 +1,22 @@
 //! The layers of a configuration: the defaults, overlaid with the user's file, overlaid with single settings.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow, bail};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::overlay::{DEFAULTS, overlay, settings, table_of};
+use super::overlay::{DEFAULTS, lookup, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use crate::os;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
+
+/// The keys of `[env]` whose values a scene gives unless the user names them.
+const OF_SCENE: [&str; 1] = ["goal_position"];
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -125,7 +129,7 @@ impl Config {
 
 impl PolicyConfig {
     /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
-    /// added and removed between versions.
+    /// added and removed between versions. What the built-in scene has given it does not hold in another.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -133,9 +137,14 @@ impl PolicyConfig {
         let source = Source { path: path.into(), text: text.into() };
         let (path, mut table) = source.table()?;
         table.retain(|section, _| section == "env" || section == "ppo");
+        let of_builtin = lookup(&table, "env.model").is_none_or(|model| model.as_str() == Some(BUILTIN_MODEL));
         for (section, keys) in &mut table {
-            let is_used = |key: &str| if section == "env" { key != "num_envs" } else { OF_NETS.contains(&key) };
-            keys.as_table_mut().into_iter().for_each(|keys| keys.retain(|key, _| is_used(key)));
+            let is_used = |key: &str, value: &Value| match section.as_str() {
+                "env" if OF_SCENE.contains(&key) => !of_builtin || *value != DEFAULTS["env"][key],
+                "env" => key != "num_envs",
+                _ => OF_NETS.contains(&key),
+            };
+            keys.as_table_mut().into_iter().for_each(|keys| keys.retain(|key, value| is_used(key, value)));
         }
         let Config { env, ppo, .. } = layered(Table::new(), Some((path, table)), overrides)?;
         Ok(Self { env, net: ppo.net() })
@@ -166,12 +175,15 @@ impl Source {
 fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
     let (mut merged, mut problems) = (DEFAULTS.clone(), Vec::new());
     let (file, given) = user.unzip();
-    for table in [Some(under), given].into_iter().flatten() {
-        overlay(&mut merged, &table, &DEFAULTS, "", &mut problems);
-    }
+    let mut named = BTreeSet::new();
+    let mut lay = |table: &Table, merged: &mut Table| {
+        named.extend(OF_SCENE.into_iter().filter(|key| lookup(table, &format!("env.{key}")).is_some()));
+        overlay(merged, table, &DEFAULTS, "", &mut problems);
+    };
+    [Some(under), given].iter().flatten().for_each(|table| lay(table, &mut merged));
     for Override { key, value } in overrides {
         let single = table_of(key, value, &merged);
-        overlay(&mut merged, &single, &DEFAULTS, "", &mut problems);
+        lay(&single, &mut merged);
     }
     // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
     // replaced by its default, so that the other rules can be checked.
@@ -185,7 +197,8 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
             merged[section][key] = default.clone();
         }
     }
-    let config = Config::deserialize(Value::Table(merged))?;
+    let mut config = Config::deserialize(Value::Table(merged))?;
+    config.env.goal_position.named = named.contains("goal_position");
     problems.extend(violations(&config));
     if problems.is_empty() {
         return Ok(config);

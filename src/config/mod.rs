@@ -20,7 +20,7 @@ pub use applicability::expect_used;
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use settings::{
-    Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, NetConfig, PpoConfig, Precision,
+    Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, NetConfig, OfScene, PpoConfig, Precision,
     RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig,
 };
 

@@ -92,9 +92,10 @@ fn floats(value: &Value) -> Vec<f64> {
 
 fn env(config: &Config, rules: &mut Rules) {
     let env = &config.env;
-    let near = env.goal_position.iter().all(|x| x.abs() <= FARTHEST);
+    let place = env.goal_position.value;
+    let near = place.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
-    rules.check(near, "env.goal_position", format!("{:?}", env.goal_position), &rule);
+    rules.check(near, "env.goal_position", format!("{place:?}"), &rule);
     rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;

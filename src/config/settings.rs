@@ -51,7 +51,7 @@ pub struct EnvConfig {
     pub noise: ByGroup,
     pub bias: ByGroup,
     pub max_episode_seconds: f64,
-    pub goal_position: [f64; 3],
+    pub goal_position: OfScene<[f64; 3]>,
     pub target_height: f64,
     pub act_moving_average: f64,
     pub rot_reward_scale: f64,
@@ -68,6 +68,32 @@ pub struct EnvConfig {
     pub reset_dof_pos_noise: f64,
     pub reset_dof_vel_noise: f64,
     pub vel_obs_scale: f64,
+}
+
+/// A setting that the scene gives unless the user names it.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct OfScene<T> {
+    /// The default until the scene is known, unless it is named.
+    pub value: T,
+    /// Whether the value holds whatever the scene says.
+    #[serde(skip)]
+    pub named: bool,
+}
+
+impl<T> OfScene<T> {
+    /// Takes the value of the scene, unless one is named.
+    pub fn settle(&mut self, of_scene: T) {
+        if !self.named {
+            *self = Self { value: of_scene, named: true };
+        }
+    }
+}
+
+impl<T: PartialEq> PartialEq for OfScene<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.value == other.value
+    }
 }
 
 /// Values by the name of a group of the observation; groups that are not named have 0.

@@ -3,7 +3,8 @@
 use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
-use crate::ppo::{CLIP, InputTransform, Policy, ROTATIONS};
+use crate::ppo::{CLIP, InputTransform, Policy};
+use crate::quat::CUBE_ROTATIONS;
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
@@ -52,7 +53,7 @@ fn canonicalize(graph: &mut Graph, size: usize, CubeAndGoal { cube, goal }: Cube
     let mut cosines = [0.0; 4 * 24];
     // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
     let mut products = Vec::new();
-    for (j, &[w, x, y, z]) in ROTATIONS.iter().enumerate() {
+    for (j, &[w, x, y, z]) in CUBE_ROTATIONS.iter().enumerate() {
         [w, -x, -y, -z].into_iter().enumerate().for_each(|(k, value)| cosines[k * 24 + j] = value);
         products.extend([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w]);
     }

@@ -25,8 +25,9 @@ const HAND: &str = "right Shadow Hand, 24 joints, 20 actuators";
 /// Fails if the policy, a setting or the scene cannot be used, or if the file cannot be written.
 pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
-    let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
+    let mut loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
+    loaded.config = task.config().clone();
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file().into_iter().chain(loaded.config.model_file()))?;
     let output = os::OutputFile::create(&args.out)?;

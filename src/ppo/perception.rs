@@ -5,14 +5,12 @@
 //! same actions, and the remaining rotation to the goal is the same. So if each observation is first mapped to one of
 //! the 24 equivalent ones, a policy has to learn only that one.
 
-use std::f32::consts::FRAC_1_SQRT_2;
-
 use anyhow::{Context, Result};
 
 use super::normalizer::Normalizer;
 use super::widest::widest;
 use crate::config::Symmetry;
-use crate::quat;
+use crate::quat::{self, CUBE_ROTATIONS};
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
@@ -20,23 +18,6 @@ pub const CLIP: f32 = 5.0;
 
 /// Added to the variance, so that a constant input does not cause a division by zero.
 const EPSILON: f64 = 1e-5;
-
-const H: f32 = 0.5;
-const R: f32 = FRAC_1_SQRT_2;
-
-/// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
-#[rustfmt::skip]
-pub const ROTATIONS: [[f32; 4]; 24] = [
-    // None, and half turns about an axis through the centres of two faces.
-    [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0],
-    // Quarter turns about the same axes.
-    [R, R, 0.0, 0.0], [R, -R, 0.0, 0.0], [R, 0.0, R, 0.0], [R, 0.0, -R, 0.0], [R, 0.0, 0.0, R], [R, 0.0, 0.0, -R],
-    // Half turns about an axis through the midpoints of two edges.
-    [0.0, R, R, 0.0], [0.0, R, -R, 0.0], [0.0, R, 0.0, R], [0.0, R, 0.0, -R], [0.0, 0.0, R, R], [0.0, 0.0, R, -R],
-    // Third turns about an axis through two corners.
-    [H, H, H, H], [H, -H, H, H], [H, H, -H, H], [H, H, H, -H],
-    [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
-];
 
 /// The symmetry that a policy exploits in raw observations.
 #[derive(Clone, Copy, Debug)]
@@ -75,8 +56,8 @@ impl Perception {
 #[inline(always)]
 fn nearest(cube: [f32; 4]) -> [f32; 4] {
     // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
-    let close = ROTATIONS.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
-    ROTATIONS[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
+    let close = CUBE_ROTATIONS.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
+    CUBE_ROTATIONS[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
 }
 
 /// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
@@ -148,14 +129,14 @@ mod tests {
 
     #[test]
     fn the_rotations_are_the_24_that_take_a_cube_onto_itself() {
-        for (i, &rotation) in ROTATIONS.iter().enumerate() {
+        for (i, &rotation) in CUBE_ROTATIONS.iter().enumerate() {
             let q = rotation.map(f64::from);
             for axis in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
                 let turned = quat::rotate(q, axis);
                 let largest = turned.iter().fold(0.0f64, |most, x| most.max(x.abs()));
                 assert!((largest - 1.0).abs() < 1e-6, "{rotation:?} takes {axis:?} to {turned:?}");
             }
-            for other in &ROTATIONS[..i] {
+            for other in &CUBE_ROTATIONS[..i] {
                 let cosine: f32 = rotation.iter().zip(other).map(|(a, b)| a * b).sum();
                 assert!(cosine.abs() < 0.99, "{rotation:?} is {other:?}");
             }
@@ -168,7 +149,7 @@ mod tests {
             let (cube, goal) = (random(2 * case), random(2 * case + 1));
             let mut seen = observation(cube, goal);
             perceive(Symmetry::Cube, &mut seen);
-            for rotation in ROTATIONS {
+            for rotation in CUBE_ROTATIONS {
                 let turn = |q| quat::mul(q, rotation.map(f64::from));
                 let mut other = observation(turn(cube), turn(goal));
                 perceive(Symmetry::Cube, &mut other);

@@ -28,6 +28,7 @@ impl Diverged {
         let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
         let mut dump = json!({
             "model": config.model,
+            "goal_position": config.goal_position.value,
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
             "iteration": iteration,

@@ -146,7 +146,7 @@ impl Repose {
 
     fn set_goal(&mut self) {
         self.goal = self.draw_rotation();
-        let [x, y, z] = self.task.config.goal_position;
+        let [x, y, z] = self.task.config.goal_position.value;
         let position = [x, y, z + self.task.config.target_height];
         self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
     }
@@ -161,7 +161,7 @@ impl Repose {
     fn outcome(&self, rot_dist_before: f64, previous_action: [f32; ACTION_SIZE]) -> Step {
         let (task, cube, qvel) = (&self.task, self.cube(), self.sim.qvel());
         let rot_dist = quat::angle_between(cube.orientation, self.goal);
-        let offset = [0, 1, 2].map(|axis| cube.position[axis] - task.config.goal_position[axis]);
+        let offset = [0, 1, 2].map(|axis| cube.position[axis] - task.config.goal_position.value[axis]);
         let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
         Step {
             rot_dist_before,
@@ -246,7 +246,7 @@ impl Repose {
         cells.put("cube_quat", quat::canonical(orientation));
         cells.put("cube_linvel", linear);
         cells.put("cube_angvel", angular.map(|x| config.vel_obs_scale * x));
-        cells.put("goal_pos", config.goal_position);
+        cells.put("goal_pos", config.goal_position.value);
         cells.put("goal_quat", quat::canonical(self.goal));
         cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
 
@@ -288,7 +288,7 @@ impl Env for Repose {
             let noise = rng::uniform(&mut self.rng, -config.reset_dof_vel_noise, config.reset_dof_vel_noise);
             self.sim.qvel_mut()[joint.dof] = noise;
         }
-        for (axis, start) in config.goal_position.into_iter().enumerate() {
+        for (axis, start) in config.goal_position.value.into_iter().enumerate() {
             let noise = rng::uniform(&mut self.rng, -config.reset_position_noise, config.reset_position_noise);
             self.sim.qpos_mut()[hand.cube.qpos + axis] = start + noise;
         }

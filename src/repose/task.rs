@@ -8,7 +8,9 @@ use super::Hand;
 use super::hand::CUBE;
 use super::physics::Physics;
 use super::sensing::NoiseStd;
-use crate::config::EnvConfig;
+use crate::config::{EnvConfig, Symmetry};
+use crate::os;
+use crate::quat::CUBE_ROTATIONS;
 use crate::sim::{Compilation, Look, Scene, origin};
 
 /// A scene, the hand in it, and the settings.
@@ -47,9 +49,11 @@ impl Task {
         if let Some(look) = look {
             scene.set_look(look, &nominal);
         }
+        let mut config = config.clone();
+        config.goal_position.settle(nominal.start(hand.cube));
         let noise = NoiseStd::new(&config.noise).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias).context("env.bias")?;
-        Ok(Arc::new(Self { scene, hand, config: config.clone(), noise, bias }))
+        Ok(Arc::new(Self { scene, hand, config, noise, bias }))
     }
 
     /// Returns the settings.
@@ -65,6 +69,38 @@ impl Task {
     /// Returns the scene.
     pub fn scene(&self) -> &Scene {
         &self.scene
+    }
+
+    /// Tells what of a user's scene the settings replace, and that the goal and the start of its cube are those of the scene.
+    pub fn notes(&self) -> Vec<String> {
+        let Some(file) = self.config.model_file() else { return Vec::new() };
+        let (scene, place, own) = (file.display(), self.config.goal_position.value, self.scene.start(self.hand.cube));
+        let (timestep, sim_dt) = (self.scene.own_timestep(), self.config.sim_dt);
+        let mut notes = Vec::new();
+        if timestep != sim_dt {
+            notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
+        }
+        if let keyframes @ [_, ..] = &self.scene.keyframes()[..] {
+            let names: Vec<String> = keyframes.iter().map(|name| format!("`{name}`")).collect();
+            notes.push(format!("keyframes of {scene} are not used: {}", os::shortened(&names.join(", "))));
+        }
+        notes.push(match place == own {
+            true => format!("the cube starts where {scene} has it: env.goal_position = {place:?}"),
+            false => format!("env.goal_position = {place:?} replaces the place of the cube in {scene}, {own:?}"),
+        });
+        notes
+    }
+
+    /// Returns a warning if a policy takes orientations of this cube for the same that are not.
+    pub fn symmetry_warning(&self, symmetry: Symmetry) -> Option<String> {
+        let rotations = self.scene.symmetry(self.hand.cube.body).len();
+        (symmetry == Symmetry::Cube && rotations < CUBE_ROTATIONS.len()).then(|| {
+            format!(
+                "ppo.symmetry = \"cube\": a policy takes 24 orientations of a cube for the same, but the body `{CUBE}` of {} \
+                 has only {rotations} that are alike",
+                origin(self.config.model_file())
+            )
+        })
     }
 
     /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's), and with a centre

@@ -17,6 +17,7 @@ mod panel;
 mod renderer;
 mod scene;
 mod simulation;
+mod symmetry;
 mod variation;
 #[cfg(feature = "viewer")]
 mod viewer;

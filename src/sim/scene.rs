@@ -19,6 +19,8 @@ use super::furnish::furnished;
 #[derive(Clone)]
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
+    /// The timestep in its file, s.
+    pub(super) own_timestep: f64,
 }
 
 /// A hinge joint with limits.
@@ -110,12 +112,13 @@ impl Scene {
     }
 
     fn checked(mut model: MjModel, compilation: &Compilation) -> Result<Self> {
+        let own_timestep = model.opt().timestep;
         compilation.set_options(&mut model);
         let halves = model.opt().integrator != MjtIntegrator::mjINT_RK4 as i32;
         ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
         let awake = model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 == 0;
         ensure!(awake, "sleep is not part of the state that MuJoCo can save; leave sleep switched off");
-        Ok(Self { model: Arc::new(model) })
+        Ok(Self { model: Arc::new(model), own_timestep })
     }
 
     /// Returns a checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
@@ -165,6 +168,22 @@ impl Scene {
         let joint = free.with_context(|| format!("body `{name}` must have a free joint"))?;
         let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
         Ok(FreeJoint { body, qpos, dof })
+    }
+
+    /// Returns the timestep in its file, s, in whose place another is used.
+    pub fn own_timestep(&self) -> f64 {
+        self.own_timestep
+    }
+
+    /// Returns the names of its keyframes.
+    pub fn keyframes(&self) -> Vec<String> {
+        let name = |id| self.model.id_to_name(MjtObjBase::mjOBJ_KEY, id).unwrap_or_default().to_owned();
+        (0..self.model.nkey() as usize).map(name).collect()
+    }
+
+    /// Returns where the scene has the body of a free joint, m.
+    pub fn start(&self, joint: FreeJoint) -> [f64; 3] {
+        *self.model.qpos0()[joint.qpos..].first_chunk().expect("a free joint")
     }
 
     /// Finds the body `name`.

@@ -78,7 +78,7 @@ impl Change {
 impl Scene {
     /// Returns this scene with these changes.
     pub fn varied(&self, changes: &[Change]) -> Self {
-        Self { model: Arc::new(changed((*self.model).clone(), changes, &Workspaces::default())) }
+        Self { model: Arc::new(changed((*self.model).clone(), changes, &Workspaces::default())), ..*self }
     }
 }
 

@@ -39,10 +39,11 @@ struct Vote {
 /// Computes, and leaves reporting and saving to the first.
 pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
-    let plan = Plan::receive(exchange)?;
+    let mut plan = Plan::receive(exchange)?;
+    let task = plan.load_task()?;
     os::start_threads(plan.config.run.threads)?;
     let exchange = exchange.clone().over(plan.config.shards())?;
-    let mut session = Session::new(plan, exchange)?;
+    let mut session = Session::new(plan, task, exchange)?;
     session.agent.exchange.expect_alike(&session.scene)?;
     requests.wait_for_end();
     // The state that the saver begins with.

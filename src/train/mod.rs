@@ -61,9 +61,12 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
+    if let Some(warning) = session.task.symmetry_warning(session.config.ppo.symmetry) {
+        os::say(&format!("warning: {warning}"));
+    }
     if !args.quiet {
         let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-        hints.iter().for_each(|hint| os::say(&format!("note: {hint}")));
+        session.task.notes().iter().chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if args.resume.is_none()
@@ -294,8 +297,9 @@ mod tests {
     use crate::train::start::Plan;
 
     fn from_scratch(sets: &[Override]) -> Session {
-        let plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default()).unwrap();
-        Session::new(plan, Exchange::alone(1)).unwrap()
+        let mut plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default()).unwrap();
+        let task = plan.load_task().unwrap();
+        Session::new(plan, task, Exchange::alone(1)).unwrap()
     }
 
     fn saver_of(session: &Session, place: (RunFolder, Locked)) -> Saver {

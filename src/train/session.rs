@@ -52,12 +52,13 @@ impl Session {
     /// # Errors
     /// Fails as [`Plan::of`] and [`Session::new`] do, or if the run folder cannot be created.
     pub(super) fn lead(args: &TrainArgs, exchange: &Exchange) -> Result<(Self, Saver)> {
-        let (plan, existing) = Plan::of(args)?;
+        let (mut plan, existing) = Plan::of(args)?;
+        let task = plan.load_task()?;
         let exchange = exchange.clone().over(plan.config.shards())?;
         plan.send(&exchange)?;
         let threads = plan.config.run.threads;
         os::start_threads(threads)?;
-        let session = Self::new(plan, exchange)?;
+        let session = Self::new(plan, task, exchange)?;
         if let Some(warning) = session.agent.exchange.expect_alike(&session.scene)?.filter(|_| threads == 0) {
             os::say(&format!("warning: {warning}"));
         }
@@ -70,16 +71,15 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Sets up the planned training.
+    /// Sets up the planned training of a task.
     ///
     /// # Errors
-    /// Fails if the scene or the precision cannot be used, or if it cannot start from what is planned.
-    pub(super) fn new(plan: Plan, exchange: Exchange) -> Result<Self> {
+    /// Fails if the precision cannot be used, or if it cannot start from what is planned.
+    pub(super) fn new(plan: Plan, task: Arc<Task>, exchange: Exchange) -> Result<Self> {
         let Plan { mut config, from, best, context, dumps } = plan;
         let set_up = || {
             // As it is saved.
             config.run.shards = config.shards();
-            let task = Task::new(&config.env)?;
             #[cfg(feature = "video")]
             let films = exchange.is_first().then(|| films(&config)).flatten();
             #[cfg(not(feature = "video"))]

@@ -2,6 +2,7 @@
 //! plan.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
@@ -164,6 +165,17 @@ impl Plan {
         // Scores under different settings are not comparable, so the best one is not kept.
         progress.best = None;
         Ok(Self { from: Some((Takes::Fork, checkpoint)), ..plan })
+    }
+
+    /// Loads the task, and takes over what its scene gives.
+    ///
+    /// # Errors
+    /// Fails if the scene cannot be used.
+    pub(super) fn load_task(&mut self) -> Result<Arc<Task>> {
+        let task = Task::new(&self.config.env);
+        let task = if let Some(context) = &self.context { task.with_context(|| context.clone()) } else { task }?;
+        self.config.env = task.config().clone();
+        Ok(task)
     }
 
     /// Sends the plan to the others, if there are any.

@@ -17,6 +17,7 @@ mod fork;
 mod goal_times;
 mod mpi;
 mod outputs;
+mod own_scene;
 #[cfg(feature = "video")]
 mod pictures;
 mod point_mass;

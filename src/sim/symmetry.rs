@@ -1,0 +1,199 @@
+//! The rotations that map a body onto itself: its shapes that can touch, and its inertia.
+
+use mujoco_rs::prelude::{MjModel, MjtGeomBase};
+
+use super::{Body, Scene};
+use crate::quat::{self, CUBE_ROTATIONS, Quat};
+
+/// The largest difference of lengths and inertias, as a fraction of the largest one, and of entries of rotation matrices.
+const TOLERANCE: f64 = 1e-5;
+
+/// A shape that can touch others, in the frame of the body.
+struct Shape {
+    kind: MjtGeomBase,
+    /// The mesh or height field, -1 for none.
+    data: i32,
+    size: [f64; 3],
+    position: [f64; 3],
+    orientation: Quat,
+}
+
+/// The distribution of mass in the frame of the body.
+#[derive(Default)]
+struct Inertia {
+    /// The mass times the centre of mass.
+    first: [f64; 3],
+    /// The tensor about the origin.
+    second: [[f64; 3]; 3],
+}
+
+impl Scene {
+    /// Returns the numbers of the rotations in [`CUBE_ROTATIONS`] that map a body, with all that is attached to it, onto itself.
+    /// With moving parts there is only the one that rotates nothing.
+    pub fn symmetry(&self, Body(top): Body) -> Vec<usize> {
+        let model = &self.model;
+        let mut frames: Vec<Option<([f64; 3], Quat)>> = vec![None; model.nbody() as usize];
+        frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
+        let (mut inertia, mut moves) = (Inertia::default(), false);
+        // Every body has a higher number than its parent.
+        for body in top..frames.len() {
+            if let Some(parent) = frames[model.body_parentid()[body] as usize].filter(|_| body > top) {
+                frames[body] = Some(inside(parent, model.body_pos()[body], model.body_quat()[body]));
+                moves |= model.body_jntnum()[body] > 0;
+            }
+            if let Some(frame) = frames[body] {
+                inertia.add(model, body, frame);
+            }
+        }
+        let shape = |geom: usize| {
+            let frame = frames[model.geom_bodyid()[geom] as usize]?;
+            let (position, orientation) = inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]);
+            let (kind, data, size) = (model.geom_type()[geom], model.geom_dataid()[geom], model.geom_size()[geom]);
+            touches(model, geom).then_some(Shape { kind, data, size, position, orientation })
+        };
+        let shapes: Vec<Shape> = (0..model.ngeom() as usize).filter_map(shape).collect();
+        let holds = |turn: Quat| {
+            let onto = |shape: &Shape| shapes.iter().any(|other| shape.turned(turn).fills(other));
+            inertia.is_kept(turn) && shapes.iter().all(onto)
+        };
+        let turns = CUBE_ROTATIONS.iter().map(|turn| quat::normalized(turn.map(f64::from)));
+        turns.enumerate().filter(|&(i, turn)| i == 0 || !moves && holds(turn)).map(|(i, _)| i).collect()
+    }
+}
+
+/// Returns whether a geom can be in a contact.
+fn touches(model: &MjModel, geom: usize) -> bool {
+    let pairs = [model.pair_geom1(), model.pair_geom2()];
+    model.geom_contype()[geom] != 0
+        || model.geom_conaffinity()[geom] != 0
+        || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
+}
+
+/// Returns the pose inside a frame as one in the frame's own surroundings.
+fn inside((origin, axes): ([f64; 3], Quat), position: [f64; 3], orientation: Quat) -> ([f64; 3], Quat) {
+    let [x, y, z] = quat::rotate(axes, position);
+    ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))
+}
+
+/// Returns the rotation as a matrix: its columns are the rotated axes.
+fn matrix(turn: Quat) -> [[f64; 3]; 3] {
+    let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| quat::rotate(turn, axis));
+    [0, 1, 2].map(|row| columns.map(|column| column[row]))
+}
+
+/// Returns whether values are equal but for rounding.
+fn alike<'a>(a: impl IntoIterator<Item = &'a f64>, b: impl IntoIterator<Item = &'a f64>, scale: f64) -> bool {
+    a.into_iter().zip(b).all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
+}
+
+impl Shape {
+    fn turned(&self, turn: Quat) -> Self {
+        let (position, orientation) = inside(([0.0; 3], turn), self.position, self.orientation);
+        Self { position, orientation, ..*self }
+    }
+
+    /// Returns whether this shape is in the place of another and fills the same space.
+    fn fills(&self, other: &Self) -> bool {
+        let scale = self.size.iter().chain(&self.position).fold(0.0, |most: f64, x| most.max(x.abs()));
+        if (self.kind, self.data) != (other.kind, other.data) || !alike(&self.position, &other.position, scale) {
+            return false;
+        }
+        let between = matrix(quat::mul(quat::conj(other.orientation), self.orientation));
+        let size = match self.kind {
+            MjtGeomBase::mjGEOM_SPHERE => self.size,
+            // Their axis is z.
+            MjtGeomBase::mjGEOM_CAPSULE | MjtGeomBase::mjGEOM_CYLINDER if between[2][2].abs() >= 1.0 - TOLERANCE => {
+                self.size
+            }
+            MjtGeomBase::mjGEOM_BOX | MjtGeomBase::mjGEOM_ELLIPSOID => {
+                let axis = |row: [f64; 3]| (0..3).find(|&j| row[j].abs() >= 1.0 - TOLERANCE);
+                let [Some(x), Some(y), Some(z)] = between.map(axis) else { return false };
+                [x, y, z].map(|axis| self.size[axis])
+            }
+            _ if (0..3).all(|i| between[i][i] >= 1.0 - TOLERANCE) => self.size,
+            _ => return false,
+        };
+        alike(&size, &other.size, scale)
+    }
+}
+
+impl Inertia {
+    fn add(&mut self, model: &MjModel, body: usize, frame: ([f64; 3], Quat)) {
+        let (mass, principal) = (model.body_mass()[body], model.body_inertia()[body]);
+        let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
+        let (axes, square) = (matrix(axes), centre.iter().map(|x| x * x).sum::<f64>());
+        for i in 0..3 {
+            self.first[i] += mass * centre[i];
+            for j in 0..3 {
+                let own: f64 = (0..3).map(|k| axes[i][k] * principal[k] * axes[j][k]).sum();
+                let all = if i == j { square } else { 0.0 };
+                self.second[i][j] += own + mass * (all - centre[i] * centre[j]);
+            }
+        }
+    }
+
+    /// Returns whether the rotation leaves it as it is.
+    fn is_kept(&self, turn: Quat) -> bool {
+        let (rotation, second) = (matrix(turn), &self.second);
+        let turned = [0, 1, 2].map(|i| {
+            [0, 1, 2].map(|j| -> f64 {
+                let terms = (0..9).map(|at| rotation[i][at / 3] * second[at / 3][at % 3] * rotation[j][at % 3]);
+                terms.sum()
+            })
+        });
+        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+        let (first, second) = (quat::rotate(turn, self.first), second.as_flattened());
+        // A centre of mass that is off by a rounding error does not count.
+        let mass_times_length = largest(&self.first).max(1e-9);
+        alike(&first, &self.first, mass_times_length) && alike(turned.as_flattened(), second, largest(second))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::super::Compilation;
+    use super::*;
+
+    fn symmetry_of(object: &str) -> usize {
+        let text = format!("<mujoco><worldbody><body name='cube'><freejoint/>{object}</body></worldbody></mujoco>");
+        let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
+        file.write_all(text.as_bytes()).unwrap();
+        let scene = Scene::load(Some(file.path()), &Compilation::plain(0.01)).unwrap();
+        scene.symmetry(scene.body("cube").unwrap()).len()
+    }
+
+    #[test]
+    fn an_object_has_the_rotations_of_a_cube_that_map_its_shapes_and_its_inertia_onto_themselves() {
+        let cube = "<geom type='box' size='.025 .025 .025'/>";
+        for (rotations, object) in [
+            (24, cube),
+            (24, "<geom type='sphere' size='.03'/>"),
+            (8, "<geom type='box' size='.025 .025 .03'/>"),
+            (8, "<geom type='cylinder' size='.025 .025'/>"),
+            (8, "<geom type='capsule' size='.02 .025' euler='90 0 0'/>"),
+            (4, "<geom type='box' size='.025 .02 .03'/>"),
+            (4, "<geom type='ellipsoid' size='.025 .02 .03'/>"),
+            (
+                2,
+                "<geom type='box' size='.03 .015 .015' pos='.015 0 0'/><geom type='box' size='.015 .03 .015' pos='0 .015 0'/>",
+            ),
+            (1, "<geom type='box' size='.03 .015 .015'/><geom type='box' size='.015 .02 .01' pos='-.015 .015 0'/>"),
+            (24, &format!("{cube}<geom type='box' size='.01 .02 .03' contype='0' conaffinity='0' mass='0'/>")),
+            (4, &format!("{cube}<geom type='sphere' size='.01' pos='0 0 .02' contype='0' conaffinity='0'/>")),
+            (24, &format!("{cube}<body><geom type='sphere' size='.01'/></body>")),
+            (4, &format!("{cube}<body pos='0 .03 0'><geom type='sphere' size='.01'/></body>")),
+            (1, &format!("{cube}<body><joint/><geom type='sphere' size='.01'/></body>")),
+            (8, "<inertial pos='0 0 0' mass='.1' diaginertia='1e-4 1e-4 1.1e-4'/><geom type='sphere' size='.03'/>"),
+        ] {
+            assert_eq!(symmetry_of(object), rotations, "{object}");
+        }
+    }
+
+    #[test]
+    fn the_cube_of_the_built_in_scene_has_all_24() {
+        let scene = Scene::load(None, &Compilation::plain(0.01)).unwrap();
+        assert_eq!(scene.symmetry(scene.body("cube").unwrap()), (0..24).collect::<Vec<_>>());
+    }
+}
