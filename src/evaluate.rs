@@ -158,13 +158,18 @@ impl Trial<'_> {
         Ok(self.play(&mut observer)?.map(|played| Score::of(&played)))
     }
 
-    /// Plays the episodes that `exchange` deals here, and returns all of them in order, or `None` if they were interrupted.
+    /// Plays the episodes that `exchange` deals here, seen by the observer, and returns all of them in order, or `None` if they were
+    /// interrupted.
     ///
     /// # Errors
-    /// Fails with the episode's number if an episode panics.
-    pub fn play_together(&self, exchange: &Exchange) -> Result<Option<Vec<EpisodeStats>>> {
+    /// Fails as [`Trial::play`] does.
+    pub fn play_together(
+        &self,
+        exchange: &Exchange,
+        observer: &mut dyn FnMut(Moment) -> Result<()>,
+    ) -> Result<Option<Vec<EpisodeStats>>> {
         let own = exchange.own(LANES.min(self.episodes.count));
-        let Some(own) = self.play_lanes(own, &mut |_| Ok(()))? else { return Ok(None) };
+        let Some(own) = self.play_lanes(own, observer)? else { return Ok(None) };
         let mut all = exchange.all_gather(own).concat();
         all.sort_unstable_by_key(|(number, _)| *number);
         Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))

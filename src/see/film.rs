@@ -134,13 +134,23 @@ impl EpisodeFilms {
         Ok(Self { task, frames })
     }
 
-    /// Plays the first of `episodes` as an evaluation does and returns its first 20 s; `None` if `stop` was set meanwhile.
+    /// Plays the first of `episodes` as an evaluation does and returns its first 20 s; `None` if `stop` was set meanwhile. Calls
+    /// `meanwhile` in each step.
     ///
     /// # Errors
     /// Fails if OpenGL does.
-    pub fn film(&mut self, actor: &Actor, episodes: Episodes, stop: &AtomicBool) -> Result<Option<Animation>> {
+    pub fn film(
+        &mut self,
+        actor: &Actor,
+        episodes: Episodes,
+        stop: &AtomicBool,
+        meanwhile: &mut dyn FnMut(),
+    ) -> Result<Option<Animation>> {
         let mut frames = Vec::new();
-        let mut observe = |moment: Moment| self.frames.draw_due(&moment, |frame| frames.push(frame));
+        let mut observe = |moment: Moment| {
+            meanwhile();
+            self.frames.draw_due(&moment, |frame| frames.push(frame))
+        };
         let one = Episodes { count: 1, ..episodes };
         let played = Trial { task: &self.task, actor, episodes: one, stop }.play(&mut observe)?;
         played.map(|_| Ok(Animation { size: ANIMATION.size, gif: gif_of(frames, ANIMATION)? })).transpose()

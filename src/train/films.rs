@@ -1,15 +1,15 @@
 //! Films of evaluation episodes for the event file.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::AtomicBool;
 
 use anyhow::{Error, anyhow};
 
+use super::saver::Lead;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes};
-use crate::os;
+use crate::os::{self, Requests};
 use crate::ppo::Policy;
-use crate::run::{Animation, Report};
+use crate::run::Animation;
 use crate::schedule::panic_message;
 use crate::see::EpisodeFilms;
 
@@ -19,22 +19,23 @@ pub(super) fn films(config: &Config) -> Option<EpisodeFilms> {
     films.inspect_err(|error| os::say(&format!("warning: {}", absent(error)))).ok()
 }
 
-/// Films the first of `episodes` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if `stop`
-/// was set meanwhile. After a failure there are no more films.
+/// Films the first of `episodes` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if a stop
+/// was requested meanwhile. After a failure there are no more films.
 pub(super) fn film(
     films: &mut Option<EpisodeFilms>,
     policy: &Policy,
     episodes: Episodes,
-    stop: &AtomicBool,
-    report: &Report,
+    requests: &Requests,
+    lead: &mut Lead,
 ) -> Option<Animation> {
     let filming = films.as_mut()?;
-    let film = || filming.film(&Actor::Mean(policy.freeze()), episodes, stop);
+    let mut meanwhile = || lead.save_if_asked(requests);
+    let film = || filming.film(&Actor::Mean(policy.freeze()), episodes, requests.stop(), &mut meanwhile);
     // A film that fails must not end the training, even by a panic.
     let made = catch_unwind(AssertUnwindSafe(film));
     let made = made.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
     made.unwrap_or_else(|error| {
-        report.warn(&absent(&error));
+        lead.report.warn(&absent(&error));
         *films = None;
         None
     })

@@ -13,7 +13,6 @@ mod start;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, Error, Result, anyhow};
 
@@ -24,7 +23,7 @@ use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::Evaluation;
 use crate::ranks::{self, Exchange};
 use crate::repose::{Repose, Score, StepSums, divergence};
-use crate::run::{Media, Report, RunFolder};
+use crate::run::{Media, Report};
 use crate::schedule::panic_message;
 #[cfg(feature = "video")]
 use films::film;
@@ -32,7 +31,7 @@ use hints::hints;
 use lockstep::{STOPPED, follow};
 use log::{Ended, described, histograms, row, tags};
 use outcome::Outcome;
-use saver::Saver;
+use saver::{Lead, Saver};
 use session::Session;
 
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
@@ -89,7 +88,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
 /// Iterates until all steps are made or a stop is requested, and returns the exit code.
 fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
     while !session.finished() {
-        let outcome = match session.iterate(requests, Some((report, &saver.held.folder))) {
+        let outcome = match session.iterate(requests, Some(Lead { report, saver: &mut saver })) {
             Ok(Some(outcome)) => outcome,
             Ok(None) => return stop(saver, report, os::exit_code(requests.signal()), STOPPED),
             Err(error) => return Err(give_up(error, saver, report)),
@@ -111,10 +110,8 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
         if let Some((code, reason)) = outcome.decision.stop {
             return stop(saver, report, code, reason);
         }
-        if outcome.decision.save
-            && let Err(error) = saver.save(report)
-        {
-            report.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
+        if outcome.decision.save {
+            saver.save_or_warn(report);
         }
     }
     saver.save_at_last(report)?;
@@ -124,25 +121,24 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
 }
 
 impl Session {
-    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Who leads passes the report
-    /// and the folder. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
+    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Who leads passes what reports
+    /// and saves. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
     /// at the end of the previous one can be used.
     ///
     /// # Errors
     /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
-    fn iterate(&mut self, requests: &Requests, place: Option<(&Report, &RunFolder)>) -> Result<Option<Outcome>> {
+    fn iterate(&mut self, requests: &Requests, mut lead: Option<Lead>) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
-        // With others, nobody can stop in the middle of an iteration: they wait for what is computed here.
-        let never = AtomicBool::new(false);
-        let stop = if self.agent.exchange.is_alone() { requests.stop() } else { &never };
+        // With others, nobody can stop or save in the middle of an iteration: they wait for what is computed here.
+        let never = Requests::none();
+        let now = if self.agent.exchange.is_alone() { requests } else { &never };
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
-            let Some(iteration) = self.agent.iterate(stop)? else { return Ok(None) };
+            let Some(iteration) = self.agent.iterate(now.stop())? else { return Ok(None) };
             let traffic = self.agent.exchange.take_traffic();
-            let report = place.map(|(report, _)| report);
-            let Some(evaluation) = self.evaluate(stop, report)? else { return Ok(None) };
-            let Some(media) = self.media(stop, report) else { return Ok(None) };
+            let Some(evaluation) = self.evaluate(now, lead.as_mut())? else { return Ok(None) };
+            let Some(media) = self.media(now, lead.as_mut()) else { return Ok(None) };
             let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
             let improved = found.beats(self.best);
             self.best = if improved { Some(found) } else { self.best };
@@ -155,7 +151,8 @@ impl Session {
                 total
             };
             let steps = exchange.sum(&sums, total, |sum, more| *sum += more);
-            let decision = self.decide(requests, place.is_some_and(|(_, folder)| folder.take_stop()), improved)?;
+            let decision =
+                self.decide(requests, lead.is_some_and(|lead| lead.saver.held.folder.take_stop()), improved)?;
             Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, media, decision }))
         };
         let caught = catch_unwind(AssertUnwindSafe(iterate));
@@ -163,20 +160,20 @@ impl Session {
         result.with_context(|| format!("iteration {number}"))
     }
 
-    /// Returns the histograms and the film that are due after this iteration; `None` if `stop` was set meanwhile. Without a report
-    /// there are none.
-    #[cfg_attr(not(feature = "video"), expect(unused_variables, reason = "only a film may be stopped and warn"))]
-    fn media(&mut self, stop: &AtomicBool, report: Option<&Report>) -> Option<Media> {
+    /// Returns the histograms and the film that are due after this iteration; `None` if a stop was requested meanwhile. Only who
+    /// leads has some.
+    #[cfg_attr(not(feature = "video"), expect(unused_variables, reason = "only a film answers requests and may warn"))]
+    fn media(&mut self, requests: &Requests, lead: Option<&mut Lead>) -> Option<Media> {
         let mut media = Media::default();
-        let Some(report) = report else { return Some(media) };
+        let Some(lead) = lead else { return Some(media) };
         if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
             media.histograms = histograms(&self.agent.rollout);
         }
         #[cfg(feature = "video")]
         if self.films.is_some() && self.agent.iteration.is_multiple_of(self.config.run.film_every) {
             let episodes = self.evaluation_episodes();
-            let film = film(&mut self.films, self.agent.ppo.policy(), episodes, stop, report);
-            if stop.load(std::sync::atomic::Ordering::Relaxed) {
+            let film = film(&mut self.films, self.agent.ppo.policy(), episodes, requests, lead);
+            if requests.stop().load(std::sync::atomic::Ordering::Relaxed) {
                 return None;
             }
             media.film = film.map(|film| (log::FILM, film));
@@ -189,16 +186,20 @@ impl Session {
         Episodes { seed, purpose: "evaluation", first: 0, count }
     }
 
-    /// Plays the evaluation episodes, if that is due, and reports their score; returns `None` if `stop` was set meanwhile.
-    fn evaluate(&self, stop: &AtomicBool, report: Option<&Report>) -> Result<Option<Score>> {
+    /// Plays the evaluation episodes, if that is due, and reports their score; returns `None` if a stop was requested meanwhile.
+    fn evaluate(&self, requests: &Requests, mut lead: Option<&mut Lead>) -> Result<Option<Score>> {
         if !evaluates(self.agent.iteration, self.config.run.eval_every) {
             return Ok(Some(Score::of(&[])));
         }
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
-        let trial = Trial { task: &self.task, actor: &actor, episodes: self.evaluation_episodes(), stop };
-        let played = trial.play_together(&self.agent.exchange)?;
+        let trial =
+            Trial { task: &self.task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
+        let played = trial.play_together(&self.agent.exchange, &mut |_| {
+            lead.iter_mut().for_each(|lead| lead.save_if_asked(requests));
+            Ok(())
+        })?;
         let Some(score) = played.map(|played| Score::of(&played)) else { return Ok(None) };
-        if let Some(report) = report {
+        if let Some(Lead { report, .. }) = lead {
             report.say(&format!(
                 "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
                 self.agent.env_steps,
@@ -294,6 +295,7 @@ mod tests {
     use crate::config::Override;
     use crate::os::Locked;
     use crate::ppo::Checkpoint;
+    use crate::run::RunFolder;
     use crate::train::start::Plan;
 
     fn from_scratch(sets: &[Override]) -> Session {
@@ -324,11 +326,14 @@ mod tests {
         let mut saver = saver_of(&session, RunFolder::create(Some(place.path()), None).unwrap());
         let (mut report, never) = (new_report(&session, &saver, true), Requests::none());
         saver.open_folder(&mut report).unwrap();
-        assert!(session.iterate(&never, Some((&report, &saver.held.folder))).unwrap().is_some(), "nothing stops it");
+        assert!(
+            session.iterate(&never, Some(Lead { report: &mut report, saver: &mut saver })).unwrap().is_some(),
+            "nothing stops it"
+        );
         saver.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
-        let error = session.iterate(&never, Some((&report, &saver.held.folder))).unwrap_err();
+        let error = session.iterate(&never, Some(Lead { report: &mut report, saver: &mut saver })).unwrap_err();
         let latest = saver.held.folder.checkpoints().latest();
         let error = format!("{:#}", give_up(error, saver, &mut report));
         assert!(error.contains("iteration 2: panic: "), "{error}");

@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::load::{self, MODEL};
-use crate::os::{self, Locked};
+use crate::os::{self, Locked, Requests};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -142,6 +142,13 @@ impl Saver {
         Ok(())
     }
 
+    /// Saves, and prints a warning if that is not possible now.
+    pub(super) fn save_or_warn(&mut self, report: &mut Report) {
+        if let Err(error) = self.save(report) {
+            report.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
+        }
+    }
+
     /// Saves for the last time and ends the report. If the folder cannot be written to, the state is saved elsewhere. Before the
     /// first iteration of a resumed run there is nothing to save.
     ///
@@ -171,6 +178,23 @@ impl Saver {
                 Err(error) => os::say(&format!("error: {:#}", held.elsewhere(error))),
             }
         });
+    }
+}
+
+/// What only the first of all ranks has.
+pub(super) struct Lead<'a> {
+    /// What it reports to.
+    pub report: &'a mut Report,
+    /// What saves its training.
+    pub saver: &'a mut Saver,
+}
+
+impl Lead<'_> {
+    /// Saves the state at the end of the last complete iteration, if that is requested. What takes long calls this meanwhile.
+    pub(super) fn save_if_asked(&mut self, requests: &Requests) {
+        if self.saver.held.wrote && requests.take_save() {
+            self.saver.save_or_warn(self.report);
+        }
     }
 }
 

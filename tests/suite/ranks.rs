@@ -193,7 +193,7 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
                 let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
                 let actor = Actor::Mean(ppo.policy().freeze());
                 let trial = Trial { task: &task, actor: &actor, episodes, stop: &never };
-                trial.play_together(&exchange).unwrap().unwrap()
+                trial.play_together(&exchange, &mut |_| Ok(())).unwrap().unwrap()
             };
             let mut together = on_ranks(ranks, 4, work);
             assert!(together.swap_remove(0) == alone, "{count} episodes on {ranks} ranks");

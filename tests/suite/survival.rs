@@ -295,6 +295,22 @@ fn sigusr1_saves_and_goes_on() {
 }
 
 #[test]
+fn sigusr1_during_an_evaluation_saves_the_last_complete_iteration_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    // The evaluation of the second iteration takes hours.
+    let evaluation = ["run.eval_every=2", "run.eval_episodes=1000000"];
+    let (child, lines) = endless(folder.path(), &["--set", evaluation[0], "--set", evaluation[1]]);
+    send("USR1", &child);
+    let (saved, patience) = (folder.path().join("run/checkpoints/iteration-00000001.safetensors"), Instant::now());
+    while !saved.exists() {
+        assert!(patience.elapsed() < Duration::from_secs(30), "no checkpoint is written");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!(ended_by("TERM", child, lines).0, Some(143));
+    assert_eq!(iterations(folder.path()), 1, "the evaluation was still running");
+}
+
+#[test]
 fn a_time_limit_saves_and_exits_with_0() {
     let folder = tempfile::tempdir().unwrap();
     let args = train(&["--total-steps", "100000000", "--run-dir", "run", "--stop-after", "500ms"]);
