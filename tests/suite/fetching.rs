@@ -4,14 +4,17 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use crate::support::{command, names};
+use shadow_repose::sim::mesh_files;
 
-/// Draws a picture with an empty cache, for which the meshes are fetched. What the folder and the variables contain is hostile.
-fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) {
+use crate::support::{command, names, stderr};
+
+/// Draws a picture, for which the meshes are fetched, and returns what the program says. What the folder and the variables contain
+/// is hostile.
+fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) -> String {
     let args = ["view", "--screenshot", "hand.png", "--size", "64x64", "--quality", "fast"];
     let mut command = command(folder, &args);
     command.env("XDG_CACHE_HOME", cache).envs(variables.iter().copied());
-    command.output().unwrap();
+    stderr(&command.output().unwrap())
 }
 
 #[test]
@@ -77,4 +80,17 @@ fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
         assert!(download.contains(&line), "{line}{download}");
     }
     assert!(download.contains(&format!("PIP_CERT={}\n", folder.join("ca.pem").display())), "{download}");
+}
+
+#[test]
+fn damaged_meshes_are_fetched_again_and_where_that_fails_the_folder_to_delete_is_named() {
+    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let meshes = cache.path().join("shadow-repose/shadow-hand-meshes");
+    fs::create_dir_all(&meshes).unwrap();
+    mesh_files().into_iter().for_each(|name| fs::write(meshes.join(name), "v nan nan nan").unwrap());
+    // Without a program named python3 nothing can be fetched.
+    let said = draw(place.path(), cache.path(), &[("PATH", place.path().to_str().unwrap())]);
+    assert!(said.contains("fetching the meshes") && said.contains("python3 could not be started"), "{said}");
+    let advice = format!("the meshes in {} are damaged; deleting this folder may help", meshes.display());
+    assert!(said.contains(&advice), "{said}");
 }
