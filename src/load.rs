@@ -178,12 +178,18 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
     Checkpoint::parse(&bytes).with_context(|| cannot_use(path))
 }
 
-/// Returns the first of these files (newest first) that is not damaged, and prints a warning for each one before it. A file that
-/// cannot be read or used is not skipped: it may be usable later, and continuing from an older one would discard its progress.
+/// Returns the first of the listed files (newest first) that is not damaged, and prints a warning for each one before it. A file
+/// that cannot be read or used is not skipped: it may be usable later, and continuing from an older one would discard its
+/// progress. If one has vanished since it was listed, as where a training goes on, the list is made once more.
 ///
 /// # Errors
 /// Fails if there is no file, if one cannot be read or used, or if all are damaged (with the error of the last one).
-pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
+pub fn newest_sound(list: impl Fn() -> Result<Vec<PathBuf>>) -> Result<(PathBuf, Checkpoint)> {
+    let found = || first_sound(&list()?);
+    found().or_else(|error| if is_absence(&error) { found() } else { Err(error) })
+}
+
+fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
@@ -195,7 +201,7 @@ pub fn newest_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
 }
 
 /// Returns whether the file is not there.
-pub fn is_absence(error: &Error) -> bool {
+fn is_absence(error: &Error) -> bool {
     let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     kinds.map(std::io::Error::kind).any(|kind| kind == std::io::ErrorKind::NotFound)
 }
@@ -261,4 +267,25 @@ fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
         bail!("it uses a custom scene, and no path in a file is followed: add --set {set} to use that scene");
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[test]
+    fn a_checkpoint_that_vanishes_between_listing_and_reading_is_looked_for_once_more() {
+        let place = tempfile::tempdir().unwrap();
+        let [gone, there] = ["gone", "there"].map(|name| place.path().join(name));
+        os::write_whole(&there, BUILTIN[0].bytes).unwrap();
+        let lists = Cell::new(0);
+        let list = || {
+            lists.set(lists.get() + 1);
+            Ok(vec![if lists.get() == 1 { gone.clone() } else { there.clone() }])
+        };
+        assert_eq!(newest_sound(list).unwrap().0, there);
+        assert!(is_absence(&newest_sound(|| Ok(vec![gone.clone()])).err().unwrap()));
+    }
 }

@@ -139,4 +139,16 @@ mod tests {
             assert!(svg.contains(text), "{text}");
         }
     }
+
+    #[test]
+    fn no_character_that_xml_does_not_allow_is_drawn() {
+        let odd = || "a\u{1}\u{ffff}<".to_owned();
+        let bars = vec![NamedBar { name: odd(), value: 1.0, interval: [1.0; 2], note: odd() }];
+        let map = HeatMap { columns: vec![odd()], rows: vec![odd()], cells: vec![vec![0.5]] };
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("bars.svg");
+        BarChart { title: odd(), bars, map }.write(OutputFile::create(&path).unwrap()).unwrap();
+        let svg = crate::os::read_text(&path).unwrap();
+        assert_eq!(svg.matches("a\u{fffd}\u{fffd}&lt;").count(), 5, "{svg}");
+    }
 }

@@ -107,7 +107,7 @@ impl Plan {
         );
         let lock = folder.lock()?;
         let newest = checkpoints.newest_first();
-        let (path, checkpoint) = load::newest_sound(&checkpoints_at(&place)?)
+        let (path, checkpoint) = load::newest_sound(|| checkpoints_at(&place))
             .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
         let config = load::for_training(&checkpoint, &path, &overrides(args));
@@ -135,10 +135,7 @@ impl Plan {
             bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
         }
         let context = || format!("cannot fork {}", place.display());
-        let newest = || load::newest_sound(&checkpoints_at(place)?).with_context(context);
-        // Where a training goes on, a checkpoint may vanish between listing and reading.
-        let (path, checkpoint) =
-            newest().or_else(|error| if load::is_absence(&error) { newest() } else { Err(error) })?;
+        let (path, checkpoint) = load::newest_sound(|| checkpoints_at(place)).with_context(context)?;
         let context = format!("cannot fork {}", path.display());
         let plan = Self::forked(&path, checkpoint, args).with_context(|| context.clone())?;
         Ok(Self { context: Some(context), ..plan })

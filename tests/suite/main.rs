@@ -8,6 +8,7 @@
 mod architecture;
 mod bad_input;
 mod binary;
+mod curves;
 mod docs;
 mod experiment;
 mod export;
@@ -18,6 +19,7 @@ mod goal_times;
 mod mpi;
 mod outputs;
 mod own_scene;
+mod permissions;
 #[cfg(feature = "video")]
 mod pictures;
 mod point_mass;

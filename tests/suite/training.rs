@@ -11,7 +11,7 @@ use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, OBSERVATION_SIZE, Repose, SPACES};
 use shadow_repose::rng;
 
-use crate::support::{config, started, started_agent, task};
+use crate::support::{config, program, started, started_agent, stderr, succeeded, task, train};
 
 const CUBE_ORIENTATION: usize = 51;
 const GOAL_ORIENTATION: usize = 64;
@@ -304,4 +304,19 @@ fn values_are_clipped_unless_the_clip_is_0() {
     assert_eq!(clip(&["ppo.value_clip=0"]), f64::INFINITY);
     assert_eq!(clip(&["ppo.clip=0.3", "ppo.value_clip=7"]), 7.0);
     assert_eq!(clip(&[]), 0.2);
+}
+
+#[test]
+fn a_policy_that_moves_far_more_than_it_should_for_twenty_iterations_is_warned_of_once() {
+    let place = tempfile::tempdir().unwrap();
+    let warnings = |iterations: u32| {
+        let (run, steps) = (format!("run-{iterations}"), (128 * iterations).to_string());
+        let mut args = train(&["--total-steps", &steps, "--run-dir", &run]);
+        // No learning rate in the range makes steps as small as that.
+        let sets = ["ppo.desired_kl=1e-9", "ppo.learning_rate_range=[1e-3,1e-2]", "ppo.learning_rate=1e-3"];
+        sets.iter().for_each(|set| args.extend(["--set", set]));
+        let said = stderr(&succeeded(program(place.path(), &args)));
+        said.matches("warning: policy/kl has been more than 10 times ppo.desired_kl").count()
+    };
+    assert_eq!([19, 50].map(warnings), [0, 1]);
 }
