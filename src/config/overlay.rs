@@ -28,6 +28,12 @@ pub(super) fn number(value: &Value) -> Option<f64> {
     value.as_float().or(value.as_integer().map(|x| x as f64))
 }
 
+/// Returns a number as text: `1e300` rather than 301 digits.
+pub(super) fn brief(x: f64) -> String {
+    let text = x.to_string();
+    if text.len() > 20 { format!("{x:e}") } else { text }
+}
+
 /// Returns whether a table of the base is a ramp, rather than a section or values by group.
 pub(super) fn is_ramp(table: &Table) -> bool {
     table.contains_key("from")
@@ -83,13 +89,20 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
                 expected = given.keys().map(|name| (name.clone(), 0.0.into())).collect();
             }
             let target = merged[key].as_table_mut().expect("the merged tables are those of the base");
-            overlay(target, &given, &expected, &format!("{name}."), problems);
+            let parts = format!("{name}.");
+            overlay(target, &given, &expected, &parts, problems);
+            // The other parts alone are no ramp that anybody wrote, so no other rule applies to them.
+            if is_ramp(&expected) && problems.iter().any(|problem| problem.starts_with(&parts)) {
+                merged[key] = base[key].clone();
+            }
             continue;
         }
         match typed(expected, value) {
             Ok(value) => drop(merged.insert(key.clone(), value)),
             Err(rule) => {
-                let [name, value] = [&name, &value.to_string()].map(|text| shortened(text));
+                let number = value.as_float().filter(|x| x.is_finite());
+                let value = number.map_or_else(|| value.to_string(), brief);
+                let [name, value] = [&name, &value].map(|text| shortened(text));
                 problems.push(format!("{name} = {value}: must be {rule}"));
             }
         }
@@ -123,6 +136,12 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::Array(expected), Value::Array(values)) => {
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&expected[0], v)).collect();
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
+        }
+        (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
+            // A `--set` whose text could not be parsed.
+            let reason = format!("value = {text}").parse::<Table>().err();
+            let reason = reason.map_or_else(String::new, |error| format!(": {}", shortened(error.message().trim())));
+            Err(format!("a table of TOML{reason}"))
         }
         (Value::Float(_), _) => Err("a number".into()),
         (Value::Integer(_), _) => Err("a whole number, not negative".into()),
@@ -158,4 +177,51 @@ fn unknown(name: &str) -> String {
     let hint = hint.unwrap_or_else(|| "configs/repose.toml lists all of them".into());
     let cut = if name.len() > LONGEST_SHOWN { "…" } else { "" };
     format!("{}{cut}: unknown key; {hint}", name.chars().take(LONGEST_SHOWN).collect::<String>())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::Config;
+
+    fn errors(sets: &[&str]) -> String {
+        let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
+        Config::resolve(None, &sets).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_table_that_is_no_toml_is_refused_with_the_reason() {
+        for (bad, reason) in [
+            ("training.tolerance={from=1,from=2,to=1,steps=1}", "duplicate key"),
+            ("env.noise={joint_pos=1,joint_pos=2}", "duplicate key"),
+            ("training.tolerance={from=1 to=2}", "expected `,`"),
+        ] {
+            let text = errors(&[bad]);
+            assert!(text.contains(": must be a table of TOML: ") && text.contains(reason), "{bad}: {text}");
+        }
+        let file = Config::from_text(Path::new("x.toml"), "[training]\ntolerance = {from=1,from=2}", &[]).unwrap_err();
+        assert!(file.to_string().contains("duplicate key"), "{file}");
+    }
+
+    #[test]
+    fn of_a_ramp_with_a_wrong_part_only_that_part_is_told() {
+        for sets in [["ppo.horizon.from=2.5", "ppo.horizon.to=5"], ["ppo.horizon.to=5", "ppo.horizon.from=2.5"]] {
+            let text = errors(&sets);
+            assert_eq!(text.matches("\n  ").count(), 1, "{text}");
+            assert!(text.contains("ppo.horizon.from = 2.5: must be a whole number"), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_huge_number_is_told_in_few_digits() {
+        for (bad, told) in [
+            ("training.tolerance.steps=1e300", "training.tolerance.steps = 1e300: must be a whole number"),
+            ("training.tolerance=-1e300", "training.tolerance = -1e300: must be above 0"),
+            ("env.rot_eps=1e300", "env.rot_eps = 1e300: must be at most 1000000000"),
+        ] {
+            let text = errors(&[bad]);
+            assert!(text.contains(told), "{bad}: {text}");
+        }
+    }
 }

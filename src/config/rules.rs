@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use toml::{Table, Value};
 
-use super::overlay::{is_ramp, lookup, number, settings};
+use super::overlay::{brief, is_ramp, lookup, number, settings};
 use super::settings::{Backend, Config, Precision};
 use crate::os::shortened;
 
@@ -70,7 +70,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     for (key, value) in settings(&table).filter(|(key, _)| limited.iter().any(|section| key.starts_with(section))) {
         let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
         if let Some(x) = too_large.filter(|_| key != "training.hold") {
-            rules.check(false, &key, x, &format!("be at most {LARGEST} in magnitude"));
+            rules.check(false, &key, brief(x), &format!("be at most {LARGEST} in magnitude"));
         }
     }
     env(config, &mut rules);
@@ -200,7 +200,7 @@ impl Rules {
         };
         for (name, value) in numbers {
             let x = number(value).expect("a number");
-            self.check(holds(x), &name, x, rule);
+            self.check(holds(x), &name, brief(x), rule);
         }
     }
 }
