@@ -11,7 +11,7 @@ use shadow_repose::load;
 use shadow_repose::os::StatusLine;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, SPACES, Task};
+use shadow_repose::repose::Task;
 use shadow_repose::run::{self, Report};
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
@@ -49,7 +49,8 @@ pub(crate) fn set(data: &[u8]) -> [bool; 2] {
 /// Resumes from the bytes of a checkpoint of one environment: learner and environment, which then run an iteration.
 pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
     static TASK: OnceLock<Arc<Task>> = OnceLock::new();
-    let task = TASK.get_or_init(|| Task::new(&Config::resolve(None, &[]).unwrap().env).unwrap());
+    let builtin = || Config::resolve(None, &[]).and_then(|config| Task::new(&config.env, &config.hand));
+    let task = TASK.get_or_init(|| builtin().unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
         let mut checkpoint = Checkpoint::parse(bytes)?;
         let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
@@ -74,10 +75,11 @@ pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
         let checkpoint = Checkpoint::parse(bytes)?;
         let config = load::for_playing(&checkpoint, Path::new("x.safetensors"), &[])?;
-        let policy = Policy::load(&config.net, SPACES, &checkpoint)?;
+        let spaces = load::record(&checkpoint, &config.net)?.spaces();
+        let policy = Policy::load(&config.net, spaces, &checkpoint)?;
         let frozen = policy.freeze();
-        let (mut action, mut work) = ([0.0; ACTION_SIZE], frozen.workspace(1));
-        frozen.mean_actions(&[0.5; OBSERVATION_SIZE], &mut action, &mut work);
+        let (mut action, mut work) = (vec![0.0; spaces.action_size], frozen.workspace(1));
+        frozen.mean_actions(&vec![0.5; spaces.observation_size], &mut action, &mut work);
         Ok(())
     };
     [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]

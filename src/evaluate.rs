@@ -17,10 +17,11 @@ use crate::env::{End, Env};
 use crate::os::Bar;
 use crate::ppo::{FrozenPolicy, Policy, Workspace};
 use crate::ranks::Exchange;
-use crate::repose::{ACTION_SIZE, EpisodeStats, OBSERVATION_SIZE, Repose, Score, Task};
+use crate::repose::{EpisodeStats, Repose, Score, Task};
 use crate::rng::{self, Rng};
 use crate::schedule::panic_message;
 use crate::sim::stepping;
+use crate::spaces::Spaces;
 
 /// The number of episodes that run together.
 const LANES: usize = 64;
@@ -185,17 +186,18 @@ impl Trial<'_> {
         let Self { task, actor, episodes, stop } = *self;
         let end = episodes.first + episodes.count;
         let mut lanes: Vec<Lane> = (own.start..own.end.min(episodes.count)).map(|_| Lane::new(task)).collect();
-        let mut observations = vec![0.0; LANES * OBSERVATION_SIZE];
-        let mut actions = vec![0.0; LANES * ACTION_SIZE];
+        let Spaces { observation_size, action_size, .. } = task.spaces();
+        let mut observations = vec![0.0; LANES * observation_size];
+        let mut actions = vec![0.0; LANES * action_size];
         let mut work = actor.policy().map(|policy| policy.workspace(LANES));
         let mut results = Vec::with_capacity(episodes.count);
         for first in (episodes.first + own.start..end).step_by(LANES) {
             let started = lanes.len().min(end - first);
-            let rows = observations.par_chunks_exact_mut(OBSERVATION_SIZE);
+            let rows = observations.par_chunks_exact_mut(observation_size);
             lanes[..started].par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| {
                 stepping("episode", first + i, || lane.start(episodes, first + i, row));
             });
-            let rows = observations.chunks_exact(OBSERVATION_SIZE);
+            let rows = observations.chunks_exact(observation_size);
             for (i, (lane, observation)) in lanes[..started].iter().zip(rows).enumerate() {
                 observer(Moment { episode: first + i, env: &lane.env, observation, step: None })?;
             }
@@ -204,17 +206,17 @@ impl Trial<'_> {
                     return Ok(None);
                 }
                 actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
-                let mut running = lanes.iter().zip(actions.chunks_exact(ACTION_SIZE)).filter(|(lane, _)| lane.running);
+                let mut running = lanes.iter().zip(actions.chunks_exact(action_size)).filter(|(lane, _)| lane.running);
                 ensure!(running.all(|(_, action)| action.iter().all(|x| x.is_finite())), NOT_FINITE);
-                let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(ACTION_SIZE));
-                let rows = acted.zip(observations.par_chunks_exact_mut(OBSERVATION_SIZE)).enumerate();
+                let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(action_size));
+                let rows = acted.zip(observations.par_chunks_exact_mut(observation_size)).enumerate();
                 rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
                     // Unwind safe: a state that a panic left inconsistent is not used again.
                     let step = || catch_unwind(AssertUnwindSafe(|| lane.step(action, row)));
                     let stepped = stepping("episode", first + i, step).map(drop);
                     stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
                 })?;
-                let rows = observations.chunks_exact(OBSERVATION_SIZE).zip(actions.chunks_exact(ACTION_SIZE));
+                let rows = observations.chunks_exact(observation_size).zip(actions.chunks_exact(action_size));
                 let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
                 for (i, (lane, (observation, action))) in running {
                     let step = Some((action, lane.end));
@@ -252,7 +254,8 @@ impl Actor<'_> {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
         }
-        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(ACTION_SIZE)) {
+        let Some(size) = lanes.first().map(|lane| lane.env.spaces().action_size) else { return };
+        for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
                 Actor::Mean(_) => {}
                 Actor::Stochastic(policy) => {
@@ -266,7 +269,7 @@ impl Actor<'_> {
                 Actor::Wave => {
                     let swings = f64::from(lane.env.episode().length) / SWING;
                     for (i, action) in row.iter_mut().enumerate() {
-                        let phase = swings - i as f64 / ACTION_SIZE as f64;
+                        let phase = swings - i as f64 / size as f64;
                         *action = (0.3 * (TAU * phase).sin()) as f32;
                     }
                 }
@@ -287,7 +290,8 @@ pub struct Player {
 impl Player {
     /// Creates a player at the start of the first of `episodes`; the caller counts the episodes.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
-        let (observation, action) = (vec![0.0; OBSERVATION_SIZE], vec![0.0; ACTION_SIZE]);
+        let Spaces { observation_size, action_size, .. } = task.spaces();
+        let (observation, action) = (vec![0.0; observation_size], vec![0.0; action_size]);
         let mut player = Self { lane: Lane::new(task), observation, action, work: None };
         player.start(episodes, episodes.first);
         player
@@ -329,28 +333,27 @@ mod tests {
     use crate::config::{Config, Symmetry};
     use crate::ppo::Ppo;
     use crate::ranks::Exchange;
-    use crate::repose::SPACES;
 
     #[test]
     fn a_policy_with_the_symmetry_of_the_cube_acts_alike_however_the_cube_is_turned_onto_itself() {
-        for (symmetry, alike) in [(Symmetry::Cube, true), (Symmetry::None, false)] {
+        for (symmetry, alike) in [(Symmetry::Cube, true), (Symmetry::Object, true), (Symmetry::None, false)] {
             let mut config = Config::resolve(None, &[]).unwrap();
             config.ppo.symmetry = symmetry;
-            let task = Task::new(&config.env).unwrap();
-            let ppo = Ppo::new(&config.ppo, SPACES, 0, Exchange::alone(1)).unwrap();
+            let task = Task::new(&config.env, &config.hand).unwrap();
+            let ppo = Ppo::new(&config.ppo, task.spaces(), 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
-            let mut observations = vec![0.1; 2 * OBSERVATION_SIZE];
-            for (row, q) in observations.chunks_exact_mut(OBSERVATION_SIZE).zip([[1.0, 0.0], [0.0, 1.0]]) {
-                let places = SPACES.cube_and_goal.unwrap();
+            let mut observations = vec![0.1; 2 * 157];
+            for (row, q) in observations.chunks_exact_mut(157).zip([[1.0, 0.0], [0.0, 1.0]]) {
+                let places = task.spaces().cube_and_goal.unwrap();
                 for place in [places.cube, places.goal] {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
                 }
             }
-            let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * ACTION_SIZE]);
+            let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * 20]);
             actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
-            let (one, other) = actions.split_at(ACTION_SIZE);
+            let (one, other) = actions.split_at(20);
             assert_eq!(one == other, alike, "{symmetry:?}");
         }
     }

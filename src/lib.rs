@@ -13,20 +13,20 @@
 //! | module | what it is | imports |
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
-//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, evaluate, load, os, ppo, ranks, repose, run, schedule, see, sim, tags |
+//! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, see, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, repose, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
-//! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, quat, repose, run, spaces |
+//! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
-//! | [`see`] | rendering of the task: window, film, picture | cli, config, draw, env, evaluate, os, repose, run, sim |
-//! | [`trace`] | episodes as JSON lines | config, env, evaluate, repose |
+//! | [`see`] | rendering of the task: window, film, picture | cli, draw, env, evaluate, os, repose, run, sim |
+//! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
-//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule |
-//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim |
-//! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
+//! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule, spaces |
+//! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
+//! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run, sim |
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |
 //! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |

@@ -5,14 +5,16 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, LazyLock};
 
 use anyhow::{Context, Error, Result, bail};
 
-use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source, Symmetry};
+use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy, expect_safetensors};
-use crate::repose::SPACES;
+use crate::repose::{Record, Task};
 use crate::run;
+use crate::sim::Parts;
 
 /// The key of the only setting that is a path.
 pub const MODEL: &str = "env.model";
@@ -128,8 +130,10 @@ pub struct Loaded {
     pub name: String,
     /// The settings of the task.
     pub config: EnvConfig,
-    /// The states that it takes for the same.
-    pub symmetry: Symmetry,
+    /// The parts of its hand that are named.
+    pub hand: Parts,
+    /// The hand and the object that it was trained with.
+    pub record: Record,
     /// The policy.
     pub policy: Policy,
     /// The checkpoint that holds it.
@@ -151,23 +155,51 @@ impl Loaded {
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
-        let policy = Policy::load(&config.net, SPACES, &checkpoint)
+        let record = record(&checkpoint, &config.net)?;
+        let policy = Policy::load(&config.net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let name = match &origin {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
             PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
-        Ok(Self { origin, name, symmetry: config.net.symmetry, config: config.env, policy, checkpoint })
+        Ok(Self { origin, name, config: config.env, hand: config.hand, record, policy, checkpoint })
     }
 
-    /// Returns the settings of its task, overlaid with other `overrides` than those with which it was loaded.
+    /// Loads its task.
     ///
     /// # Errors
-    /// Fails as [`for_playing`] does.
-    pub fn config_with(&self, overrides: &[Override]) -> Result<EnvConfig> {
-        Ok(for_playing(&self.checkpoint, self.origin.path(), overrides)?.env)
+    /// Fails if the scene cannot be used, or has another hand.
+    pub fn task(&self) -> Result<Arc<Task>> {
+        Task::new(&self.config, &self.hand)?.for_policy(&self.record)
+    }
+
+    /// Loads its task, with settings overlaid with other `overrides` than those with which it was loaded.
+    ///
+    /// # Errors
+    /// Fails as [`for_playing`] and [`Self::task`] do.
+    pub fn task_with(&self, overrides: &[Override]) -> Result<Arc<Task>> {
+        let config = for_playing(&self.checkpoint, self.origin.path(), overrides)?;
+        Task::new(&config.env, &config.hand)?.for_policy(&self.record)
     }
 }
+
+/// Returns the hand and the object that a policy with this net was trained with.
+///
+/// # Errors
+/// Fails if what its file says of them is damaged.
+pub fn record(checkpoint: &Checkpoint, net: &NetConfig) -> Result<Record> {
+    let record = match &checkpoint.hand {
+        Some(text) => Record::parse(text)?,
+        None => OF_BUILTIN.clone(),
+    };
+    Ok(record.with(net.symmetry))
+}
+
+/// The hand and the cube of the built-in scene, for files that say nothing of theirs.
+static OF_BUILTIN: LazyLock<Record> = LazyLock::new(|| {
+    let builtin = Config::resolve(None, &[]).and_then(|config| Task::new(&config.env, &config.hand));
+    builtin.expect("the built-in scene is sound").record()
+});
 
 /// Reads a checkpoint or a policy.
 ///
@@ -234,7 +266,7 @@ pub fn for_fork(
     overrides: &[Override],
 ) -> Result<(Config, Config)> {
     let parent = Config::from_text(path, &checkpoint.config, &[])?;
-    checkpoint.expect_policy(&parent.ppo.net(), &SPACES)?;
+    expect_policy(checkpoint, &parent.ppo.net())?;
     let config = parent.changed(user, overrides)?;
     expect_named_scene(&parent.env, config.env.model_file().is_some())?;
     Ok((parent, config))
@@ -256,8 +288,12 @@ fn cannot_use(path: &Path) -> String {
 
 /// Checks that a checkpoint holds this policy, and that a custom scene was named by the user and not only by the file.
 fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
-    checkpoint.expect_policy(net, &SPACES)?;
+    expect_policy(checkpoint, net)?;
     expect_named_scene(env, overrides.iter().any(|set| set.key == MODEL))
+}
+
+fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
+    checkpoint.expect_policy(net, &record(checkpoint, net)?.spaces())
 }
 
 /// Checks that a scene other than the built-in one was named by the user.

@@ -10,7 +10,7 @@ use anyhow::{Context, Result, ensure};
 use serde_json::{Map, Value, json};
 
 use crate::cli::{Baseline, PlayArgs, usage_error};
-use crate::config::{Config, EnvConfig, expect_used};
+use crate::config::{Config, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
@@ -39,11 +39,10 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Some(_) => None,
         None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
     };
-    let config = match &loaded {
-        Some(loaded) => loaded.config.clone(),
-        None => Config::resolve(None, &args.set)?.env,
+    let task = match &loaded {
+        Some(loaded) => loaded.task()?,
+        None => Config::resolve(None, &args.set).and_then(|config| Task::new(&config.env, &config.hand))?,
     };
-    let task = Task::new(&config)?;
     let config = task.config();
     for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
         let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
@@ -59,15 +58,13 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if !args.json {
         task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
     }
-    let warning = loaded.as_ref().and_then(|loaded| task.symmetry_warning(loaded.symmetry));
-    warning.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if let (Some(loaded), true) = (&loaded, args.robustness) {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
     }
     #[cfg(not(feature = "viewer"))]
     ensure!(!wants_window(args), see::NO_WINDOWS);
     #[cfg(feature = "viewer")]
-    if wants_window(args) && show(args, config, loaded.as_ref())? {
+    if wants_window(args) && show(args, &task, loaded.as_ref())? {
         return Ok(ExitCode::SUCCESS);
     }
     play_unseen(args, requests, &task, loaded.as_ref())
@@ -84,7 +81,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
     let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
     // Opened before playing, so that a path that cannot be written to does not cost the score.
     let output = args.trace.as_deref().map(os::OutputFile::create).transpose()?;
-    let mut trace = output.as_ref().map(|_| Trace::new(config, checkpoint.as_deref()));
+    let mut trace = output.as_ref().map(|_| Trace::new(task, checkpoint.as_deref()));
     let mut goal_times = GoalTimes::new(config);
     if let (Some(output), Some(video)) = (&output, &args.video) {
         ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
@@ -104,7 +101,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         #[cfg(not(feature = "video"))]
         Some(_) => bail!(see::NO_FILMS),
         #[cfg(feature = "video")]
-        Some(path) => film(path, config, &actor, args, requests, &mut observe)?,
+        Some(path) => film(path, task, &actor, args, requests, &mut observe)?,
         None => score(&actor, &mut observe)?,
     };
     let Some(played) = played else {
@@ -146,8 +143,8 @@ fn wants_window(args: &PlayArgs) -> bool {
 
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
 #[cfg(feature = "viewer")]
-fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<bool> {
-    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+fn show(args: &PlayArgs, task: &Task, loaded: Option<&Loaded>) -> Result<bool> {
+    let task = see::task_for_display(task, &args.shot, [1280, 720], crate::sim::Quality::High)?;
     let (names, actors, first) = match (loaded, args.policy) {
         (Some(loaded), _) => {
             let policy = &loaded.policy;
@@ -174,13 +171,13 @@ fn show(args: &PlayArgs, config: &EnvConfig, loaded: Option<&Loaded>) -> Result<
 #[cfg(feature = "video")]
 fn film(
     path: &std::path::Path,
-    config: &EnvConfig,
+    task: &Task,
     actor: &Actor,
     args: &PlayArgs,
     requests: &Requests,
     observe: &mut dyn FnMut(&Moment),
 ) -> Result<Option<Score>> {
-    let task = see::task_for_display(config, &args.shot, [640, 480], crate::sim::Quality::Fast)?;
+    let task = see::task_for_display(task, &args.shot, [640, 480], crate::sim::Quality::Fast)?;
     let all = episodes(args, 1);
     let mut film = see::Film::create(path, &task, args.fps, all.count as u64)?;
     // Unlike the other outputs, a film is worth keeping if it is interrupted.

@@ -67,14 +67,14 @@ struct Row {
 pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
     output.as_ref().map(draw::picture_format).transpose()?;
-    let config = |condition: &Condition| {
+    let task = |condition: &Condition| {
         let sets = [&args.set[..], &condition.sets].concat();
-        loaded.config_with(&sets).with_context(|| format!("row `{}`", condition.name))
+        loaded.task_with(&sets).with_context(|| format!("row `{}`", condition.name))
     };
     let conditions = conditions();
-    let configs: Vec<EnvConfig> = conditions.iter().map(config).collect::<Result<_>>()?;
     // Found out now rather than after minutes.
-    let tasks: Vec<Arc<Task>> = configs.iter().map(Task::new).collect::<Result<_>>()?;
+    let tasks: Vec<Arc<Task>> = conditions.iter().map(task).collect::<Result<_>>()?;
+    let configs: Vec<EnvConfig> = tasks.iter().map(|task| task.config().clone()).collect();
     let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
     let bar = os::progress_bar((different * count) as u64, "episodes", "robustness");

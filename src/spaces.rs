@@ -12,14 +12,25 @@ pub struct Spaces {
     /// The location of a cube and its goal, if there is one; for `ppo.symmetry`.
     pub cube_and_goal: Option<CubeAndGoal>,
     /// The distance of an observation from its goal, in the unit of `ppo.away_range`.
-    pub distance: fn(&[f32]) -> f32,
+    pub distance: fn(&Self, &[f32]) -> f32,
 }
 
-/// The offsets of the orientations (w, x, y, z) of a cube and its goal in an observation.
+impl Spaces {
+    /// Returns the distance of an observation from its goal.
+    pub fn distance_of(&self, observation: &[f32]) -> f32 {
+        (self.distance)(self, observation)
+    }
+}
+
+/// The offsets of orientations (w, x, y, z) in an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct CubeAndGoal {
     /// The offset of the orientation of the cube.
     pub cube: usize,
     /// The offset of the orientation of its goal.
     pub goal: usize,
+    /// The offset of the orientation of the cube relative to its goal.
+    pub relative: usize,
+    /// The rotations that map the object onto itself: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
+    pub symmetry: u32,
 }

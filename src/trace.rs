@@ -2,10 +2,9 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::config::EnvConfig;
 use crate::env::{End, Env};
 use crate::evaluate::Moment;
-use crate::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION, add_settings};
+use crate::repose::{Group, Task, add_settings};
 
 /// The number of records at which writing stops; episodes are written whole and in order.
 const ENOUGH: usize = 2000;
@@ -20,8 +19,9 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Creates an empty trace of the task with these settings, played by the policy in `checkpoint`.
-    pub fn new(config: &EnvConfig, checkpoint: Option<&str>) -> Self {
+    /// Creates an empty trace of a task, played by the policy in `checkpoint`.
+    pub fn new(task: &Task, checkpoint: Option<&str>) -> Self {
+        let (config, hand) = (task.config(), task.hand());
         let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
@@ -32,12 +32,12 @@ impl Trace {
             "model": config.model,
             "goal_position": config.goal_position.value,
             "checkpoint": checkpoint,
-            "observation": OBSERVATION.map(|Group { name, start, length, unit }| {
+            "observation": hand.layout.groups.map(|Group { name, start, length, unit, .. }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
             }),
-            "joint_names": JOINTS.map(|joint| format!("rh_{joint}")),
-            "actuator_names": ACTUATORS.map(|actuator| format!("rh_A_{actuator}")),
-            "fingertip_names": FINGERTIPS,
+            "joint_names": hand.parts.joints,
+            "actuator_names": hand.parts.actuators,
+            "fingertip_names": hand.parts.fingertips,
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
         });

@@ -9,7 +9,7 @@ use anyhow::bail;
 use anyhow::{Context, Result};
 
 use crate::cli::{Motion, ViewArgs, usage_error};
-use crate::config::{Config, EnvConfig, expect_used, user_file};
+use crate::config::{Config, expect_used, user_file};
 use crate::evaluate::{Actor, Episodes};
 use crate::os;
 #[cfg(any(feature = "video", feature = "viewer"))]
@@ -42,21 +42,25 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
     let episodes = Episodes::scored(args.seed, usize::MAX);
     match &args.screenshot {
-        Some(path) => draw(path, args, &config.env, &ACTORS[first].2, episodes),
-        None => show(args, &config.env, first, episodes),
+        Some(path) => draw(path, args, &config, &ACTORS[first].2, episodes),
+        None => show(args, &config, first, episodes),
     }
 }
 
 /// Loads the task, and tells what of the user's scene the settings replace.
 #[cfg(any(feature = "video", feature = "viewer"))]
-fn task_for_display(config: &EnvConfig, args: &ViewArgs) -> Result<Arc<Task>> {
-    let task = see::task_for_display(config, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
+    let task = Task::new(&config.env, &config.hand)?;
+    let task = see::task_for_display(&task, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    if config.env.model_file().is_some() {
+        os::say(task.table().trim_end());
+    }
     task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
     Ok(task)
 }
 
 #[cfg(feature = "video")]
-fn draw(path: &Path, args: &ViewArgs, config: &EnvConfig, actor: &Actor, episodes: Episodes) -> Result<()> {
+fn draw(path: &Path, args: &ViewArgs, config: &Config, actor: &Actor, episodes: Episodes) -> Result<()> {
     let task = task_for_display(config, args)?;
     let [width, height] = see::screenshot(path, &task, actor, episodes, args.at)?;
     os::say(&format!("{}: {width}x{height}", path.display()));
@@ -64,12 +68,12 @@ fn draw(path: &Path, args: &ViewArgs, config: &EnvConfig, actor: &Actor, episode
 }
 
 #[cfg(not(feature = "video"))]
-fn draw(_: &Path, _: &ViewArgs, _: &EnvConfig, _: &Actor, _: Episodes) -> Result<()> {
+fn draw(_: &Path, _: &ViewArgs, _: &Config, _: &Actor, _: Episodes) -> Result<()> {
     bail!(see::NO_FILMS)
 }
 
 #[cfg(feature = "viewer")]
-fn show(args: &ViewArgs, config: &EnvConfig, first: usize, episodes: Episodes) -> Result<()> {
+fn show(args: &ViewArgs, config: &Config, first: usize, episodes: Episodes) -> Result<()> {
     let task = task_for_display(config, args)?;
     let window = see::Window::open(&task, ACTORS.iter().map(|(_, name, _)| *name).collect(), first)?;
     os::say(&window.play(&task, &ACTORS.map(|(.., actor)| actor), episodes)?);
@@ -77,6 +81,6 @@ fn show(args: &ViewArgs, config: &EnvConfig, first: usize, episodes: Episodes) -
 }
 
 #[cfg(not(feature = "viewer"))]
-fn show(_: &ViewArgs, _: &EnvConfig, _: usize, _: Episodes) -> Result<()> {
+fn show(_: &ViewArgs, _: &Config, _: usize, _: Episodes) -> Result<()> {
     bail!(see::NO_WINDOWS)
 }

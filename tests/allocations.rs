@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Config;
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{OBSERVATION_SIZE, Task};
+use shadow_repose::repose::Task;
 
 struct Watching;
 
@@ -39,7 +39,8 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
     let mut agent =
-        Agent::for_task(&Task::new(&config.env).unwrap(), &config, Exchange::alone(config.shards())).unwrap();
+        Agent::for_task(&Task::new(&config.env, &config.hand).unwrap(), &config, Exchange::alone(config.shards()))
+            .unwrap();
     let mut iterate = || {
         LARGEST.store(0, Ordering::Relaxed);
         agent.iterate(&NEVER).unwrap().expect("nothing stops it");
@@ -49,6 +50,6 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let later = [iterate(), iterate()];
     // gemm packs the largest weight matrix, 157 × 256 floats, into its own buffer. An array of all weights, or of a block of rows
     // in a net, would be larger; one of all samples, much larger.
-    let packed = 4 * OBSERVATION_SIZE * config.ppo.hidden[0];
+    let packed = 4 * 157 * config.ppo.hidden[0];
     assert!(first > 500_000 && later.iter().all(|&largest| largest <= packed), "{first} bytes, then {later:?}");
 }

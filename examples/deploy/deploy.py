@@ -18,11 +18,6 @@ import numpy as np
 import onnxruntime
 
 SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
-HAND = "right Shadow Hand, 24 joints, 20 actuators"
-JOINTS = """THJ5 THJ4 THJ3 THJ2 THJ1 FFJ4 FFJ3 FFJ2 FFJ1 MFJ4 MFJ3 MFJ2 MFJ1 RFJ4 RFJ3 RFJ2 RFJ1
-            LFJ5 LFJ4 LFJ3 LFJ2 LFJ1 WRJ2 WRJ1""".split()
-ACTUATORS = """THJ5 THJ4 THJ3 THJ2 THJ1 FFJ4 FFJ3 FFJ0 MFJ4 MFJ3 MFJ0 RFJ4 RFJ3 RFJ0 LFJ5 LFJ4 LFJ3 LFJ0 WRJ2 WRJ1""".split()
-FINGERTIPS = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"]
 # Settings that older files do not have.
 NOMINAL = dict.fromkeys(["hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale"], 1.0)
 NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "action_delay": 0, "noise": {}, "bias": {}}
@@ -30,7 +25,7 @@ OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
 
 
 class Policy:
-    """The file: `obs` [batch, 157] to `actions` [batch, 20]. Symmetry, normaliser and clipping are inside."""
+    """The file: `obs` [batch, O] to `actions` [batch, A]. Mirror, symmetry, normaliser and clipping are inside."""
 
     def __init__(self, path):
         options = onnxruntime.SessionOptions()
@@ -40,11 +35,14 @@ class Policy:
         except Exception as error:  # onnxruntime's errors have no common class
             sys.exit(f"error: {path} is not an ONNX file that can be run: {error}")
         self.facts = self.session.get_modelmeta().custom_metadata_map
-        if self.facts.get("hand") != HAND:
-            sys.exit(f"error: {path} is for another hand: {self.facts.get('hand')}")
+        if "hinge_names" not in self.facts:
+            sys.exit(f"error: {path} does not name the parts of its hand; export it again")
 
     def numbers(self, key):
         return np.array([float(number) for number in self.facts[key].split(",")])
+
+    def names(self, key):
+        return self.facts[key].split(",")
 
     def act(self, observation):
         action = self.session.run(["actions"], {"obs": observation[None]})[0][0]
@@ -62,20 +60,28 @@ class Hand:
         for key in ("noise", "bias"):
             if env[key]:
                 sys.exit(f"error: the policy was exported with env.{key}, which this program does not simulate")
-        self.model = varied_model(env, scene)
+        try:
+            self.model = varied_model(env, scene, policy)
+            joints = [self.model.joint(name) for name in policy.names("hinge_names")]
+            self.tips = [frame(self.model, name) for name in policy.names("fingertip_names")]
+            self.actuators = [self.model.actuator(name) for name in policy.names("joint_names")]
+            cube = self.model.body(policy.facts["object_name"])
+        except KeyError as error:
+            sys.exit(f"error: {scene} is not the policy's hand: {error.args[0].splitlines()[0]}")
         self.data = mujoco.MjData(self.model)
-        cube = self.model.body("cube")
         self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
-        joints = [self.model.joint("rh_" + name) for name in JOINTS]
         self.angle = np.array([joint.qposadr[0] for joint in joints])
         self.speed = np.array([joint.dofadr[0] for joint in joints])
         self.limits = np.array([joint.range for joint in joints])
         free = self.model.joint(cube.jntadr[0])
         self.cube, self.cube_speed = free.qposadr[0], free.dofadr[0]
-        self.tips = [self.model.body(name).id for name in FINGERTIPS]
-        self.target = self.model.body("target").mocapid[0]
+        # Without a keyframe, episodes start in the scene's default pose.
+        start = policy.facts["start_keyframe"]
+        self.start = self.model.key(int(start)).qpos if start else self.model.qpos0
+        # Where the observation has the goal's orientation, which the relative one follows.
+        sizes = policy.numbers("observation_sizes").astype(int)
+        self.size, self.goal_at = sizes.sum(), sizes[:policy.names("observation_names").index("goal_quat")].sum()
         # An action of -1 … 1 asks for a target within the control range: offset + scale * action.
-        self.actuators = [self.model.actuator(name) for name in policy.facts["joint_names"].split(",")]
         self.controls = np.array([actuator.id for actuator in self.actuators])
         self.offset, self.scale = policy.numbers("action_offset"), policy.numbers("action_scale")
         self.alpha = float(policy.facts["ema_alpha"])
@@ -83,7 +89,7 @@ class Hand:
         if not np.allclose(ranges, np.stack([self.offset - self.scale, self.offset + self.scale], 1), rtol=0, atol=1e-9):
             sys.exit(f"error: the actuators of {scene} have other ranges than those that the policy was exported for")
         self.low, self.high = ranges.T
-        self.previous_action = np.zeros(20)
+        self.previous_action = np.zeros(len(self.actuators))
         self.goal = np.array([1.0, 0, 0, 0])
 
     def place(self, qpos, qvel):
@@ -94,34 +100,35 @@ class Hand:
 
     def reset(self, random):
         """Begins an episode: joints near their start, the cube above the palm, both orientations uniformly random."""
-        env, qpos = self.env, self.model.qpos0.copy()
-        noise = random.uniform(-env["reset_dof_pos_noise"], env["reset_dof_pos_noise"], len(JOINTS))
+        env, qpos = self.env, self.start.copy()
+        noise = random.uniform(-env["reset_dof_pos_noise"], env["reset_dof_pos_noise"], len(self.angle))
         qpos[self.angle] = np.clip(qpos[self.angle] + noise, self.limits[:, 0], self.limits[:, 1])
         qvel = np.zeros(self.model.nv)
-        qvel[self.speed] = random.uniform(-env["reset_dof_vel_noise"], env["reset_dof_vel_noise"], len(JOINTS))
+        qvel[self.speed] = random.uniform(-env["reset_dof_vel_noise"], env["reset_dof_vel_noise"], len(self.angle))
         noise = random.uniform(-env["reset_position_noise"], env["reset_position_noise"], 3)
         qpos[self.cube:self.cube + 3] = env["goal_position"] + noise
         qpos[self.cube + 3:self.cube + 7] = uniform_rotation(random)
         self.place(qpos, qvel)
         self.goal = uniform_rotation(random)
-        self.previous_action = np.zeros(20)
-        # The targets begin where the joints are. A J0 drives the sum of a finger's two outer joints.
-        angles = dict(zip(JOINTS, qpos[self.angle]))
-        names = [actuator.name.removeprefix("rh_A_") for actuator in self.actuators]
-        sums = [angles[name[:2] + "J2"] + angles[name[:2] + "J1"] if name.endswith("J0") else angles[name] for name in names]
-        self.targets = np.clip(sums, self.low, self.high)
+        self.previous_action = np.zeros(len(self.actuators))
+        # The targets begin where the actuators are.
+        self.targets = np.clip(self.data.actuator_length[self.controls], self.low, self.high)
         self.under_way = [self.targets] * env["action_delay"]
 
     def observe(self):
-        """Returns the 157 values that the policy sees, in the order of `observation_names`."""
+        """Returns the values that the policy sees, in the order of `observation_names`."""
         env, data = self.env, self.data
         cube, speed = data.qpos[self.cube:self.cube + 7], data.qvel[self.cube_speed:self.cube_speed + 6]
         tips = []
-        for tip in self.tips:
+        for kind, tip in self.tips:
             # The velocity of the frame's origin in the world frame; MuJoCo gives the angular part first.
             velocity = np.zeros(6)
-            mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_XBODY, tip, velocity, 0)
-            tips += [data.xpos[tip], data.xquat[tip], velocity[3:], velocity[:3]]
+            mujoco.mj_objectVelocity(self.model, data, kind, tip, velocity, 0)
+            position, orientation = data.xpos[tip], data.xquat[tip]
+            if kind == mujoco.mjtObj.mjOBJ_SITE:
+                body = data.xquat[self.model.site_bodyid[tip]]
+                position, orientation = data.site_xpos[tip], product(body, self.model.site_quat[tip])
+            tips += [position, orientation, velocity[3:], velocity[:3]]
         return np.concatenate([
             data.qpos[self.angle],
             env["vel_obs_scale"] * data.qvel[self.speed],
@@ -159,7 +166,13 @@ class Hand:
         return np.linalg.norm(self.data.qpos[self.cube:self.cube + 3] - self.env["goal_position"]) >= self.env["fall_dist"]
 
 
-def varied_model(env, scene, drawn=None):
+def frame(model, name):
+    """Returns the kind and the number of the body or, if there is none, the site with this name."""
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    return (mujoco.mjtObj.mjOBJ_XBODY, body) if body >= 0 else (mujoco.mjtObj.mjOBJ_SITE, model.site(name).id)
+
+
+def varied_model(env, scene, policy, drawn=None):
     """Compiles the scene with the physics that the settings ask for; without changes, it is the scene itself. `drawn` is what an
     episode of a training has drawn besides: `randomization` in a dump."""
     drawn = drawn or {}
@@ -167,7 +180,9 @@ def varied_model(env, scene, drawn=None):
               for key in ("friction", "cube_mass", "hand_mass", "cube_size", "gains", "damping", "frictionloss")}
     offset = {key: np.array(env[key]) + drawn.get(key, [0, 0, 0]) for key in ("cube_com", "gravity")}
     spec = mujoco.MjSpec.from_file(str(scene))
-    cube, size = spec.body("cube"), float(factor["cube_size"])
+    cube, size = spec.body(policy.facts["object_name"]), float(factor["cube_size"])
+    if cube is None:
+        raise KeyError(f"it has no body {policy.facts['object_name']}")
     if any(offset["cube_com"]):
         cube.simple = False  # MuJoCo's shortcut for bodies whose centre of mass is their origin
     if size != 1:
@@ -182,17 +197,19 @@ def varied_model(env, scene, drawn=None):
         model.opt.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[env["cone"]]
     model.geom_friction[:] *= factor["friction"]
     model.pair_friction[:] *= factor["friction"]
-    cube = model.body("cube")
+    cube = model.body(policy.facts["object_name"])
     of_cube = model.body_rootid == cube.id
-    of_hand = model.body_rootid == model.body(FINGERTIPS[0]).rootid[0]
+    tips = [frame(model, name) for name in policy.names("fingertip_names")]
+    tips = [model.site_bodyid[tip] if kind == mujoco.mjtObj.mjOBJ_SITE else tip for kind, tip in tips]
+    of_hand = np.isin(model.body_rootid, model.body_rootid[tips])
     for bodies, mass in (of_cube, factor["cube_mass"]), (of_hand, factor["hand_mass"]):
         model.body_mass[bodies] *= mass
         model.body_inertia[bodies] *= mass
     cube.ipos[:] += offset["cube_com"]
-    servos = [model.actuator("rh_A_" + name).id for name in ACTUATORS]
+    servos = [model.actuator(name).id for name in policy.names("joint_names")]
     model.actuator_gainprm[servos, 0] *= factor["gains"]
     model.actuator_biasprm[servos, 1] *= factor["gains"]
-    speeds = [model.joint("rh_" + name).dofadr[0] for name in JOINTS]
+    speeds = [model.joint(name).dofadr[0] for name in policy.names("hinge_names")]
     model.dof_damping[speeds] *= factor["damping"]
     model.dof_dampingpoly[speeds] *= factor["damping"][..., None] if factor["damping"].ndim else factor["damping"]
     model.dof_frictionloss[speeds] *= factor["frictionloss"]
@@ -274,10 +291,11 @@ def check(policy, hand, trace):
         hand.place(record["qpos"], record["qvel"])
         # Where a goal was reached, the observation already shows the next one.
         hand.goal = np.array(after["goal"] if same else record["goal"])
-        hand.previous_action = np.clip(record["action"], -1, 1) if not record.get("reset") else np.zeros(20)
+        hand.previous_action = np.clip(record["action"], -1, 1) if not record.get("reset") else np.zeros(len(hand.actuators))
         seen, expected = hand.observe(), np.array(record["obs"])
         if not same:  # the goal after an episode's last step is in no record
-            seen[64:72] = expected[64:72]
+            goal = slice(hand.goal_at, hand.goal_at + 8)
+            seen[goal] = expected[goal]
         # Unlike max, this keeps a NaN.
         largest[0] = np.maximum(largest[0], np.abs(seen - expected).max())
         if same:

@@ -15,6 +15,7 @@ use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, Ro
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
 use crate::schedule::in_rounds;
+use crate::spaces::Spaces;
 
 // The names under which a checkpoint stores the states of the environments.
 const NUMBERS: &str = "envs.numbers";
@@ -99,7 +100,7 @@ impl<E: Env> Agent<E> {
         lessons: impl Fn(u64) -> E::Lesson + Send + 'static,
     ) -> Result<Self> {
         let mut pool = EnvPool::new(seed, envs, &exchange);
-        let ppo = Ppo::new(config, E::SPACES, seed, exchange.clone())?;
+        let ppo = Ppo::new(config, pool.spaces(), seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
         let work = pool.block_sizes().into_iter().map(|envs| ppo.workspace(envs)).collect();
         pool.set_lesson(lessons(0));
@@ -200,8 +201,9 @@ impl<E: Resumable> Agent<E> {
 /// # Errors
 /// Fails with the environment's number if an environment panics.
 pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t: usize) -> Result<()> {
-    let (row, actions) = (rollout.step(t, 1), rollout.step(t, E::SPACES.action_size));
-    let next = rollout.step(t + 1, E::SPACES.observation_size);
+    let Spaces { observation_size, action_size, .. } = envs.spaces;
+    let (row, actions, next) =
+        (rollout.step(t, 1), rollout.step(t, action_size), rollout.step(t + 1, observation_size));
     envs.step(&rollout.actions[actions], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
     rollout.dones[row].iter_mut().zip(&envs.ends).for_each(|(done, end)| *done = end.is_some());
     Ok(())

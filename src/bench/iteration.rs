@@ -13,7 +13,6 @@ use super::measure::{NEVER, median};
 use super::replay::{RecordingEnv, replay};
 use crate::agent::Agent;
 use crate::config::Config;
-use crate::env::Env;
 use crate::load::PolicySource;
 use crate::ppo::{Ppo, Rollout};
 use crate::ranks::Exchange;
@@ -51,7 +50,7 @@ pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &Polic
     let exchange = || Exchange::alone(config.shards());
     let mut agent = Agent::new(envs, &acting, config.run.seed, exchange(), move |_| at_end)?;
     agent.ppo.begin_with(&checkpoint)?;
-    let mut learner = Ppo::new(&config.ppo, RecordingEnv::SPACES, config.run.seed, exchange())?;
+    let mut learner = Ppo::new(&config.ppo, task.spaces(), config.run.seed, exchange())?;
     let mut seen = learner.rollout(&agent.pool.block_sizes());
     let mut found: [Vec<f64>; 4] = Default::default();
     let before = BEFORE.div_ceil(config.ppo.first_horizon());

@@ -17,7 +17,7 @@ use crate::agent::{Agent, step_block};
 use crate::cli::{BenchArgs, Part, usage_error};
 use crate::config::{Config, expect_used, user_file};
 use crate::draw::{self, BarChart, HeatMap, NamedBar, Picture};
-use crate::env::{Env, EnvPool};
+use crate::env::EnvPool;
 use crate::load::PolicySource;
 use crate::os::{self, OutputFile};
 use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
@@ -67,7 +67,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
-    let task = Task::new(&config.env)?;
+    let task = Task::new(&config.env, &config.hand)?;
     config.env = task.config().clone();
     let (threads, num_envs, hidden) = (rayon::current_num_threads(), config.env.num_envs, &config.ppo.hidden);
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
@@ -128,7 +128,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut lesson = Lesson::task(&config.env);
     lesson.randomized = Lesson::at(0, config).randomized;
     pool.set_lesson(lesson);
-    let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &RecordingEnv::SPACES);
+    let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
     pool.reset(rollout.first_observations_mut());
     let mut noise = rng::stream(config.run.seed, "bench", 0);
     let std = config.ppo.std.by_equal_factors(0) as f32;

@@ -105,7 +105,9 @@ impl RecordingEnv {
 impl Env for RecordingEnv {
     type Episode = EpisodeStats;
     type Lesson = Lesson;
-    const SPACES: Spaces = Repose::SPACES;
+    fn spaces(&self) -> Spaces {
+        self.env.spaces()
+    }
 
     fn set_lesson(&mut self, lesson: Lesson) {
         self.env.set_lesson(lesson);

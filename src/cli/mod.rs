@@ -123,7 +123,15 @@ pub fn parse() -> Result<Cli, clap::Error> {
         ErrorKind::DisplayHelp => command().try_get_matches().err().unwrap_or(answer),
         _ => answer,
     });
-    Cli::from_arg_matches(&parsed?).map_err(|error| error.format(&mut command()))
+    let mut cli = Cli::from_arg_matches(&parsed?).map_err(|error| error.format(&mut command()))?;
+    let (mirror, sets) = match &mut cli.command {
+        Command::Train(args) => (args.mirror, &mut args.settings.set),
+        Command::Play(args) => (args.mirror, &mut args.set),
+        Command::Export(args) => (args.mirror, &mut args.set),
+        _ => return Ok(cli),
+    };
+    sets.extend(mirror.then(|| Override { key: "env.mirror".into(), value: "true".into() }));
+    Ok(cli)
 }
 
 /// The options that change settings.
@@ -169,6 +177,9 @@ pub struct TrainArgs {
     /// settings
     #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
+    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    #[arg(long, requires = "init", help_heading = START)]
+    pub mirror: bool,
     /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000), help_heading = RUN_FOLDER)]
     pub keep: Option<usize>,
@@ -190,6 +201,9 @@ pub struct PlayArgs {
     /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
+    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    #[arg(long, help_heading = POLICY)]
+    pub mirror: bool,
     /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film, 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
@@ -244,6 +258,9 @@ pub struct ExportArgs {
     /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
+    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    #[arg(long, help_heading = POLICY)]
+    pub mirror: bool,
     /// Change one env.* setting that the file tells, e.g. env.model=my_scene.xml; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,

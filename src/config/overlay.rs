@@ -134,9 +134,13 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
             Ok(Value::Integer(*x as i64))
         }
         (Value::Array(expected), Value::Array(values)) => {
-            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&expected[0], v)).collect();
+            // An empty list is one of names.
+            let one = expected.first().cloned().unwrap_or(Value::String(String::new()));
+            let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
+        (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
+        (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
             let reason = format!("value = {text}").parse::<Table>().err();

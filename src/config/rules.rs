@@ -49,9 +49,6 @@ const LONGEST_DELAY: u32 = 1000;
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
 const FARTHEST: f64 = 100.0;
 
-/// Settings whose only valid value is fixed by the layout of the task.
-const FIXED: &[(&str, f64)] = &[("env.num_hand_dofs", 24.0), ("env.num_actuators", 20.0)];
-
 /// Returns every rule that the values break, as "key = value: must …".
 pub(super) fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
@@ -62,9 +59,6 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     SHARES.split_whitespace().for_each(|key| rules.number(&table, key, |x| (0.0..=1.0).contains(&x), "lie in [0, 1]"));
     for (key, most) in AT_MOST {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
-    }
-    for (key, only) in FIXED {
-        rules.number(&table, key, |x| x == *only, &format!("be {only}, fixed by the layout of the task"));
     }
     let limited = ["env.", "training.", "randomization."];
     for (key, value) in settings(&table).filter(|(key, _)| limited.iter().any(|section| key.starts_with(section))) {

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::ramp::Ramp;
-use crate::sim::Cone;
+use crate::sim::{Cone, Parts};
 
 /// The value of `env.model` for the built-in scene.
 pub const BUILTIN_MODEL: &str = "builtin";
@@ -18,6 +18,8 @@ pub const BUILTIN_MODEL: &str = "builtin";
 pub struct Config {
     /// The task and its physics.
     pub env: EnvConfig,
+    /// What of the hand is not found by the structure of the scene, or is to be another.
+    pub hand: Parts,
     /// Changes to the task and additions to its reward that only training uses.
     pub training: TrainingConfig,
     /// Random physics, noise and delays of a share of the episodes of a training.
@@ -33,8 +35,8 @@ pub struct Config {
 pub struct EnvConfig {
     pub num_envs: usize,
     pub model: String,
-    pub num_hand_dofs: usize,
-    pub num_actuators: usize,
+    pub num_hand_dofs: OfScene<usize>,
+    pub num_actuators: OfScene<usize>,
     pub sim_dt: f64,
     pub ctrl_dt: f64,
     pub friction_scale: f64,
@@ -53,6 +55,7 @@ pub struct EnvConfig {
     pub max_episode_seconds: f64,
     pub goal_position: OfScene<[f64; 3]>,
     pub target_height: f64,
+    pub mirror: bool,
     pub act_moving_average: f64,
     pub rot_reward_scale: f64,
     pub rot_eps: f64,
@@ -186,8 +189,10 @@ pub enum Activation {
 pub enum Symmetry {
     /// None.
     None,
-    /// A cube and the same cube turned onto itself.
+    /// A cube and the same cube turned onto itself, whatever the object is.
     Cube,
+    /// The object and the same object turned onto itself, by those of a cube's rotations that do that.
+    Object,
 }
 
 /// The implementation that computes the gradients.

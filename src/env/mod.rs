@@ -42,8 +42,8 @@ pub trait Env: Send {
     /// The variant of the task that is trained at a given step of a run.
     type Lesson: Copy + Send;
 
-    /// The description of observations and actions that a learner needs.
-    const SPACES: Spaces;
+    /// Returns the description of observations and actions that a learner needs.
+    fn spaces(&self) -> Spaces;
 
     /// Switches to `lesson` from the next step on.
     fn set_lesson(&mut self, lesson: Self::Lesson);

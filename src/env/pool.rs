@@ -32,6 +32,8 @@ pub struct EnvBlock<E: Env> {
     /// Final observations `[n, O]` of the episodes that were truncated in the last step, and under goals that were replaced; other
     /// rows are older.
     pub final_observations: Vec<f32>,
+    /// The description of observations and actions.
+    pub spaces: Spaces,
     slots: Vec<Slot<E>>,
     seed: u64,
     /// The number of all environments, by which the episode numbers of one environment increase.
@@ -49,9 +51,9 @@ impl<E: Env> EnvPool<E> {
     /// `seed`.
     ///
     /// # Panics
-    /// Panics if they do not divide evenly into the shards of this rank.
+    /// Panics if there are none, or if they do not divide evenly into the shards of this rank.
     pub fn new(seed: u64, envs: Vec<E>, exchange: &Exchange) -> Self {
-        let shards = exchange.own_shards();
+        let (shards, spaces) = (exchange.own_shards(), envs[0].spaces());
         let in_shard = envs.len() / shards.len();
         assert_eq!(
             in_shard * shards.len(),
@@ -69,14 +71,20 @@ impl<E: Env> EnvPool<E> {
                 number,
                 first: first - size,
                 ends: vec![None; size],
-                final_observations: vec![0.0; size * E::SPACES.observation_size],
+                final_observations: vec![0.0; size * spaces.observation_size],
                 slots: slots.by_ref().take(size).collect(),
+                spaces,
                 seed,
                 stride: all as u64,
                 finished: Vec::new(),
             }
         };
         Self { blocks: (first_block..).zip(sizes.repeat(shards.len())).map(block).collect() }
+    }
+
+    /// Returns the description of observations and actions.
+    pub fn spaces(&self) -> Spaces {
+        self.blocks[0].spaces
     }
 
     /// Returns the number of environments.
@@ -92,7 +100,7 @@ impl<E: Env> EnvPool<E> {
     /// Starts the first episode of every environment, at a random age so that they do not all end together, and writes the
     /// `observations` `[n, O]` of each block.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
-        let size = E::SPACES.observation_size;
+        let size = self.spaces().observation_size;
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
             for (i, (slot, row)) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)).enumerate() {
                 let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
@@ -135,7 +143,7 @@ impl<E: Resumable> EnvPool<E> {
     /// # Errors
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let (size, first) = (E::SPACES.observation_size, self.blocks[0].first);
+        let (size, first) = (self.spaces().observation_size, self.blocks[0].first);
         let states = state.rows(self.blocks[0].stride as usize)?.skip(first);
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
@@ -172,7 +180,7 @@ impl<E: Env> EnvBlock<E> {
     /// # Errors
     /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
     pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
-        let Spaces { observation_size: size, action_size, .. } = E::SPACES;
+        let Spaces { observation_size: size, action_size, .. } = self.spaces;
         let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());
         assert_eq!(found, [n * action_size, n, n * size], "lengths of the block's actions, rewards and observations");
         let rows = observations.chunks_exact_mut(size).zip(self.final_observations.chunks_exact_mut(size));

@@ -56,6 +56,14 @@ impl<'a> SavedEnv<'a> {
         next.context("the state has too few numbers")
     }
 
+    /// Reads the next `count` numbers.
+    ///
+    /// # Errors
+    /// Fails if fewer are left.
+    pub fn next(&mut self, count: usize) -> Result<&'a [f64]> {
+        self.numbers.split_off(..count).context("the state has too few numbers")
+    }
+
     /// Returns how many numbers are left.
     pub fn numbers_left(&self) -> usize {
         self.numbers.len()

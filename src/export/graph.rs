@@ -4,17 +4,25 @@ use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
 use crate::ppo::{CLIP, InputTransform, Policy};
-use crate::quat::CUBE_ROTATIONS;
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
-pub(super) fn policy_graph(policy: &Policy) -> Graph {
+///
+/// A `mirror` `[O, O]` is multiplied from the right to observations before all else.
+pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     let Spaces { observation_size: size, action_size, .. } = policy.spaces;
     let InputTransform { perception, mean, factor } = policy.input_transform();
     let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));
-    let seen = match perception.cube_and_goal {
-        Some(places) => canonicalize(&mut graph, size, places),
+    let seen = match mirror {
+        Some(matrix) => {
+            graph.floats("mirror", &[size, size], matrix);
+            graph.node("MatMul", &["obs", "mirror"], "mirrored", &[])
+        }
         None => "obs".into(),
+    };
+    let seen = match perception.cube_and_goal {
+        Some(places) => canonicalize(&mut graph, size, &seen, (places, perception.rotations())),
+        None => seen,
     };
     graph.floats("mean", &[size], &mean);
     graph.floats("factor", &[size], &factor);
@@ -47,13 +55,18 @@ fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
 }
 
 /// Turns cube and goal by the rotation of the cube's symmetry that brings the cube closest to its unrotated orientation.
-fn canonicalize(graph: &mut Graph, size: usize, CubeAndGoal { cube, goal }: CubeAndGoal) -> String {
+fn canonicalize(
+    graph: &mut Graph,
+    size: usize,
+    obs: &str,
+    (CubeAndGoal { cube, goal, .. }, rotations): (CubeAndGoal, &[[f32; 4]]),
+) -> String {
     assert!(cube + 4 <= goal, "the goal follows the cube");
     // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
     let mut cosines = [0.0; 4 * 24];
     // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
     let mut products = Vec::new();
-    for (j, &[w, x, y, z]) in CUBE_ROTATIONS.iter().enumerate() {
+    for (j, &[w, x, y, z]) in rotations.iter().enumerate() {
         [w, -x, -y, -z].into_iter().enumerate().for_each(|(k, value)| cosines[k * 24 + j] = value);
         products.extend([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w]);
     }
@@ -71,7 +84,7 @@ fn canonicalize(graph: &mut Graph, size: usize, CubeAndGoal { cube, goal }: Cube
     ];
     graph.index("axis", 1);
     for (name, ends) in parts {
-        slice(graph, "obs", ends, name);
+        slice(graph, obs, ends, name);
     }
     let near = graph.node("MatMul", &["cube", "cosines"], "near", &[]);
     let nearness = graph.node("Abs", &[&near], "nearness", &[]);

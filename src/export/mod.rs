@@ -12,12 +12,20 @@ use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os;
-use crate::repose::{ACTUATORS, Hand, OBSERVATION, Task};
+use crate::repose::Hand;
 use crate::run;
 use graph::policy_graph;
 
-/// The hand that the policy was trained for, for programs that refuse another.
-const HAND: &str = "right Shadow Hand, 24 joints, 20 actuators";
+/// Returns what the hand is, for programs that refuse another.
+fn description(hand: &Hand) -> String {
+    let (joints, actuators) = (hand.joints.len(), hand.actuators.len());
+    let name = match hand.side() {
+        Some("rh_") => "right Shadow Hand",
+        Some("lh_") => "left Shadow Hand",
+        _ => "own hand",
+    };
+    format!("{name}, {joints} joints, {actuators} actuators")
+}
 
 /// Writes a policy as an ONNX file. The same policy gives the same bytes.
 ///
@@ -26,12 +34,12 @@ const HAND: &str = "right Shadow Hand, 24 joints, 20 actuators";
 pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let mut loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
-    let task = Task::new(&loaded.config).context("the ranges of the actuators are those of the scene")?;
+    let task = loaded.task().context("the ranges of the actuators are those of the scene")?;
     loaded.config = task.config().clone();
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file().into_iter().chain(loaded.config.model_file()))?;
     let output = os::OutputFile::create(&args.out)?;
-    let bytes = policy_graph(&loaded.policy).file(metadata(&loaded, task.hand()));
+    let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, task.hand()));
     output.finish(&bytes)?;
     os::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
     Ok(())
@@ -43,24 +51,31 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 /// actuators, and their target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
 fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
     let EnvConfig { act_moving_average, vel_obs_scale, .. } = loaded.config;
-    let ranges = hand.actuators.map(|actuator| actuator.range);
-    let offsets = list(ranges.map(|[low, high]| (low + high) / 2.0));
+    let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
+    let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
+    let parts = &hand.parts;
+    let groups = &hand.layout.groups;
     let progress = &loaded.checkpoint.progress;
     let mut facts = vec![
         ("action_offset", offsets.clone()),
-        ("action_scale", list(ranges.map(|[low, high]| (high - low) / 2.0))),
+        ("action_scale", list(ranges().map(|[low, high]| (high - low) / 2.0))),
         ("actions_clipped", "true".into()),
         ("commit", env!("SHADOW_REPOSE_COMMIT").into()),
         ("config", settings(loaded)),
         ("ctrl_dt", loaded.config.ctrl_dt.to_string()),
         ("default_joint_pos", offsets),
         ("ema_alpha", act_moving_average.to_string()),
-        ("hand", HAND.into()),
-        ("joint_names", list(ACTUATORS.map(|name| format!("rh_A_{name}")))),
-        ("observation_names", list(OBSERVATION.map(|group| group.name))),
-        ("observation_sizes", list(OBSERVATION.map(|group| group.length))),
+        ("fingertip_names", list(&parts.fingertips)),
+        ("goal_name", parts.goal.clone()),
+        ("hand", description(hand)),
+        ("hinge_names", list(&parts.joints)),
+        ("joint_names", list(&parts.actuators)),
+        ("object_name", parts.object.clone()),
+        ("observation_names", list(groups.map(|group| group.name))),
+        ("observation_sizes", list(groups.map(|group| group.length))),
         ("program", concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into()),
         ("quaternion_order", "wxyz, w >= 0 but for the fingertips".into()),
+        ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
         ("vel_obs_scale", vel_obs_scale.to_string()),
     ];
     if progress.env_steps > 0 {
@@ -78,6 +93,6 @@ fn settings(loaded: &Loaded) -> String {
     table.to_string()
 }
 
-fn list<T: ToString, const N: usize>(values: [T; N]) -> String {
-    values.map(|value| value.to_string()).join(",")
+fn list<T: ToString>(values: impl IntoIterator<Item = T>) -> String {
+    values.into_iter().map(|value| value.to_string()).collect::<Vec<_>>().join(",")
 }

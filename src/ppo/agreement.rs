@@ -17,8 +17,8 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 157,
         action_size: 20,
-        cube_and_goal: Some(CubeAndGoal { cube: 51, goal: 64 }),
-        distance: |_| 0.0,
+        cube_and_goal: Some(CubeAndGoal { cube: 51, goal: 64, relative: 0, symmetry: 1 }),
+        distance: |_, _| 0.0,
     };
 
     /// Returns a learner with this backend, and a rollout that a slightly different policy could have collected.

@@ -22,6 +22,9 @@ const OLDER: [(&str, &str); 2] = [("shadow-repose checkpoint 2", "0.1.0"), ("sha
 /// The text that identifies the physics of the scene.
 const SCENE: &str = "scene";
 
+/// The text that describes the hand and the object of the policy.
+const HAND: &str = "hand";
+
 /// The most bytes of a configuration that are read; ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
@@ -45,6 +48,8 @@ pub struct Checkpoint {
     pub provenance: Option<String>,
     /// The fingerprint of the physics of its scene; `None`: the built-in scene.
     pub scene: Option<String>,
+    /// The hand and the object that it was trained with; `None`: those of the built-in scene.
+    pub hand: Option<String>,
     content: Content,
 }
 
@@ -65,11 +70,11 @@ impl Checkpoint {
         let long = config.len();
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
         let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
-        let [provenance, scene] = [PROVENANCE, SCENE].map(|key| content.texts.remove(key));
+        let [provenance, scene, hand] = [PROVENANCE, SCENE, HAND].map(|key| content.texts.remove(key));
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata has an unknown `{}`", shortened(key));
         }
-        Ok(Self { config, progress, provenance, scene, content })
+        Ok(Self { config, progress, provenance, scene, hand, content })
     }
 
     /// Returns the bytes of a file.
@@ -79,7 +84,7 @@ impl Checkpoint {
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let (mut content, progress) = (self.content.clone(), serde_json::to_string(&self.progress)?);
         let always = [("format", FORMAT), ("config", &self.config), ("progress", &progress)];
-        let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene)];
+        let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene), (HAND, &self.hand)];
         let others = others.into_iter().filter_map(|(key, text)| Some((key, text.as_deref()?)));
         content.texts.extend(always.into_iter().chain(others).map(|(key, text)| (key.into(), text.into())));
         content.to_bytes()
@@ -218,7 +223,7 @@ impl Ppo {
     /// progress of the run. All that exchange call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
-        let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, content };
+        let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, hand: None, content };
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
         let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
@@ -279,7 +284,7 @@ mod tests {
     use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Exchange;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;

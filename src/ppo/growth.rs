@@ -74,7 +74,7 @@ mod tests {
     use crate::ppo::{Ppo, Progress};
     use crate::ranks::Exchange;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
 
     fn net(hidden: &[usize]) -> NetConfig {
         NetConfig { hidden: hidden.to_vec(), activation: Activation::Elu, symmetry: Symmetry::None }

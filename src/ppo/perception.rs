@@ -24,6 +24,8 @@ const EPSILON: f64 = 1e-5;
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
     pub cube_and_goal: Option<CubeAndGoal>,
+    /// The rotations that map the object onto itself; if there are fewer, the first one fills the rest.
+    rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
 }
 
 impl Perception {
@@ -32,32 +34,42 @@ impl Perception {
     /// # Errors
     /// Fails if the setting is the symmetry of a cube but the observations contain no cube.
     pub fn new(symmetry: Symmetry, spaces: &Spaces) -> Result<Self> {
-        let cube_and_goal = match symmetry {
-            Symmetry::None => None,
-            Symmetry::Cube => Some(spaces.cube_and_goal.context("ppo.symmetry = \"cube\": this task has no cube")?),
+        let place = || spaces.cube_and_goal.context("ppo.symmetry = \"cube\": this task has no cube");
+        let (cube_and_goal, mask) = match symmetry {
+            Symmetry::None => (None, 1),
+            Symmetry::Cube => (Some(place()?), u32::MAX),
+            Symmetry::Object => (spaces.cube_and_goal, spaces.cube_and_goal.map_or(1, |places| places.symmetry)),
         };
-        Ok(Self { cube_and_goal })
+        let mut rotations = [CUBE_ROTATIONS[0]; CUBE_ROTATIONS.len()];
+        let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
+        rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
+        Ok(Self { cube_and_goal, rotations })
+    }
+
+    /// Returns the rotations that map the object onto itself; the first one may be repeated at the end.
+    pub fn rotations(&self) -> &[[f32; 4]] {
+        &self.rotations
     }
 
     /// Maps one raw observation `[O]`, in place, to the one that represents all equivalent observations.
     #[inline(always)]
-    pub fn canonicalize(self, observation: &mut [f32]) {
-        let Some(CubeAndGoal { cube, goal }) = self.cube_and_goal else { return };
-        let best = nearest(quaternion(observation, cube));
+    pub fn canonicalize(&self, observation: &mut [f32]) {
+        let Some(CubeAndGoal { cube, goal, .. }) = self.cube_and_goal else { return };
+        let best = self.nearest(quaternion(observation, cube));
         for place in [cube, goal] {
             let turned = quat::mul(quaternion(observation, place), best);
             let turned = if turned[0] < 0.0 { turned.map(|x| -x) } else { turned };
             observation[place..place + 4].copy_from_slice(&turned);
         }
     }
-}
 
-/// Returns the rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
-#[inline(always)]
-fn nearest(cube: [f32; 4]) -> [f32; 4] {
-    // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
-    let close = CUBE_ROTATIONS.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
-    CUBE_ROTATIONS[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
+    /// Returns the rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
+    #[inline(always)]
+    fn nearest(&self, cube: [f32; 4]) -> [f32; 4] {
+        // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
+        let close = self.rotations.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
+        self.rotations[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
+    }
 }
 
 /// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
@@ -105,8 +117,8 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 20,
         action_size: 1,
-        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11 }),
-        distance: |_| 0.0,
+        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11, relative: 0, symmetry: 1 }),
+        distance: |_, _| 0.0,
     };
 
     fn perceive(symmetry: Symmetry, row: &mut [f32]) {
@@ -201,7 +213,7 @@ mod tests {
     fn normalised_values_are_in_standard_deviations_and_clipped() {
         let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
         let mut normalised = [0.0; 3];
-        let transform = InputTransform::new(Perception { cube_and_goal: None }, &normalizer);
+        let transform = InputTransform::new(Perception::new(Symmetry::None, &SPACES).unwrap(), &normalizer);
         transform.apply(&[4.0, 2.0, 400.0], &mut normalised);
         assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
         assert_eq!(normalised[1..], [0.0, CLIP]);

@@ -30,7 +30,8 @@ impl Conditions {
     /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`, and gives the simulation its
     /// physics; the state must be reset after it.
     pub(super) fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
-        self.draw = self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability));
+        self.draw =
+            self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {
@@ -76,8 +77,8 @@ impl Conditions {
             noise.draw(rng).for_each(|(i, added)| observation[i] += added);
         }
         if noise_rng.is_some() || !self.bias.is_empty() {
-            sensing::offset(observation, &self.bias);
-            sensing::make_consistent(observation);
+            sensing::offset(observation, &self.bias, &task.hand.layout);
+            sensing::make_consistent(observation, &task.hand.layout);
         }
     }
 }

@@ -2,8 +2,8 @@
 
 use serde_json::{Value, json};
 
+use super::EpisodePhysics;
 use super::physics::add_settings;
-use super::{ACTION_SIZE, EpisodePhysics};
 use crate::config::EnvConfig;
 use crate::sim::{Simulation, SimulationState};
 
@@ -24,8 +24,8 @@ impl Diverged {
     /// is what this one has drawn (null if nothing), on top of the settings, and `pushes` the force on the cube in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
-        let actions: Vec<Value> = tail.actions.iter().map(|action| json!(action.as_slice())).collect();
-        let ctrl: Vec<Value> = tail.controls.iter().map(|controls| json!(controls.as_slice())).collect();
+        let actions: Vec<&[f32]> = tail.actions.chunks_exact(tail.width).collect();
+        let ctrl: Vec<&[f64]> = tail.controls.chunks_exact(tail.width).collect();
         let mut dump = json!({
             "model": config.model,
             "goal_position": config.goal_position.value,
@@ -63,10 +63,12 @@ const STEPS: usize = 16;
 pub struct Tail {
     /// The state before the first of these steps.
     pub start: SimulationState,
-    /// The controls sent in each step, in the model's order.
-    pub controls: Vec<[f64; ACTION_SIZE]>,
-    /// The policy's action in each step.
-    pub actions: Vec<[f32; ACTION_SIZE]>,
+    /// The controls sent in each step, in the model's order, one step after another.
+    pub controls: Vec<f64>,
+    /// The policy's action in each step, one step after another.
+    pub actions: Vec<f32>,
+    /// The number of controls, and of values in an action.
+    pub width: usize,
     /// The random force on the cube in each step, N; empty where there is none.
     pub pushes: Vec<[f64; 3]>,
 }
@@ -86,13 +88,14 @@ impl Recorder {
 
     /// Records a step that is about to be taken, after its controls have been set.
     pub(super) fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>) {
-        if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS) {
-            let (controls, actions) = (Vec::with_capacity(STEPS), Vec::with_capacity(STEPS));
-            self.before = self.now.replace(Tail { start: sim.state(), controls, actions, pushes: Vec::new() });
+        let width = action.len();
+        if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
+            let (controls, actions) = (Vec::with_capacity(STEPS * width), Vec::with_capacity(STEPS * width));
+            self.before = self.now.replace(Tail { start: sim.state(), controls, actions, width, pushes: Vec::new() });
         }
         let tail = self.now.as_mut().expect("just begun");
-        tail.controls.push(*sim.ctrl().first_chunk().expect("one control per actuator"));
-        tail.actions.push(*action.first_chunk().expect("a complete action"));
+        tail.controls.extend(sim.ctrl());
+        tail.actions.extend(action);
         tail.pushes.extend(push);
     }
 

@@ -9,12 +9,12 @@ use anyhow::{Result, ensure};
 
 use super::conditions::Conditions;
 use super::divergence::{Diverged, Recorder};
-use super::observation::{Cells, SPACES};
+use super::observation::Cells;
 use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
-use super::servos::{Servos, Targets};
+use super::servos::Servos;
 use super::task::Task;
-use super::{ACTION_SIZE, EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward};
+use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward};
 use crate::config::{EnvConfig, SuccessHold};
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
@@ -29,8 +29,8 @@ pub struct Repose {
     sim: Simulation,
     rng: Rng,
     goal: Quat,
-    /// The previous action as observed: clipped to [-1, 1].
-    previous_action: [f32; ACTION_SIZE],
+    /// What the rewards of the last step depended on; its action is the previous one as observed.
+    now: Step,
     servos: Servos,
     conditions: Conditions,
     /// Control steps since the reset, plus those skipped by `skip_ahead`.
@@ -72,13 +72,19 @@ impl Repose {
         let conditions = Conditions::new(randomization);
         Self {
             sim: Simulation::new(conditions.nominal(task)),
-            servos: Servos::new(),
+            servos: Servos::new(task.hand.actuators.len()),
             conditions,
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
-            previous_action: [0.0; ACTION_SIZE],
+            now: Step {
+                action: vec![0.0; task.hand.actuators.len()],
+                previous_action: vec![0.0; task.hand.actuators.len()],
+                joint_pos: vec![0.0; task.hand.joints.len()],
+                joint_vel: vec![0.0; task.hand.joints.len()],
+                ..Step::default()
+            },
             age: 0,
             held: 0,
             episode: EpisodeStats::default(),
@@ -151,30 +157,26 @@ impl Repose {
         self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
     }
 
-    fn cube(&self) -> Pose {
+    /// Returns the pose of the object.
+    pub fn cube(&self) -> Pose {
         let at = self.task.hand.cube.qpos;
         let q = self.sim.qpos();
         Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
     }
 
-    /// Returns what the rewards of a step depend on, after its physics.
-    fn outcome(&self, rot_dist_before: f64, previous_action: [f32; ACTION_SIZE]) -> Step {
-        let (task, cube, qvel) = (&self.task, self.cube(), self.sim.qvel());
-        let rot_dist = quat::angle_between(cube.orientation, self.goal);
+    /// Takes down what the rewards of a step depend on, after its physics.
+    fn measure(&mut self, rot_dist_before: f64) {
+        let (cube, cube_velocity) = (self.cube(), self.cube_velocity());
+        let (task, now, qpos, qvel) = (&self.task, &mut self.now, self.sim.qpos(), self.sim.qvel());
         let offset = [0, 1, 2].map(|axis| cube.position[axis] - task.config.goal_position.value[axis]);
-        let goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
-        Step {
-            rot_dist_before,
-            rot_dist,
-            goal_dist,
-            within: rot_dist <= self.lesson.tolerance,
-            dropped: goal_dist >= task.config.fall_dist,
-            action: self.previous_action,
-            previous_action,
-            cube,
-            cube_velocity: self.cube_velocity(),
-            joint_pos: task.hand.joints.map(|joint| self.sim.qpos()[joint.qpos]),
-            joint_vel: task.hand.joints.map(|joint| qvel[joint.dof]),
+        (now.rot_dist_before, now.rot_dist) = (rot_dist_before, quat::angle_between(cube.orientation, self.goal));
+        now.goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
+        now.within = now.rot_dist <= self.lesson.tolerance;
+        now.dropped = now.goal_dist >= task.config.fall_dist;
+        (now.cube, now.cube_velocity) = (cube, cube_velocity);
+        let cells = now.joint_pos.iter_mut().zip(&mut now.joint_vel);
+        for ((angle, speed), joint) in cells.zip(&task.hand.joints) {
+            (*angle, *speed) = (qpos[joint.qpos], qvel[joint.dof]);
         }
     }
 
@@ -187,19 +189,19 @@ impl Repose {
         Velocity { linear: [*vx, *vy, *vz], angular }
     }
 
-    /// Clips the action, writes as controls the targets that take effect now, and returns those.
-    fn actuate(&mut self, action: &[f32]) -> Targets {
-        self.previous_action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        let due =
-            self.servos.apply(&self.previous_action, &self.task.hand.actuators, self.task.config.act_moving_average);
-        self.send(due);
-        due
+    /// Clips the action, and writes as controls the targets that take effect now.
+    fn actuate(&mut self, action: &[f32]) {
+        let now = &mut self.now;
+        std::mem::swap(&mut now.previous_action, &mut now.action);
+        now.action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        self.servos.apply(&now.action, &self.task.hand.actuators, self.task.config.act_moving_average);
+        self.send();
     }
 
-    fn send(&mut self, targets: Targets) {
+    fn send(&mut self) {
         let ctrl = self.sim.ctrl_mut();
-        for (actuator, target) in self.task.hand.actuators.iter().zip(targets) {
-            ctrl[actuator.ctrl] = target;
+        for (actuator, target) in self.task.hand.actuators.iter().zip(self.servos.due()) {
+            ctrl[actuator.ctrl] = *target;
         }
     }
 
@@ -232,13 +234,13 @@ impl Repose {
         chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
     }
 
-    /// Writes the observation `[157]` of the current state, in the task's order.
+    /// Writes the observation of the current state, in the order of the hand's layout.
     pub fn observe(&self, observation: &mut [f32]) {
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
-        let mut cells = Cells::new(observation);
-        cells.put("joint_pos", hand.joints.map(|joint| qpos[joint.qpos]));
-        cells.put("joint_vel", hand.joints.map(|joint| config.vel_obs_scale * qvel[joint.dof]));
+        let mut cells = Cells::new(&hand.layout, observation);
+        cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
+        cells.put("joint_vel", hand.joints.iter().map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
         let Pose { position, orientation } = self.cube();
         let Velocity { linear, angular } = self.cube_velocity();
@@ -250,7 +252,7 @@ impl Repose {
         cells.put("goal_quat", quat::canonical(self.goal));
         cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
 
-        for tip in hand.fingertips {
+        for &tip in &hand.fingertips {
             let Pose { position, orientation } = self.sim.pose(tip);
             let Velocity { linear, angular } = self.sim.velocity(tip);
             cells.put("fingertips", position);
@@ -258,16 +260,21 @@ impl Repose {
             cells.put("fingertips", linear);
             cells.put("fingertips", angular);
         }
-        cells.put("previous_action", self.previous_action.map(f64::from));
+        cells.put("previous_action", self.now.action.iter().copied().map(f64::from));
         cells.finish();
         self.conditions.disturb(&self.rng, self.episode.length, &self.task, observation);
+        if let Some(mirror) = &self.task.mirror {
+            mirror.apply(observation);
+        }
     }
 }
 
 impl Env for Repose {
     type Episode = EpisodeStats;
     type Lesson = Lesson;
-    const SPACES: Spaces = SPACES;
+    fn spaces(&self) -> Spaces {
+        self.task.spaces()
+    }
 
     fn set_lesson(&mut self, lesson: Lesson) {
         self.lesson = lesson;
@@ -279,6 +286,7 @@ impl Env for Repose {
         self.rng = rng;
         self.conditions.begin(&self.rng, self.lesson.randomized, &mut self.sim, &task);
         self.sim.reset();
+        self.sim.qpos_mut().copy_from_slice(&hand.start);
         for joint in &hand.joints {
             let noise = rng::uniform(&mut self.rng, -config.reset_dof_pos_noise, config.reset_dof_pos_noise);
             let angle = &mut self.sim.qpos_mut()[joint.qpos];
@@ -295,14 +303,11 @@ impl Env for Repose {
         let orientation = self.draw_rotation();
         self.sim.qpos_mut()[hand.cube.qpos + 3..hand.cube.qpos + 7].copy_from_slice(&orientation);
         self.set_goal();
-        let mut targets = [0.0; ACTION_SIZE];
-        for ((target, actuator), driven) in targets.iter_mut().zip(&hand.actuators).zip(&hand.driven) {
-            let angle: f64 = driven.iter().map(|&joint| self.sim.qpos()[hand.joints[joint].qpos]).sum();
-            *target = angle.clamp(actuator.range[0], actuator.range[1]);
-        }
-        self.send(targets);
+        let lengths = self.sim.lengths(&hand.actuators).zip(&hand.actuators);
+        let targets = lengths.map(|(length, actuator)| length.clamp(actuator.range[0], actuator.range[1]));
         self.servos.reset(targets, self.conditions.delay(&self.task));
-        self.previous_action = [0.0; ACTION_SIZE];
+        self.send();
+        self.now.action.fill(0.0);
         (self.age, self.held) = (0, 0);
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
         self.last = StepDetails::default();
@@ -316,39 +321,39 @@ impl Env for Repose {
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
-        let (rot_dist_before, previous_action) = (self.rot_dist(), self.previous_action);
-        let sent = self.actuate(action);
+        let rot_dist_before = self.rot_dist();
+        self.actuate(action);
         let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, push);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls; restore what was sent for anyone who reads them.
-            self.send(sent);
+            self.send();
         }
 
-        let step = self.outcome(rot_dist_before, previous_action);
+        self.measure(rot_dist_before);
         let (mut reward, mut added, mut reached) = (TaskReward::default(), TrainingReward::default(), false);
         self.age += 1;
         self.episode.length += 1;
         self.episode.diverged = diverged;
-        self.episode.dropped = !diverged && step.dropped;
+        self.episode.dropped = !diverged && self.now.dropped;
         self.sums.steps += 1;
         self.sums.diverged += u64::from(diverged);
         if diverged {
             let (length, draw) = (self.episode.length, self.conditions.draw().cloned());
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
         } else {
-            reward = task_reward(&self.task.config, &step);
-            added = self.lesson.reward(&step);
+            reward = task_reward(&self.task.config, &self.now);
+            added = self.lesson.reward(&self.now);
             self.episode.reward += reward;
-            self.episode.rot_dist_sum += step.rot_dist;
-            self.episode.in_tolerance += u32::from(step.rot_dist <= self.task.config.success_tolerance);
+            self.episode.rot_dist_sum += self.now.rot_dist;
+            self.episode.in_tolerance += u32::from(self.now.rot_dist <= self.task.config.success_tolerance);
             self.sums.task += reward;
             self.sums.training += added;
-            self.sums.turned += rot_dist_before - step.rot_dist;
-            reached = self.hold(step.within);
+            self.sums.turned += rot_dist_before - self.now.rot_dist;
+            reached = self.hold(self.now.within);
         }
-        let Step { rot_dist, goal_dist, .. } = step;
+        let Step { rot_dist, goal_dist, .. } = self.now;
         self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged, push };
 
         let end = if diverged || self.episode.dropped {
@@ -381,14 +386,14 @@ impl Resumable for Repose {
     fn save(&self, state: &mut EnvState) {
         state.numbers.extend(self.sim.state().numbers());
         state.numbers.extend(self.goal);
-        state.numbers.extend(self.previous_action.map(f64::from));
+        state.numbers.extend(self.now.action.iter().copied().map(f64::from));
         state.numbers.extend(self.servos.last());
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
         state.counters.push(u64::from(self.episode.randomized));
         self.episode.save(state);
         // Always the same number of values.
-        state.numbers.extend(self.servos.under_way(self.conditions.most_delay(&self.task)).flatten());
+        state.numbers.extend(self.servos.under_way(self.conditions.most_delay(&self.task)));
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
@@ -401,22 +406,23 @@ impl Resumable for Repose {
         let [randomized] = state.counters()?;
         ensure!(randomized <= 1, "an episode is randomised or not, but the state says {randomized}");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
-        let fixed = 4 + 2 * ACTION_SIZE + EpisodeStats::NUMBERS;
+        let actuators = self.task.hand.actuators.len();
+        let fixed = 4 + 2 * actuators + EpisodeStats::NUMBERS;
         // A fork may have other delays than its parent.
-        let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / ACTION_SIZE;
-        self.sim.restore(state.numbers_but(fixed + under_way * ACTION_SIZE)?)?;
+        let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / actuators;
+        self.sim.restore(state.numbers_but(fixed + under_way * actuators)?)?;
         // A fork may also have no forces on the cube, but its parent's state has one.
         self.sim.push(self.task.hand.cube.body, [0.0; 3]);
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
-        self.previous_action = state.numbers()?.map(|x| x as f32);
-        let clipped = self.previous_action.iter().all(|action| (-1.0..=1.0).contains(action));
-        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.previous_action);
-        let targets = state.numbers()?;
+        self.now.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
+        let clipped = self.now.action.iter().all(|action| (-1.0..=1.0).contains(action));
+        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.now.action);
+        let targets = state.next(actuators)?;
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
-        let under_way: Vec<Targets> = (0..under_way).map(|_| state.numbers()).collect::<Result<_>>()?;
-        self.servos.restore(targets, &under_way, self.conditions.delay(&self.task));
+        let under_way = state.next(under_way * actuators)?;
+        self.servos.restore(targets, under_way, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
         self.last = StepDetails::default();
         self.recorder.clear();

@@ -1,123 +1,177 @@
-//! The Shadow Hand in a scene: its names in the task's order, bound once, and the layouts that follow from them.
+//! The hand in a scene: its parts in the task's order, bound once, and the layout of observations that follows from them.
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, bail, ensure};
 
-use crate::sim::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
+use super::observation::Layout;
+use crate::sim::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Parts, Scene};
 
-/// The length of an action: one value for each actuator.
-pub const ACTION_SIZE: usize = 20;
-
-/// Joints in observation order, without the prefix `rh_` that they have in a scene.
+/// Joints of the Shadow Hand in observation order, without the prefix that they have in a scene.
 pub const JOINTS: [&str; 24] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
     "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
 ];
 
-/// Actuators in action order, without the prefix `rh_A_` that they have in a scene. A J0 drives the sum of J2 and J1.
-pub const ACTUATORS: [&str; ACTION_SIZE] = [
+/// Actuators of the Shadow Hand in action order, without the prefix and `A_`. A J0 drives the sum of J2 and J1.
+pub const ACTUATORS: [&str; 20] = [
     "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "RFJ4", "RFJ3", "RFJ0",
     "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
 ];
 
-/// The name of the body that the hand turns.
-pub(super) const CUBE: &str = "cube";
-
-/// The name of the body that shows the goal.
-const TARGET: &str = "target";
-
-/// Fingertip bodies in observation order, as named in the scene.
-pub const FINGERTIPS: [&str; 5] = ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"];
+/// Fingertip bodies of the Shadow Hand in observation order, without the prefix.
+pub const FINGERTIPS: [&str; 5] = ["ffdistal", "mfdistal", "rfdistal", "lfdistal", "thdistal"];
 
 /// Everything in a scene that the task uses.
+#[derive(Clone)]
 pub struct Hand {
+    /// The names of its parts.
+    pub parts: Parts,
     /// Joints in observation order.
-    pub joints: [Hinge; 24],
+    pub joints: Vec<Hinge>,
     /// Actuators in action order.
-    pub actuators: [Actuator; ACTION_SIZE],
-    /// The joints that each actuator drives the sum of, as indices into `joints`.
-    pub driven: [Vec<usize>; ACTION_SIZE],
-    /// Fingertips: index, middle, ring, little finger, thumb.
-    pub fingertips: [Body; 5],
-    /// The body that carries the hand, an arm's included.
-    pub root: Body,
-    /// The cube.
+    pub actuators: Vec<Actuator>,
+    /// The joints that each actuator drives, and the coefficients of their sum; none for a tendon along a path in space.
+    pub driven: Vec<Vec<(String, f64)>>,
+    /// Fingertips in observation order.
+    pub fingertips: Vec<Frame>,
+    /// The first bodies of the trees that carry the fingertips, an arm's included.
+    pub roots: Vec<Body>,
+    /// The object, by default a cube.
     pub cube: FreeJoint,
-    /// The cube that shows the goal.
+    /// The body that shows the goal.
     pub target: Mocap,
+    /// The number of the keyframe in which an episode starts, if it does.
+    pub keyframe: Option<usize>,
+    /// The generalised positions in which an episode starts, before noise.
+    pub start: Vec<f64>,
+    /// The layout of observations.
+    pub layout: Layout,
 }
 
 impl Hand {
-    /// Finds every name in `scene`, in whatever order they appear in its file.
+    /// Finds the parts of the hand in `scene`: those that are `named`, and the others in the order of the Shadow Hand if they
+    /// have its names with one prefix, else by the structure of the scene.
     ///
     /// # Errors
-    /// Fails with all names that are missing, or with the first one that belongs to something else.
-    pub fn bind(scene: &Scene) -> Result<Self> {
-        let named = |kind: &'static str, begin: &'static str, names: &'static [&'static str]| {
-            names.iter().map(move |name| (kind, format!("{begin}{name}")))
+    /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
+    pub fn find(scene: &Scene, named: &Parts) -> Result<Parts> {
+        let mut parts = named.clone();
+        if let Some(shadow) = shadow_hand(scene) {
+            for (own, of_shadow) in [
+                (&mut parts.joints, shadow.joints),
+                (&mut parts.actuators, shadow.actuators),
+                (&mut parts.fingertips, shadow.fingertips),
+            ] {
+                if own.is_empty() {
+                    *own = of_shadow;
+                }
+            }
+        }
+        scene.find_parts(&parts)
+    }
+
+    /// Binds these parts of `scene`, all of which are named but for the start.
+    ///
+    /// # Errors
+    /// Fails with one message on all names that are missing, and on all that belong to something else.
+    pub fn bind(scene: &Scene, parts: Parts) -> Result<Self> {
+        let lists: [(&str, &[String]); 3] =
+            [("joint", &parts.joints), ("actuator", &parts.actuators), ("body or site", &parts.fingertips)];
+        let single = [("body", &parts.object), ("body", &parts.goal), ("keyframe", &parts.start)];
+        let names = lists.into_iter().flat_map(|(kind, names)| names.iter().map(move |name| (kind, name)));
+        let has = |kind: &str, name: &str| match kind {
+            "body or site" => scene.has("body", name) || scene.has("site", name),
+            "keyframe" if name.is_empty() => true,
+            kind => scene.has(kind, name),
         };
-        let lists = [
-            named("joint", "rh_", &JOINTS),
-            named("actuator", "rh_A_", &ACTUATORS),
-            named("body", "", &FINGERTIPS),
-            named("body", "", &[CUBE, TARGET]),
-        ];
-        let missing: Vec<String> = lists
-            .into_iter()
-            .flatten()
-            .filter(|(kind, name)| !scene.has(kind, name))
+        let missing: Vec<String> = names
+            .chain(single)
+            .filter(|(kind, name)| !has(kind, name))
             .map(|(kind, name)| format!("{kind} `{name}`"))
             .collect();
         ensure!(missing.is_empty(), "has no {}", missing.join(", "));
-        let joints = each(JOINTS, |joint| scene.hinge(&format!("rh_{joint}")))?;
-        let driven = each(ACTUATORS, |actuator| Ok(driven_by(actuator)))?;
-        let actuators = each(ACTUATORS, |actuator| {
-            let coupled: Vec<String> = match actuator.strip_suffix("J0") {
-                Some(finger) => vec![format!("rh_{finger}J2"), format!("rh_{finger}J1")],
-                None => Vec::new(),
-            };
-            scene.actuator(&format!("rh_A_{actuator}"), &format!("rh_{actuator}"), &coupled)
-        })?;
+        let mut problems = Vec::new();
+        let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
+        let actuators = each(&parts.actuators, |actuator| scene.servo(actuator), &mut problems);
+        let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
+        if !problems.is_empty() {
+            bail!(problems.join("; "));
+        }
+        let controls = scene.controls();
         ensure!(
-            scene.controls() == ACTION_SIZE,
-            "has {} controls, but it must have exactly the {ACTION_SIZE} of the hand",
-            scene.controls()
+            controls == actuators.len(),
+            "has {controls} controls, but it must have exactly the {} of the hand",
+            actuators.len()
         );
-        let fingertips = each(FINGERTIPS, |tip| scene.body(tip))?;
-        Ok(Self {
-            joints,
-            driven,
-            actuators,
-            fingertips,
-            root: scene.root(fingertips[0]),
-            cube: scene.free_body(CUBE)?,
-            target: scene.mocap(TARGET)?,
-        })
+        let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
+        let mut roots: Vec<Body> = Vec::new();
+        for root in fingertips.iter().map(|&tip| scene.root(scene.body_of(tip))) {
+            if !roots.contains(&root) {
+                roots.push(root);
+            }
+        }
+        let cube = scene.free_body(&parts.object)?;
+        let target = scene.mocap(&parts.goal)?;
+        let keyframe = scene.start(&parts.start)?;
+        let start = scene.pose_of(keyframe);
+        let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
+        let hand = Self { parts, joints, actuators, driven, fingertips, roots, cube, target, keyframe, start, layout };
+        hand.expect_shadow_drives()?;
+        Ok(hand)
+    }
+
+    /// Returns where an episode starts the object, before noise, m.
+    pub fn place(&self) -> [f64; 3] {
+        *self.start[self.cube.qpos..].first_chunk().expect("a free joint")
+    }
+
+    /// Returns the prefix of its names if it has those of the Shadow Hand.
+    pub fn side(&self) -> Option<&str> {
+        let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
+        let names = self.parts.joints.iter().map(|name| name.strip_prefix(prefix));
+        names.eq(JOINTS.map(Some)).then_some(prefix)
+    }
+
+    /// Checks that a hand with the names of the Shadow Hand has its drives.
+    fn expect_shadow_drives(&self) -> Result<()> {
+        let Some(prefix) = self.side() else { return Ok(()) };
+        for (name, driven) in self.parts.actuators.iter().zip(&self.driven) {
+            let Some(actuator) = name.strip_prefix(prefix).and_then(|name| name.strip_prefix("A_")) else { continue };
+            let expected = match actuator.strip_suffix("J0") {
+                Some(finger) => vec![format!("{prefix}{finger}J1"), format!("{prefix}{finger}J2")],
+                None => vec![format!("{prefix}{actuator}")],
+            };
+            let mut found: Vec<(String, f64)> = driven.clone();
+            found.sort_by(|a, b| a.0.cmp(&b.0));
+            let is_right = found
+                .iter()
+                .map(|(name, coefficient)| (name, *coefficient))
+                .eq(expected.iter().map(|name| (name, 1.0)));
+            ensure!(is_right, "actuator `{name}` must drive {}", expected.join(" + "));
+        }
+        Ok(())
     }
 }
 
-/// Returns the indices into [`JOINTS`] of the joints that `actuator` drives.
-fn driven_by(actuator: &str) -> Vec<usize> {
-    let drives = |joint: &str| match actuator.strip_suffix("J0") {
-        Some(finger) => joint.strip_prefix(finger).is_some_and(|rest| rest == "J2" || rest == "J1"),
-        None => joint == actuator,
-    };
-    (0..JOINTS.len()).filter(|&i| drives(JOINTS[i])).collect()
+/// Returns the parts of a Shadow Hand, if all of its names are there with one prefix.
+fn shadow_hand(scene: &Scene) -> Option<Parts> {
+    let firsts = scene.joints();
+    let mut prefixes = firsts.iter().filter_map(|name| name.strip_suffix(JOINTS[0]));
+    let with = |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
+    prefixes.find_map(|prefix| {
+        let parts = Parts {
+            joints: with(&JOINTS, prefix),
+            actuators: with(&ACTUATORS, &format!("{prefix}A_")),
+            fingertips: with(&FINGERTIPS, prefix),
+            ..Parts::default()
+        };
+        let all = |kind: &str, names: &[String]| names.iter().all(|name| scene.has(kind, name));
+        let is_there =
+            all("joint", &parts.joints) && all("actuator", &parts.actuators) && all("body", &parts.fingertips);
+        is_there.then_some(parts)
+    })
 }
 
-fn each<T, const N: usize>(names: [&str; N], find: impl FnMut(&str) -> Result<T>) -> Result<[T; N]> {
-    let found: Vec<T> = names.into_iter().map(find).collect::<Result<_>>()?;
-    found.try_into().ok().context("one result per name")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn coupled_actuators_drive_two_joints_and_all_joints_are_driven_once() {
-        assert_eq!(driven_by("FFJ0").iter().map(|&i| JOINTS[i]).collect::<Vec<_>>(), ["FFJ2", "FFJ1"]);
-        let mut all: Vec<usize> = ACTUATORS.iter().flat_map(|a| driven_by(a)).collect();
-        all.sort_unstable();
-        assert_eq!(all, (0..24).collect::<Vec<_>>());
-    }
+/// Finds each of these names, and lists what is wrong.
+fn each<T>(names: &[String], find: impl Fn(&str) -> Result<T>, problems: &mut Vec<String>) -> Vec<T> {
+    names.iter().filter_map(|name| find(name).map_err(|error| problems.push(error.to_string())).ok()).collect()
 }

@@ -1,6 +1,6 @@
 //! The layout of an observation: one table from which sizes, offsets and the descriptions for other modules follow.
 
-use super::hand::{ACTION_SIZE, FINGERTIPS, JOINTS};
+use crate::quat;
 use crate::spaces::{CubeAndGoal, Spaces};
 
 /// A group of consecutive values in an observation.
@@ -14,86 +14,130 @@ pub struct Group {
     pub length: usize,
     /// The unit; 1 for dimensionless values.
     pub unit: &'static str,
+    /// The values that change their sign in the mirror, by index; of fingertips, for each one.
+    mirrored: &'static [usize],
 }
 
-// Each group begins where the previous one ends.
-const JOINT_POS: Group = Group { name: "joint_pos", start: 0, length: JOINTS.len(), unit: "rad" };
-const JOINT_VEL: Group = JOINT_POS.then("joint_vel", JOINTS.len(), "rad/s * vel_obs_scale");
-const CUBE_POS: Group = JOINT_VEL.then("cube_pos", 3, "m");
-pub(super) const CUBE_QUAT: Group = CUBE_POS.then("cube_quat", 4, "1");
-const CUBE_LINVEL: Group = CUBE_QUAT.then("cube_linvel", 3, "m/s");
-const CUBE_ANGVEL: Group = CUBE_LINVEL.then("cube_angvel", 3, "rad/s * vel_obs_scale");
-const GOAL_POS: Group = CUBE_ANGVEL.then("goal_pos", 3, "m");
-pub(super) const GOAL_QUAT: Group = GOAL_POS.then("goal_quat", 4, "1");
-pub(super) const RELATIVE_QUAT: Group = GOAL_QUAT.then("relative_quat", 4, "1");
 /// The number of values of a fingertip.
 pub(super) const TIP_SIZE: usize = 13;
 /// The index of its quaternion among them.
 pub(super) const TIP_QUAT: usize = 3;
 const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
-pub(super) const TIPS: Group = RELATIVE_QUAT.then("fingertips", TIP_SIZE * FINGERTIPS.len(), OF_FINGERTIPS);
-const PREVIOUS_ACTION: Group = TIPS.then("previous_action", ACTION_SIZE, "1");
 
-/// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z; all but those of the
-/// fingertips have w ≥ 0.
-#[rustfmt::skip]
-pub const OBSERVATION: [Group; 11] = [
-    JOINT_POS, JOINT_VEL, CUBE_POS, CUBE_QUAT, CUBE_LINVEL, CUBE_ANGVEL,
-    GOAL_POS, GOAL_QUAT, RELATIVE_QUAT, TIPS, PREVIOUS_ACTION,
-];
+// The places of groups in the table.
+pub(super) const CUBE_QUAT: usize = 3;
+pub(super) const GOAL_QUAT: usize = 7;
+pub(super) const RELATIVE_QUAT: usize = 8;
+pub(super) const TIPS: usize = 9;
 
-/// The number of values in an observation.
-pub const OBSERVATION_SIZE: usize = PREVIOUS_ACTION.start + PREVIOUS_ACTION.length;
+/// The layout of the observations of a hand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layout {
+    /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z; all but those of the
+    /// fingertips have w ≥ 0.
+    pub groups: [Group; 11],
+    /// The number of values in an observation.
+    pub size: usize,
+    /// The number of values in an action.
+    pub actions: usize,
+}
 
-/// The description of this task's observations and actions for a learner.
-pub const SPACES: Spaces = Spaces {
-    observation_size: OBSERVATION_SIZE,
-    action_size: ACTION_SIZE,
-    cube_and_goal: Some(CubeAndGoal { cube: CUBE_QUAT.start, goal: GOAL_QUAT.start }),
-    distance: rotation_error,
-};
+impl Layout {
+    /// Returns the layout for a hand with this many joints, fingertips and actuators.
+    #[rustfmt::skip]
+    pub fn new(joints: usize, fingertips: usize, actuators: usize) -> Self {
+        const JOINTS: &[usize] = &[];
+        // Points and velocities change their y, axes their x and z, and so do quaternions.
+        const POINT: &[usize] = &[1];
+        const AXIS: &[usize] = &[0, 2];
+        const QUATERNION: &[usize] = &[1, 3];
+        const TIP: &[usize] = &[1, 4, 6, 8, 10, 12];
+        let table = [
+            ("joint_pos", joints, "rad", JOINTS), ("joint_vel", joints, "rad/s * vel_obs_scale", JOINTS),
+            ("cube_pos", 3, "m", POINT), ("cube_quat", 4, "1", QUATERNION),
+            ("cube_linvel", 3, "m/s", POINT), ("cube_angvel", 3, "rad/s * vel_obs_scale", AXIS),
+            ("goal_pos", 3, "m", POINT), ("goal_quat", 4, "1", QUATERNION), ("relative_quat", 4, "1", QUATERNION),
+            ("fingertips", TIP_SIZE * fingertips, OF_FINGERTIPS, TIP),
+            ("previous_action", actuators, "1", JOINTS),
+        ];
+        let mut size = 0;
+        let groups = table.map(|(name, length, unit, mirrored)| {
+            size += length;
+            Group { name, start: size - length, length, unit, mirrored }
+        });
+        Self { groups, size, actions: actuators }
+    }
 
-impl Group {
-    /// Returns the group that follows this one.
-    const fn then(self, name: &'static str, length: usize, unit: &'static str) -> Self {
-        Self { name, start: self.start + self.length, length, unit }
+    /// Returns the index of the first value of a group, by the group's place in the table.
+    pub(super) fn start(&self, group: usize) -> usize {
+        self.groups[group].start
+    }
+
+    /// Returns the indices of the first values of the fingertips.
+    pub(super) fn tips(&self) -> impl Iterator<Item = usize> {
+        let Group { start, length, .. } = self.groups[TIPS];
+        (start..start + length).step_by(TIP_SIZE)
+    }
+
+    /// Returns the indices of the values that change their sign in the mirror, the plane y = 0 of the world.
+    pub(super) fn mirrored(&self) -> Vec<usize> {
+        let of_group = |group: &Group| {
+            let (Group { start, length, mirrored, .. }, own) = (*group, group.length.min(TIP_SIZE));
+            let parts = (start..start + length).step_by(own.max(1));
+            parts.flat_map(|part| mirrored.iter().map(move |i| part + i)).collect::<Vec<_>>()
+        };
+        self.groups.iter().flat_map(of_group).collect()
+    }
+
+    /// Returns the description of observations and actions for a learner, for an object with these rotations.
+    pub fn spaces(&self, symmetry: &[usize]) -> Spaces {
+        let [cube, goal, relative] = [CUBE_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
+        Spaces {
+            observation_size: self.size,
+            action_size: self.actions,
+            cube_and_goal: Some(CubeAndGoal { cube, goal, relative, symmetry: quat::mask(symmetry) }),
+            distance: rotation_error,
+        }
     }
 }
 
 /// Returns the rotation error that an observation shows, rad.
-fn rotation_error(observation: &[f32]) -> f32 {
-    2.0 * observation[RELATIVE_QUAT.start].clamp(0.0, 1.0).acos()
+fn rotation_error(spaces: &Spaces, observation: &[f32]) -> f32 {
+    let places = spaces.cube_and_goal.expect("a cube and its goal");
+    2.0 * observation[places.relative].clamp(0.0, 1.0).acos()
 }
 
 /// An observation that is being written, group by group.
 pub(super) struct Cells<'a> {
+    layout: &'a Layout,
     cells: &'a mut [f32],
     written: usize,
     part: usize,
 }
 
 impl<'a> Cells<'a> {
-    pub(super) fn new(observation: &'a mut [f32]) -> Self {
-        assert_eq!(observation.len(), OBSERVATION_SIZE, "observation length");
-        Self { cells: observation, written: 0, part: 0 }
+    pub(super) fn new(layout: &'a Layout, observation: &'a mut [f32]) -> Self {
+        assert_eq!(observation.len(), layout.size, "observation length");
+        Self { layout, cells: observation, written: 0, part: 0 }
     }
 
     /// Writes the next values, which must belong to the group `name`. This is the only place where the doubles of the physics
     /// become the floats of the learner.
-    pub(super) fn put<const N: usize>(&mut self, name: &str, values: [f64; N]) {
-        let Group { name: expected, start, length, .. } = OBSERVATION[self.part];
-        assert!(name == expected && self.written + N <= start + length, "{name}: {N} values do not fit {expected}");
-        self.cells[self.written..self.written + N]
-            .iter_mut()
-            .zip(values)
-            .for_each(|(cell, value)| *cell = value as f32);
-        self.written += N;
-        self.part += usize::from(self.written == start + length);
+    pub(super) fn put(&mut self, name: &str, values: impl IntoIterator<Item = f64>) {
+        let Group { name: expected, start, length, .. } = self.layout.groups[self.part];
+        let end = start + length;
+        assert!(name == expected, "{name}: {expected} comes first");
+        for value in values {
+            assert!(self.written < end, "{name}: more than {length} values");
+            self.cells[self.written] = value as f32;
+            self.written += 1;
+        }
+        self.part += usize::from(self.written == end);
     }
 
     /// Checks that every value has been overwritten.
     pub(super) fn finish(self) {
-        assert_eq!(self.written, OBSERVATION_SIZE, "values written to an observation");
+        assert_eq!(self.written, self.layout.size, "values written to an observation");
     }
 }
 
@@ -103,7 +147,8 @@ mod tests {
 
     #[test]
     fn the_observation_is_laid_out_as_the_task_says() {
-        let found = OBSERVATION.map(|part| (part.name, part.start, part.length));
+        let layout = Layout::new(24, 5, 20);
+        let found = layout.groups.map(|part| (part.name, part.start, part.length));
         let expected = [
             ("joint_pos", 0, 24),
             ("joint_vel", 24, 24),
@@ -118,28 +163,29 @@ mod tests {
             ("previous_action", 137, 20),
         ];
         assert_eq!(found, expected);
-        assert_eq!(OBSERVATION_SIZE, 157);
+        assert_eq!((layout.size, layout.actions), (157, 20));
     }
 
     #[test]
     fn numbers_that_do_not_fit_into_their_part_are_refused() {
+        let layout = Layout::new(24, 5, 20);
         let refused = |write: fn(&mut Cells)| {
-            let mut observation = [0.0; OBSERVATION_SIZE];
-            let mut cells = Cells::new(&mut observation);
+            let mut observation = [0.0; 157];
+            let mut cells = Cells::new(&layout, &mut observation);
             std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| write(&mut cells))).is_err()
         };
         assert!(!refused(|cells| cells.put("joint_pos", [0.0; 24])));
         assert!(refused(|cells| cells.put("joint_pos", [0.0; 25])), "too many");
         assert!(refused(|cells| cells.put("joint_vel", [0.0; 24])), "out of order");
         let all = |cells: &mut Cells| {
-            for part in OBSERVATION {
+            for part in Layout::new(24, 5, 20).groups {
                 (0..part.length).for_each(|_| cells.put(part.name, [0.0]));
             }
         };
-        let mut observation = [0.0; OBSERVATION_SIZE];
-        let mut cells = Cells::new(&mut observation);
+        let mut observation = [0.0; 157];
+        let mut cells = Cells::new(&layout, &mut observation);
         all(&mut cells);
         cells.finish();
-        assert!(refused(|cells| std::mem::replace(cells, Cells { cells: &mut [], written: 0, part: 0 }).finish()));
+        assert!(refused(|cells| Cells::new(cells.layout, &mut [0.0; 157]).finish()), "nothing was written");
     }
 }

@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use serde_json::{Map, Value, json};
 use toml::Table;
 
-use super::hand::{ACTION_SIZE, Hand, JOINTS};
+use super::hand::Hand;
 use crate::config::{EnvConfig, RandomizationConfig};
 use crate::rng::{self, Rng};
 use crate::sim::Change;
@@ -43,8 +43,8 @@ enum Law {
     Within(fn(&RandomizationConfig) -> f64),
     /// For each axis, normally with this standard deviation.
     Normal(fn(&RandomizationConfig) -> f64),
-    /// This number of factors, each uniformly in its logarithm.
-    Each(usize, fn(&RandomizationConfig) -> [f64; 2]),
+    /// As many factors as the hand has of these, each uniformly in its logarithm.
+    Each(fn(&Hand) -> usize, fn(&RandomizationConfig) -> [f64; 2]),
 }
 
 /// The number of sizes of the cube.
@@ -59,8 +59,8 @@ fn none(_: &Hand, _: &[f64]) -> Vec<Change> {
 }
 
 /// Returns the changes of each of these parts, given one value for all of them or one for each.
-fn each<T: Copy, const N: usize>(parts: [T; N], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
-    parts.into_iter().zip(values.iter().cycle()).map(|(part, &value)| change(part, value)).collect()
+fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
+    parts.iter().zip(values.iter().cycle()).map(|(&part, &value)| change(part, value)).collect()
 }
 
 fn vector(values: &[f64]) -> [f64; 3] {
@@ -78,7 +78,7 @@ pub const QUANTITIES: [Quantity; 10] = [
         change: |hand, x| vec![Change::Mass(hand.cube.body, x[0])] },
     Quantity { name: "hand_mass", setting: "hand_mass_scale", unit: "1", neutral: 1.0,
         task: |env| vec![env.hand_mass_scale], law: Law::Uniform(|drawn| drawn.hand_mass),
-        change: |hand, x| vec![Change::Mass(hand.root, x[0])] },
+        change: |hand, x| each(&hand.roots, x, Change::Mass) },
     Quantity { name: "cube_size", setting: "cube_size_scale", unit: "1", neutral: 1.0,
         task: |env| vec![env.cube_size_scale], law: Law::Size(|drawn| drawn.cube_size), change: none },
     Quantity { name: "delay", setting: "action_delay", unit: "control steps", neutral: 0.0,
@@ -90,30 +90,31 @@ pub const QUANTITIES: [Quantity; 10] = [
         task: |env| env.gravity.into(), law: Law::Normal(|drawn| drawn.gravity),
         change: |_, x| vec![Change::Gravity(vector(x))] },
     Quantity { name: "gains", setting: "gains_scale", unit: "1", neutral: 1.0,
-        task: |env| vec![env.gains_scale], law: Law::Each(ACTION_SIZE, |drawn| drawn.gains),
-        change: |hand, x| each(hand.actuators, x, Change::Gain) },
+        task: |env| vec![env.gains_scale], law: Law::Each(|hand| hand.actuators.len(), |drawn| drawn.gains),
+        change: |hand, x| each(&hand.actuators, x, Change::Gain) },
     Quantity { name: "damping", setting: "damping_scale", unit: "1", neutral: 1.0,
-        task: |env| vec![env.damping_scale], law: Law::Each(JOINTS.len(), |drawn| drawn.damping),
-        change: |hand, x| each(hand.joints, x, Change::Damping) },
+        task: |env| vec![env.damping_scale], law: Law::Each(|hand| hand.joints.len(), |drawn| drawn.damping),
+        change: |hand, x| each(&hand.joints, x, Change::Damping) },
     Quantity { name: "frictionloss", setting: "frictionloss_scale", unit: "1", neutral: 1.0,
-        task: |env| vec![env.frictionloss_scale], law: Law::Each(JOINTS.len(), |drawn| drawn.frictionloss),
-        change: |hand, x| each(hand.joints, x, Change::FrictionLoss) },
+        task: |env| vec![env.frictionloss_scale], law: Law::Each(|hand| hand.joints.len(), |drawn| drawn.frictionloss),
+        change: |hand, x| each(&hand.joints, x, Change::FrictionLoss) },
 ];
 
 /// Settings of `[env]` that vary what is simulated or observed and are no quantities.
 const OTHERS: [&str; 3] = ["cone", "noise", "bias"];
 
 impl Quantity {
-    fn count(&self) -> usize {
+    /// Returns the number of values in an episode of this hand.
+    fn count(&self, hand: &Hand) -> usize {
         match self.law {
             Law::Uniform(_) | Law::Size(_) | Law::Whole(_) => 1,
             Law::Within(_) | Law::Normal(_) => 3,
-            Law::Each(count, _) => count,
+            Law::Each(count, _) => count(hand),
         }
     }
 
     /// Draws the values of an episode.
-    pub(super) fn draw(&self, config: &RandomizationConfig, rng: &mut Rng) -> Vec<f64> {
+    pub(super) fn draw(&self, config: &RandomizationConfig, hand: &Hand, rng: &mut Rng) -> Vec<f64> {
         let axes = 0..3;
         match &self.law {
             Law::Uniform(range) => {
@@ -135,8 +136,8 @@ impl Quantity {
             Law::Each(count, range) => {
                 let [low, high] = range(config);
                 let together = rng::uniform(rng, 0.0, 1.0) < 0.5;
-                let own: Vec<f64> = (0..*count).map(|_| rng::uniform(rng, low.ln(), high.ln()).exp()).collect();
-                if together { vec![own[0]; *count] } else { own }
+                let own: Vec<f64> = (0..count(hand)).map(|_| rng::uniform(rng, low.ln(), high.ln()).exp()).collect();
+                if together { vec![own[0]; own.len()] } else { own }
             }
         }
     }
@@ -158,8 +159,8 @@ pub struct Physics(Vec<Vec<f64>>);
 
 impl Physics {
     /// Returns the physics of the scene as it is.
-    pub(super) fn neutral() -> Self {
-        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral; quantity.count()]).collect())
+    pub(super) fn neutral(hand: &Hand) -> Self {
+        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral; quantity.count(hand)]).collect())
     }
 
     /// Returns the physics that a task sets.
@@ -183,8 +184,8 @@ impl Physics {
         let value = |(quantity, values): (&Quantity, &Vec<f64>)| {
             let value = match quantity.law {
                 Law::Whole(_) => json!(values[0] as u64),
-                _ if quantity.count() == 1 => json!(values[0]),
-                _ => json!(values),
+                Law::Uniform(_) | Law::Size(_) => json!(values[0]),
+                Law::Within(_) | Law::Normal(_) | Law::Each(..) => json!(values),
             };
             (quantity.name.to_owned(), value)
         };

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 
+use super::hand::Hand;
 use super::physics::{Physics, QUANTITIES, SHARED, normal, sizes};
 use super::sensing::NoiseStd;
 use super::task::Task;
@@ -52,8 +53,8 @@ impl Randomization {
     /// # Errors
     /// Fails if the scene cannot be varied in this way, or if a setting names an unknown group of the observation.
     pub fn new(task: &Task, config: &RandomizationConfig) -> Result<Option<Arc<Self>>> {
-        let noise = NoiseStd::new(&config.noise).context("randomization.noise")?;
-        let bias = NoiseStd::new(&config.bias).context("randomization.bias")?;
+        let noise = NoiseStd::new(&config.noise, &task.hand.layout).context("randomization.noise")?;
+        let bias = NoiseStd::new(&config.bias, &task.hand.layout).context("randomization.bias")?;
         if !config.happens() {
             return Ok(None);
         }
@@ -81,18 +82,18 @@ impl Randomization {
     /// Draws the physics of the episode that owns `rng`; the generator's position does not matter. Returns `None` if the episode is
     /// not randomised, which happens with probability 1 - `probability`. All numbers are drawn in any case, so that one setting does not
     /// change what is drawn for another.
-    pub fn draw(&self, rng: &Rng, probability: f64) -> Option<EpisodePhysics> {
+    pub fn draw(&self, rng: &Rng, probability: f64, hand: &Hand) -> Option<EpisodePhysics> {
         let shared = &mut rng::beside(rng, "randomization");
         let randomized = rng::uniform(shared, 0.0, 1.0) < probability;
         let is_varied = |rng: &mut Rng| rng::uniform(rng, 0.0, 1.0) < self.config.each;
         let flags = [(); SHARED + 3].map(|()| is_varied(shared));
-        let mut physics = Physics::neutral();
+        let mut physics = Physics::neutral(hand);
         for (i, quantity) in QUANTITIES.iter().enumerate() {
             let (drawn, varied) = if i < SHARED {
-                (quantity.draw(&self.config, shared), flags[i])
+                (quantity.draw(&self.config, hand, shared), flags[i])
             } else {
                 let own = &mut rng::beside(rng, quantity.name);
-                (quantity.draw(&self.config, own), is_varied(own))
+                (quantity.draw(&self.config, hand, own), is_varied(own))
             };
             if varied {
                 physics.set(i, drawn);

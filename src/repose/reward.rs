@@ -7,7 +7,6 @@ use std::ops::{AddAssign, Index};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::hand::{ACTION_SIZE, JOINTS};
 use crate::config::{EnvConfig, Ramp, TrainingConfig};
 use crate::sim::{Pose, Velocity};
 
@@ -25,17 +24,17 @@ pub struct Step {
     /// Whether the cube was dropped.
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
-    pub action: [f32; ACTION_SIZE],
+    pub action: Vec<f32>,
     /// The action of the step before, clipped; zeros after a reset.
-    pub previous_action: [f32; ACTION_SIZE],
+    pub previous_action: Vec<f32>,
     /// The pose of the cube.
     pub cube: Pose,
     /// The velocity of the cube's centre.
     pub cube_velocity: Velocity,
     /// The angles of the joints, in observation order.
-    pub joint_pos: [f64; JOINTS.len()],
+    pub joint_pos: Vec<f64>,
     /// The velocities of the joints, in observation order.
-    pub joint_vel: [f64; JOINTS.len()],
+    pub joint_vel: Vec<f64>,
 }
 
 /// What a reader is told about a quantity: its name in columns, tags and JSON, and what it is, in a sentence.
@@ -208,9 +207,7 @@ mod tests {
     fn terms(rot_dist: f64, goal_dist: f64, action: &[f32]) -> TaskReward {
         let mut config = Config::resolve(None, &[]).unwrap().env;
         config.fall_penalty = -7.0;
-        let mut step = Step { rot_dist, goal_dist, ..Step::default() };
-        step.action[..action.len()].copy_from_slice(action);
-        task_reward(&config, &step)
+        task_reward(&config, &Step { rot_dist, goal_dist, action: action.to_vec(), ..Step::default() })
     }
 
     #[test]

@@ -3,8 +3,7 @@
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::hand::FINGERTIPS;
-use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, OBSERVATION, RELATIVE_QUAT, TIP_QUAT, TIP_SIZE, TIPS};
+use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, Layout, RELATIVE_QUAT, TIP_QUAT};
 use crate::config::ByGroup;
 use crate::os::shortened;
 use crate::quat::{self, Quat};
@@ -23,10 +22,10 @@ impl NoiseStd {
     ///
     /// # Errors
     /// Fails on the name of a group that does not exist or is not measured.
-    pub(super) fn new(groups: &ByGroup) -> Result<Self> {
+    pub(super) fn new(groups: &ByGroup, layout: &Layout) -> Result<Self> {
         for name in groups.keys() {
             if !MEASURED.contains(&name.as_str()) {
-                let known = OBSERVATION.iter().any(|group| group.name == name);
+                let known = layout.groups.iter().any(|group| group.name == name);
                 let what = if known { "is not measured" } else { "is not a group of the observation" };
                 bail!("`{}` {what}; those that can have noise are {}", shortened(name), MEASURED.join(", "));
             }
@@ -35,7 +34,7 @@ impl NoiseStd {
             let std = groups.get(name).copied().unwrap_or(0.0) as f32;
             (start..start + length).map(move |i| (i, std))
         };
-        Ok(Self(OBSERVATION.into_iter().flat_map(of_group).filter(|&(_, std)| std != 0.0).collect()))
+        Ok(Self(layout.groups.into_iter().flat_map(of_group).filter(|&(_, std)| std != 0.0).collect()))
     }
 
     /// Returns whether nothing is added to any value.
@@ -61,11 +60,8 @@ pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (
 
 /// Adds the offset of an episode. On an orientation q it is a small rotation that stays the same however the body turns: q ⊗ (1, v),
 /// where v are the last three of its four numbers.
-pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)]) {
-    let orientations = || {
-        std::iter::once(CUBE_QUAT.start)
-            .chain((TIPS.start..).step_by(TIP_SIZE).take(FINGERTIPS.len()).map(|tip| tip + TIP_QUAT))
-    };
+pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
+    let orientations = || std::iter::once(layout.start(CUBE_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
     let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
     let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
     bias.iter().filter(|(i, _)| !in_orientation(*i)).for_each(|&(i, added)| observation[i] += added);
@@ -78,7 +74,7 @@ pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)]) {
 
 /// Makes an observation consistent after something was added to its values: quaternions have length 1 and their usual sign, and
 /// the orientation relative to the goal follows from that of the cube.
-pub(super) fn make_consistent(observation: &mut [f32]) {
+pub(super) fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -88,24 +84,29 @@ pub(super) fn make_consistent(observation: &mut [f32]) {
     let write = |observation: &mut [f32], at: usize, q: Quat| {
         observation[at..at + 4].iter_mut().zip(q).for_each(|(cell, x)| *cell = x as f32);
     };
-    let cube = quat::canonical(read(observation, CUBE_QUAT.start));
-    let goal = read(observation, GOAL_QUAT.start);
-    write(observation, CUBE_QUAT.start, cube);
-    write(observation, RELATIVE_QUAT.start, quat::canonical(quat::mul(cube, quat::conj(goal))));
-    for tip in observation[TIPS.start..][..TIPS.length].chunks_exact_mut(TIP_SIZE) {
-        let orientation = read(tip, TIP_QUAT);
-        write(tip, TIP_QUAT, orientation);
+    let [cube_at, goal_at, relative_at] = [CUBE_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
+    let cube = quat::canonical(read(observation, cube_at));
+    let goal = read(observation, goal_at);
+    write(observation, cube_at, cube);
+    write(observation, relative_at, quat::canonical(quat::mul(cube, quat::conj(goal))));
+    for tip in layout.tips() {
+        let orientation = read(observation, tip + TIP_QUAT);
+        write(observation, tip + TIP_QUAT, orientation);
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::OBSERVATION_SIZE;
+    use super::super::observation::{TIP_SIZE, TIPS};
     use super::*;
     use crate::rng;
 
+    fn shadow() -> Layout {
+        Layout::new(24, 5, 20)
+    }
+
     fn spread(groups: &[(&str, f64)]) -> Result<NoiseStd> {
-        NoiseStd::new(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect())
+        NoiseStd::new(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect(), &shadow())
     }
 
     #[test]
@@ -133,13 +134,13 @@ mod tests {
         let mut turns = rng::stream(2, "turns", 0);
         let mut off = || {
             let q = quat::canonical(quat::uniform([0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0))));
-            let mut observation = vec![0.1; OBSERVATION_SIZE];
-            observation[CUBE_QUAT.start..][..4].copy_from_slice(&q.map(|x| x as f32));
-            offset(&mut observation, &bias);
-            make_consistent(&mut observation);
+            let mut observation = vec![0.1; 157];
+            observation[shadow().start(CUBE_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
+            offset(&mut observation, &bias, &shadow());
+            make_consistent(&mut observation, &shadow());
             assert_eq!(observation[5], 0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1);
             assert_eq!(observation[30], 0.1);
-            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[CUBE_QUAT.start + i]));
+            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(CUBE_QUAT) + i]));
             quat::canonical(quat::mul(quat::conj(q), seen))
         };
         let first = off();
@@ -151,21 +152,26 @@ mod tests {
 
     #[test]
     fn quaternions_stay_of_length_one_and_the_relative_one_is_that_of_the_seen_cube() {
-        let mut observation = vec![0.1; OBSERVATION_SIZE];
-        observation[GOAL_QUAT.start..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
-        observation[CUBE_QUAT.start..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
-        for (i, added) in [(CUBE_QUAT.start, -0.4), (TIPS.start + TIP_QUAT, 3.0), (3, 0.25)] {
+        let mut observation = vec![0.1; 157];
+        observation[shadow().start(GOAL_QUAT)..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
+        observation[shadow().start(CUBE_QUAT)..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
+        for (i, added) in [(shadow().start(CUBE_QUAT), -0.4), (shadow().start(TIPS) + TIP_QUAT, 3.0), (3, 0.25)] {
             observation[i] += added;
         }
-        make_consistent(&mut observation);
+        make_consistent(&mut observation, &shadow());
         let part = |at: usize| [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
-        let cube = part(CUBE_QUAT.start);
+        let cube = part(shadow().start(CUBE_QUAT));
         assert!(cube[0] > 0.0 && cube[1] < 0.0, "{cube:?}");
-        for at in [CUBE_QUAT.start, RELATIVE_QUAT.start, TIPS.start + TIP_QUAT, TIPS.start + TIP_SIZE + TIP_QUAT] {
+        for at in [
+            shadow().start(CUBE_QUAT),
+            shadow().start(RELATIVE_QUAT),
+            shadow().start(TIPS) + TIP_QUAT,
+            shadow().start(TIPS) + TIP_SIZE + TIP_QUAT,
+        ] {
             assert!((part(at).iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-6);
         }
         let relative = quat::canonical(quat::mul(cube, quat::conj([0.0, 1.0, 0.0, 0.0])));
-        assert!(part(RELATIVE_QUAT.start).iter().zip(relative).all(|(a, b)| (a - b).abs() < 1e-6));
+        assert!(part(shadow().start(RELATIVE_QUAT)).iter().zip(relative).all(|(a, b)| (a - b).abs() < 1e-6));
         assert_eq!((observation[3], observation[4]), (0.35, 0.1));
     }
 }

@@ -1,68 +1,74 @@
 //! The targets of the actuators: actions become smoothed targets, which take effect after the delay of the episode.
 
 use std::collections::VecDeque;
-use std::iter::repeat_n;
 
-use super::ACTION_SIZE;
 use crate::sim::Actuator;
 
-/// Targets of all actuators, rad, in action order.
-pub(super) type Targets = [f64; ACTION_SIZE];
-
-/// The targets of the servos of one hand.
+/// The targets of the servos of one hand: for each actuator in action order, in the unit of its control range.
 pub(super) struct Servos {
     /// The last targets.
-    targets: Targets,
-    /// The targets that have not taken effect yet, the oldest first: as many as there are control steps of delay.
-    under_way: VecDeque<Targets>,
+    targets: Vec<f64>,
+    /// The targets that take effect now.
+    due: Vec<f64>,
+    /// The targets that have not taken effect yet, the oldest first: as many sets as there are control steps of delay.
+    under_way: VecDeque<f64>,
 }
 
 impl Servos {
-    pub(super) fn new() -> Self {
-        Self { targets: [0.0; ACTION_SIZE], under_way: VecDeque::new() }
+    pub(super) fn new(actuators: usize) -> Self {
+        Self { targets: vec![0.0; actuators], due: vec![0.0; actuators], under_way: VecDeque::new() }
     }
 
     /// Starts with `targets`, which stay in effect during the delay.
-    pub(super) fn reset(&mut self, targets: Targets, delay: usize) {
-        self.targets = targets;
+    pub(super) fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
+        self.targets.iter_mut().zip(targets).for_each(|(own, target)| *own = target);
         self.under_way.clear();
-        self.under_way.extend(repeat_n(targets, delay));
+        for _ in 0..delay {
+            self.under_way.extend(&self.targets);
+        }
+        self.due.copy_from_slice(&self.targets);
     }
 
-    /// Turns an action, clipped to [-1, 1], into targets, and returns those that take effect now. `alpha` is the weight of an
+    /// Turns an action, clipped to [-1, 1], into targets, of which those that are due take effect. `alpha` is the weight of an
     /// action in the smoothed targets.
-    pub(super) fn apply(
-        &mut self,
-        action: &[f32; ACTION_SIZE],
-        actuators: &[Actuator; ACTION_SIZE],
-        alpha: f64,
-    ) -> Targets {
+    pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], alpha: f64) {
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
             let asked = low + (f64::from(*action) + 1.0) / 2.0 * (high - low);
             *target = (alpha * asked + (1.0 - alpha) * *target).clamp(low, high);
         }
-        self.under_way.push_back(self.targets);
-        self.under_way.pop_front().expect("it has just got one")
+        self.under_way.extend(&self.targets);
+        self.due.iter_mut().zip(self.under_way.drain(..self.targets.len())).for_each(|(due, target)| *due = target);
+    }
+
+    /// Returns the targets that take effect now.
+    pub(super) fn due(&self) -> &[f64] {
+        &self.due
     }
 
     /// Returns the last targets.
-    pub(super) fn last(&self) -> Targets {
-        self.targets
+    pub(super) fn last(&self) -> &[f64] {
+        &self.targets
     }
 
-    /// Returns `count` targets: those under way and, in front of them, the oldest one again.
-    pub(super) fn under_way(&self, count: usize) -> impl Iterator<Item = Targets> {
-        let oldest = *self.under_way.front().unwrap_or(&self.targets);
-        repeat_n(oldest, count - self.under_way.len()).chain(self.under_way.iter().copied())
+    /// Returns `count` sets of targets: those under way and, in front of them, the oldest one again.
+    pub(super) fn under_way(&self, count: usize) -> impl Iterator<Item = f64> {
+        let actuators = self.targets.len();
+        let missing = (count * actuators).saturating_sub(self.under_way.len());
+        let oldest = (0..missing).map(move |i| i % actuators);
+        let oldest = oldest.map(|i| *self.under_way.get(i).unwrap_or(&self.targets[i]));
+        oldest.chain(self.under_way.iter().copied())
     }
 
-    /// Resumes with these last targets and the newest `delay` of those that [`Self::under_way`] returned. If there are fewer,
+    /// Resumes with these last targets and the newest `delay` sets of those that [`Self::under_way`] returned. If there are fewer,
     /// because a fork has a longer delay than its parent, the oldest one is repeated.
-    pub(super) fn restore(&mut self, last: Targets, under_way: &[Targets], delay: usize) {
-        let oldest = *under_way.first().unwrap_or(&last);
-        self.reset(last, 0);
-        self.under_way.extend(repeat_n(oldest, delay.saturating_sub(under_way.len())));
-        self.under_way.extend(&under_way[under_way.len().saturating_sub(delay)..]);
+    pub(super) fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
+        let oldest = if under_way.is_empty() { last } else { &under_way[..last.len()] };
+        self.reset(last.iter().copied(), 0);
+        let wanted = delay * last.len();
+        for _ in 0..wanted.saturating_sub(under_way.len()) / last.len() {
+            self.under_way.extend(oldest);
+        }
+        self.under_way.extend(&under_way[under_way.len().saturating_sub(wanted)..]);
     }
 }

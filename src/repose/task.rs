@@ -2,58 +2,85 @@
 
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 
-use super::Hand;
-use super::hand::CUBE;
+use super::mirror::Mirror;
 use super::physics::Physics;
 use super::sensing::NoiseStd;
-use crate::config::{EnvConfig, Symmetry};
+use super::{Hand, Record};
+use crate::config::EnvConfig;
 use crate::os;
 use crate::quat::CUBE_ROTATIONS;
-use crate::sim::{Compilation, Look, Scene, origin};
+use crate::sim::{Compilation, Look, Parts, Scene, origin};
+use crate::spaces::Spaces;
+
+/// The name of the body that shows the goal where a scene has none.
+const GOAL: &str = "goal of shadow-repose";
 
 /// A scene, the hand in it, and the settings.
+#[derive(Clone)]
 pub struct Task {
     pub(super) scene: Scene,
+    compilation: Compilation,
     pub(super) hand: Hand,
     pub(super) config: EnvConfig,
     /// The standard deviation of white noise on an observation.
     pub(super) noise: NoiseStd,
     /// The standard deviation of the offset of an observation that lasts an episode.
     pub(super) bias: NoiseStd,
+    /// The rotations of a cube, by number, that the policy takes for the same; by default those that the object has.
+    pub(super) symmetry: Vec<usize>,
+    /// What turns observations into those of the policy's hand, if that is on the other side.
+    pub(super) mirror: Option<Mirror>,
 }
 
 impl Task {
-    /// Loads the scene that `config` names and binds the hand in it.
+    /// Loads the scene that `config` names, and binds the hand in it, of which some parts may be `named`.
     ///
     /// # Errors
-    /// Fails with the scene's file if the scene cannot be loaded or lacks a name, or if a setting names an unknown group of the
-    /// observation.
-    pub fn new(config: &EnvConfig) -> Result<Arc<Self>> {
-        Self::in_scene(Scene::load(config.model_file(), &compilation(config))?, config, None)
+    /// Fails with the scene's file if the scene cannot be loaded or lacks something, or if a setting does not fit the hand.
+    pub fn new(config: &EnvConfig, named: &Parts) -> Result<Arc<Self>> {
+        let (file, mut config) = (config.model_file(), config.clone());
+        let as_it_is = Scene::load(file, &Compilation::plain(config.sim_dt, config.cone))?;
+        let mut parts = Hand::find(&as_it_is, named).with_context(|| origin(file))?;
+        let compilation = Compilation {
+            object: parts.object.clone(),
+            size: config.cube_size_scale,
+            shifts: config.cube_com != [0.0; 3],
+            adds_goal: parts.goal.is_empty().then_some(GOAL),
+            ..Compilation::plain(config.sim_dt, config.cone)
+        };
+        if parts.goal.is_empty() {
+            parts.goal = GOAL.into();
+        }
+        let nominal = if compilation.keeps_all() { as_it_is } else { Scene::load(file, &compilation)? };
+        let hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
+        let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
+        config.goal_position.settle(hand.place());
+        for (setting, key, what, found) in [
+            (&mut config.num_hand_dofs, "num_hand_dofs", "joints", hand.joints.len()),
+            (&mut config.num_actuators, "num_actuators", "actuators", hand.actuators.len()),
+        ] {
+            setting.settle(found);
+            let named = setting.value;
+            ensure!(named == found, "env.{key} = {named}: the hand of {} has {found} {what}", origin(file));
+        }
+        let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
+        let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
+        let symmetry = nominal.symmetry(hand.cube.body);
+        Ok(Arc::new(Self { scene, compilation, hand, config, noise, bias, symmetry, mirror: None }))
     }
 
     /// Loads the same task in a scene for display.
     ///
     /// # Errors
-    /// Fails like [`Task::new`], or if meshes cannot be read.
-    pub fn for_display(config: &EnvConfig, look: &Look) -> Result<Arc<Self>> {
-        Self::in_scene(Scene::load_for_display(config.model_file(), &compilation(config), look)?, config, Some(look))
-    }
-
-    fn in_scene(scene: Scene, config: &EnvConfig, look: Option<&Look>) -> Result<Arc<Self>> {
-        let hand = Hand::bind(&scene).with_context(|| origin(config.model_file()))?;
-        let nominal = scene;
-        let mut scene = nominal.varied(&Physics::of_task(config).changes(&hand));
-        if let Some(look) = look {
-            scene.set_look(look, &nominal);
-        }
-        let mut config = config.clone();
-        config.goal_position.settle(nominal.start(hand.cube));
-        let noise = NoiseStd::new(&config.noise).context("env.noise")?;
-        let bias = NoiseStd::new(&config.bias).context("env.bias")?;
-        Ok(Arc::new(Self { scene, hand, config, noise, bias }))
+    /// Fails if the scene or meshes cannot be read any more.
+    pub fn for_display(&self, look: &Look) -> Result<Arc<Self>> {
+        let nominal = Scene::load_for_display(self.config.model_file(), &self.compilation, look)?;
+        let hand = Hand::bind(&nominal, self.hand.parts.clone())?;
+        let mut scene = nominal.varied(&Physics::of_task(&self.config).changes(&hand));
+        scene.set_look(look, &nominal);
+        Ok(Arc::new(Self { scene, hand, ..self.clone() }))
     }
 
     /// Returns the settings.
@@ -74,15 +101,32 @@ impl Task {
     /// Tells what of a user's scene the settings replace, and that the goal and the start of its cube are those of the scene.
     pub fn notes(&self) -> Vec<String> {
         let Some(file) = self.config.model_file() else { return Vec::new() };
-        let (scene, place, own) = (file.display(), self.config.goal_position.value, self.scene.start(self.hand.cube));
+        let (scene, place, own) = (file.display(), self.config.goal_position.value, self.hand.place());
         let (timestep, sim_dt) = (self.scene.own_timestep(), self.config.sim_dt);
         let mut notes = Vec::new();
         if timestep != sim_dt {
             notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
         }
-        if let keyframes @ [_, ..] = &self.scene.keyframes()[..] {
-            let names: Vec<String> = keyframes.iter().map(|name| format!("`{name}`")).collect();
-            notes.push(format!("keyframes of {scene} are not used: {}", os::shortened(&names.join(", "))));
+        let (mut used, mut unused) = (Vec::new(), Vec::new());
+        for (i, key) in self.scene.keyframes().into_iter().enumerate() {
+            if Some(i) == self.hand.keyframe { &mut used } else { &mut unused }.push(format!("`{key}`"));
+        }
+        for (keys, what) in [(used, "episodes start in the keyframe"), (unused, "not used are the keyframes")] {
+            if !keys.is_empty() {
+                notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
+            }
+        }
+        let (object, alike) = (&self.hand.parts.object, self.scene.symmetry(self.hand.cube.body).len());
+        if alike < CUBE_ROTATIONS.len() {
+            notes.push(format!(
+                "{alike} of the 24 rotations of a cube map `{object}` onto itself (ppo.symmetry = \"object\")"
+            ));
+        }
+        let round: String = self.scene.round_axes(self.hand.cube.body).into_iter().collect();
+        if !round.is_empty() {
+            notes.push(format!(
+                "no turn of `{object}` about its axes {round} can be seen or felt, but goals differ by such turns, and scores count them"
+            ));
         }
         notes.push(match place == own {
             true => format!("the cube starts where {scene} has it: env.goal_position = {place:?}"),
@@ -91,16 +135,70 @@ impl Task {
         notes
     }
 
-    /// Returns a warning if a policy takes orientations of this cube for the same that are not.
-    pub fn symmetry_warning(&self, symmetry: Symmetry) -> Option<String> {
-        let rotations = self.scene.symmetry(self.hand.cube.body).len();
-        (symmetry == Symmetry::Cube && rotations < CUBE_ROTATIONS.len()).then(|| {
-            format!(
-                "ppo.symmetry = \"cube\": a policy takes 24 orientations of a cube for the same, but the body `{CUBE}` of {} \
-                 has only {rotations} that are alike",
-                origin(self.config.model_file())
-            )
-        })
+    /// Returns a table of what was found in the scene, and in what order.
+    pub fn table(&self) -> String {
+        let Parts { joints, actuators, fingertips, object, goal, .. } = &self.hand.parts;
+        let listed = |names: &[String]| format!("{}: {}", names.len(), names.join(" "));
+        let alike = self.symmetry.len();
+        let start = match self.hand.keyframe {
+            Some(keyframe) => format!("keyframe `{}`", self.scene.keyframes()[keyframe]),
+            None => "the default pose".into(),
+        };
+        [
+            ("joints", listed(joints)),
+            ("actuators", listed(actuators)),
+            ("fingertips", listed(fingertips)),
+            ("object", format!("{object}: {alike} of a cube's 24 rotations map it onto itself")),
+            ("goal", goal.clone()),
+            ("start", start),
+        ]
+        .map(|(what, found)| format!("{what:<11} {found}\n"))
+        .concat()
+    }
+
+    /// Prepares the task for a policy with this record, and prints a warning where it does not fit well.
+    ///
+    /// # Errors
+    /// Fails if the policy is for another hand.
+    pub fn for_policy(mut self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
+        let (here, place) = (self.record(), self.origin());
+        if let Some(warning) = policy.expect_fits(&here, self.config.mirror, &place)? {
+            os::say(&format!("warning: {warning}"));
+        }
+        if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
+            os::say(&format!(
+                "warning: the policy takes {} orientations of an object for the same, but `{}` of {place} has only {} that are alike",
+                policy.symmetry.len(),
+                self.hand.parts.object,
+                here.symmetry.len()
+            ));
+        }
+        let task = Arc::get_mut(&mut self).expect("a task that nobody uses yet");
+        if task.config.mirror {
+            task.mirror = Some(Mirror::new(&here, policy, &task.hand.layout).context(place)?);
+        }
+        task.symmetry.clone_from(&policy.symmetry);
+        Ok(self)
+    }
+
+    /// Returns the record of its hand and object.
+    pub fn record(&self) -> Record {
+        Record::of(&self.hand, &self.scene, self.symmetry.clone())
+    }
+
+    /// Returns what mirrors observations, as a matrix `[O, O]` that is multiplied from the right, if they are mirrored.
+    pub fn mirror(&self) -> Option<Vec<f32>> {
+        self.mirror.as_ref().map(|mirror| mirror.matrix(self.hand.layout.size))
+    }
+
+    /// Returns the description of observations and actions for a learner.
+    pub fn spaces(&self) -> Spaces {
+        self.hand.layout.spaces(&self.symmetry)
+    }
+
+    /// Returns the name of the scene, for messages.
+    pub fn origin(&self) -> String {
+        origin(self.config.model_file())
     }
 
     /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's), and with a centre
@@ -110,16 +208,10 @@ impl Task {
     /// Fails like [`Task::new`].
     pub(super) fn scene_with(&self, size: f64, shifts: bool) -> Result<Scene> {
         let config = &self.config;
-        let mut compilation = compilation(config);
+        let mut compilation = self.compilation.clone();
         compilation.size *= size;
         compilation.shifts |= shifts;
         let scene = Scene::load(config.model_file(), &compilation)?;
         Ok(scene.varied(&Physics::of_task(config).changes(&self.hand)))
     }
-}
-
-/// Returns how the scene is compiled for a task.
-fn compilation(config: &EnvConfig) -> Compilation {
-    let shifts = config.cube_com != [0.0; 3];
-    Compilation { timestep: config.sim_dt, cone: config.cone, object: CUBE, size: config.cube_size_scale, shifts }
 }

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use anyhow::{Error, Result};
 
 use crate::cli::Shot;
-use crate::config::EnvConfig;
 use crate::os;
 use crate::repose::Task;
 use crate::sim::{Look, Quality, mesh_files};
@@ -13,20 +12,20 @@ use crate::sim::{Look, Quality, mesh_files};
 /// Loads the task for display as `shot` requests. If the meshes are not available, prints a note and shows the primitives.
 ///
 /// # Errors
-/// Fails like [`Task::new`].
-pub fn task_for_display(config: &EnvConfig, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
+/// Fails like [`Task::for_display`].
+pub fn task_for_display(task: &Task, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
     let note = |error: &Error| os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
-    let meshes = match shot.plain || config.model_file().is_some() {
+    let meshes = match shot.plain || task.config().model_file().is_some() {
         true => Vec::new(),
         false => os::hand_meshes(&mesh_files()).inspect_err(note).unwrap_or_default(),
     };
     let quality = shot.quality.unwrap_or(quality);
     let mut look = Look { meshes, size: shot.size.unwrap_or(size), camera: shot.camera, quality };
-    let task = Task::for_display(config, &look);
-    match &task {
+    let shown = task.for_display(&look);
+    match &shown {
         Err(error) if !look.meshes.is_empty() => note(error),
-        _ => return task,
+        _ => return shown,
     }
     look.meshes.clear();
-    Task::for_display(config, &look)
+    task.for_display(&look)
 }

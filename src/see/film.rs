@@ -8,7 +8,6 @@ use std::time::Instant;
 use anyhow::{Result, ensure};
 
 use crate::cli::Shot;
-use crate::config::EnvConfig;
 use crate::draw::{FilmFormat, FilmWriter, Frame, gif_of, write_png};
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player, Trial};
@@ -121,14 +120,14 @@ pub struct EpisodeFilms {
 }
 
 impl EpisodeFilms {
-    /// Prepares films of the task with these settings.
+    /// Prepares films of a task.
     ///
     /// # Errors
     /// Fails if there is no EGL.
-    pub fn new(config: &EnvConfig) -> Result<Self> {
+    pub fn new(task: &Task) -> Result<Self> {
         // Primitives, since a training should not need the hand's meshes.
         let shot = Shot { size: None, camera: None, quality: None, plain: true };
-        let task = task_for_display(config, &shot, ANIMATION.size, Quality::Fast)?;
+        let task = task_for_display(task, &shot, ANIMATION.size, Quality::Fast)?;
         let renderer = Renderer::new(task.scene())?;
         let frames = Frames { renderer, fps: ANIMATION.fps, longest: ANIMATION.longest as u64, drawn: 0 };
         Ok(Self { task, frames })

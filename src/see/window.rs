@@ -9,7 +9,7 @@ use anyhow::Result;
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
-use crate::repose::{ACTION_SIZE, Repose, Step, Task, task_reward};
+use crate::repose::{Repose, Step, Task, task_reward};
 use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
 /// The minimum time between two frames.
@@ -170,7 +170,7 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
     let (stats, reward) = (env.episode(), env.last_step().reward);
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
-    let extreme = Step { goal_dist: config.fall_dist, action: [1.0; ACTION_SIZE], ..Step::default() };
+    let extreme = Step { goal_dist: config.fall_dist, action: vec![1.0; env.spaces().action_size], ..Step::default() };
     let largest = task_reward(config, &extreme).values();
     let terms = reward.named().zip(largest).map(|((name, value), largest)| {
         let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };

@@ -10,8 +10,12 @@ use std::ptr;
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
 use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
+use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
 use serde::{Deserialize, Serialize};
+
+/// The group of geoms that are drawn and by convention collide with nothing.
+pub(super) const VISUAL: i32 = 2;
 
 /// The scene built into the program.
 pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -29,25 +33,32 @@ pub enum Cone {
 }
 
 /// How a scene is compiled.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Compilation {
     /// The physics timestep, s.
     pub timestep: f64,
     /// The friction cones.
     pub cone: Cone,
     /// The name of the body that `size` and `shifts` are about.
-    pub object: &'static str,
+    pub object: String,
     /// The factor on the lengths of the object: its shapes, and the places of what is attached to it. Its mass stays the same.
     pub size: f64,
     /// Whether the object's centre of mass may later be shifted. MuJoCo has a shortcut for bodies whose centre of mass is the
     /// origin of their frame; without it, results differ in rounding.
     pub shifts: bool,
+    /// The name of a mocap body that is added to show the goal: it looks like the object, and touches nothing.
+    pub adds_goal: Option<&'static str>,
 }
 
 impl Compilation {
-    /// Returns the compilation that keeps all of a scene but its timestep in s.
-    pub fn plain(timestep: f64) -> Self {
-        Self { timestep, cone: Cone::Scene, object: "", size: 1.0, shifts: false }
+    /// Returns the compilation that keeps all of a scene but its timestep in s and its friction cones.
+    pub fn plain(timestep: f64, cone: Cone) -> Self {
+        Self { timestep, cone, object: String::new(), size: 1.0, shifts: false, adds_goal: None }
+    }
+
+    /// Returns whether it keeps all of a scene but its options.
+    pub fn keeps_all(&self) -> bool {
+        self.size == 1.0 && !self.shifts && self.adds_goal.is_none()
     }
 
     /// Compiles the built-in scene (`None`) or a user's file.
@@ -59,7 +70,7 @@ impl Compilation {
         ensure!(!is_folder, "env.model must name a MuJoCo scene, but this is a folder");
         let exists = file.is_none_or(Path::is_file);
         ensure!(exists, "env.model must name a MuJoCo scene, but there is no such file");
-        if self.size == 1.0 && !self.shifts {
+        if self.keeps_all() {
             let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
             if let Ok(model) = model {
                 return Ok(model);
@@ -79,16 +90,19 @@ impl Compilation {
             Some(whole) => refused(whole),
             None => refused(error),
         })?;
-        if self.size == 1.0 && !self.shifts {
+        if self.keeps_all() {
             return Ok(spec);
         }
-        let name = self.object;
+        let name = &self.object;
         let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
         if self.shifts {
             body.set_simple(false);
         }
         if self.size != 1.0 {
             resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))?;
+        }
+        if let Some(goal) = self.adds_goal {
+            add_goal(&mut spec, name, goal)?;
         }
         Ok(spec)
     }
@@ -127,6 +141,24 @@ fn refused(error: impl Display) -> Error {
 /// Returns the name of a scene's file, for messages.
 pub fn origin(file: Option<&Path>) -> String {
     file.map_or("the built-in scene".into(), |path| path.display().to_string())
+}
+
+/// Adds a mocap body in the shape of the body `name`, where that is, which touches nothing.
+fn add_goal(spec: &mut MjSpec, name: &str, goal: &str) -> Result<()> {
+    let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
+    let pos = *body.pos();
+    let shapes: Vec<_> = body
+        .geom_iter_mut(false)
+        .map(|geom| (geom.type_(), *geom.size(), *geom.pos(), *geom.quat(), *geom.fromto(), geom.meshname().to_owned()))
+        .collect();
+    let shown = spec.world_body_mut().add_body();
+    shown.with_name(goal).with_pos(pos).with_mocap(true);
+    for (kind, size, pos, quat, fromto, mesh) in shapes {
+        let geom = shown.add_geom();
+        geom.with_type(kind).with_size(size).with_pos(pos).with_quat(quat).with_fromto(fromto).with_meshname(&mesh);
+        geom.with_contype(0).with_conaffinity(0).with_group(VISUAL).with_mass(0.0).with_rgba([0.2, 0.8, 0.2, 0.4]);
+    }
+    Ok(())
 }
 
 /// Multiplies the lengths of a body and its descendants by `factor` and leaves their masses as they are.

@@ -51,7 +51,7 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Compilation, Scene};
+    use super::super::{Compilation, Cone, Scene};
 
     #[test]
     fn a_scene_is_recognised_by_its_physics_and_not_by_its_path_names_or_look() {
@@ -62,10 +62,10 @@ mod tests {
             let path = place.path().join(name);
             let text = if from.is_empty() { text.to_owned() } else { text.replacen(from, to, 1) };
             crate::os::write_whole(&path, text.as_bytes()).unwrap();
-            Scene::load(Some(&path), &Compilation::plain(0.01)).unwrap().fingerprint()
+            Scene::load(Some(&path), &Compilation::plain(0.01, Cone::Scene)).unwrap().fingerprint()
         };
         let original = print("a.xml", "", "");
-        assert_eq!(original, Scene::load(None, &Compilation::plain(0.01)).unwrap().fingerprint());
+        assert_eq!(original, Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap().fingerprint());
         assert_eq!(print("b.xml", "name=\"cube\"", "name=\"die\""), original);
         let unseen = "<geom type='sphere' size='.1' pos='9 9 9' contype='0' conaffinity='0' rgba='1 0 0 1'/>";
         assert_eq!(print("c.xml", "<worldbody>", &format!("<worldbody><light pos='0 0 9'/>{unseen}")), original);

@@ -10,8 +10,7 @@ use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_model::MjtTexture;
 
-use super::compilation::Compilation;
-use super::look::VISUAL;
+use super::compilation::{Compilation, VISUAL};
 
 /// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours.
 const CUBES: [(&str, f32); 2] = [("cube", 1.0), ("target", 0.7)];

@@ -7,12 +7,10 @@ use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 
-use super::compilation::Compilation;
+use super::compilation::{Compilation, VISUAL};
 
 /// The group of geoms that are not drawn.
 const HIDDEN: i32 = 3;
-/// The group of geoms that are drawn and by convention collide with nothing.
-pub(super) const VISUAL: i32 = 2;
 /// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 

@@ -17,6 +17,7 @@ mod panel;
 mod renderer;
 mod scene;
 mod simulation;
+mod structure;
 mod symmetry;
 mod variation;
 #[cfg(feature = "viewer")]
@@ -26,8 +27,9 @@ pub use compilation::{Compilation, Cone, origin};
 pub use fatal::{before_fatal_error, stepping};
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
-pub use scene::{Actuator, Body, FreeJoint, Hinge, Mocap, Scene};
+pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
 pub use simulation::{Physics, Pose, Simulation, SimulationState, Velocity};
+pub use structure::Parts;
 pub use variation::{Change, Variants};
 
 #[cfg(feature = "viewer")]

@@ -49,6 +49,15 @@ pub struct FreeJoint {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Body(pub(super) usize);
 
+/// A body or a site, whose pose and velocity can be read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Frame {
+    /// A body.
+    Body(Body),
+    /// A site, by its number.
+    Site(usize),
+}
+
 /// A mocap body, whose pose is set directly.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mocap(pub(super) usize);
@@ -181,17 +190,49 @@ impl Scene {
         (0..self.model.nkey() as usize).map(name).collect()
     }
 
-    /// Returns where the scene has the body of a free joint, m.
-    pub fn start(&self, joint: FreeJoint) -> [f64; 3] {
-        *self.model.qpos0()[joint.qpos..].first_chunk().expect("a free joint")
-    }
-
     /// Finds the body `name`.
     ///
     /// # Errors
     /// Fails if there is no such body.
     pub fn body(&self, name: &str) -> Result<Body> {
         Ok(Body(self.find(MjtObjBase::mjOBJ_BODY, "body", name)?))
+    }
+
+    /// Finds the body or, if there is none, the site `name`.
+    ///
+    /// # Errors
+    /// Fails if there is neither.
+    pub fn frame(&self, name: &str) -> Result<Frame> {
+        if let Ok(body) = self.body(name) {
+            return Ok(Frame::Body(body));
+        }
+        Ok(Frame::Site(self.find(MjtObjBase::mjOBJ_SITE, "body or site", name)?))
+    }
+
+    /// Returns the body that carries a frame.
+    pub fn body_of(&self, frame: Frame) -> Body {
+        match frame {
+            Frame::Body(body) => body,
+            Frame::Site(site) => Body(self.model.site_bodyid()[site] as usize),
+        }
+    }
+
+    /// Returns the number of the keyframe in which an episode starts: `name`, else `start` or `home`, else the only one, if any.
+    ///
+    /// # Errors
+    /// Fails if there is no keyframe `name`.
+    pub fn start(&self, name: &str) -> Result<Option<usize>> {
+        if !name.is_empty() {
+            return self.find(MjtObjBase::mjOBJ_KEY, "keyframe", name).map(Some);
+        }
+        let known = ["start", "home"].into_iter().find_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_KEY, name));
+        Ok(known.or((self.model.nkey() == 1).then_some(0)))
+    }
+
+    /// Returns the generalised positions of a keyframe, by its number, or the default ones.
+    pub fn pose_of(&self, keyframe: Option<usize>) -> Vec<f64> {
+        let size = self.model.nq() as usize;
+        keyframe.map_or(self.model.qpos0(), |key| &self.model.key_qpos()[key * size..][..size]).to_vec()
     }
 
     /// Returns the first body of the kinematic tree to which `body` belongs.
@@ -209,26 +250,16 @@ impl Scene {
         Ok(Mocap(id.with_context(|| format!("body `{name}` must have mocap=\"true\""))?))
     }
 
-    /// Finds the actuator `name`, which must be a position servo with one limited control. It must drive the joint `target` or,
-    /// if `summed` is not empty, the fixed tendon `target` that is the sum of the joints `summed`.
+    /// Finds the actuator `name`, which must be a position servo with one limited control that moves a joint or a tendon.
     ///
     /// # Errors
-    /// Fails if there is no such actuator or target, or if the actuator is of another kind or drives something else.
-    pub fn actuator(&self, name: &str, target: &str, summed: &[String]) -> Result<Actuator> {
+    /// Fails if there is no such actuator, or if it is of another kind.
+    pub fn servo(&self, name: &str) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
-        let (kind, what, transmission) = match summed {
-            [] => (MjtObjBase::mjOBJ_JOINT, "joint", MjtTrn::mjTRN_JOINT),
-            _ => (MjtObjBase::mjOBJ_TENDON, "tendon", MjtTrn::mjTRN_TENDON),
-        };
-        let target_id = self.find(kind, what, target)?;
-        let drives_it =
-            self.model.actuator_trntype()[id] == transmission && self.model.actuator_trnid()[id][0] == target_id as i32;
-        ensure!(drives_it, "actuator `{name}` must drive the {what} `{target}`");
-        if !summed.is_empty() {
-            self.check_sum(target, target_id, summed)?;
-        }
         let is_servo = self.is_position_servo(id);
         ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
+        let moves = matches!(self.model.actuator_trntype()[id], MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_TENDON);
+        ensure!(moves, "actuator `{name}` must drive a joint or a tendon");
         let is_angle = self.model.actuator_gear()[id][0] == 1.0;
         ensure!(is_angle, "actuator `{name}` must have a gear of 1: its control is an angle");
         let is_direct =
@@ -240,11 +271,28 @@ impl Scene {
         Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
     }
 
-    /// Returns whether the scene has a joint, an actuator or a body of this name.
+    /// Returns the joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
+    /// in space drives no sum.
+    pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
+        let target = self.model.actuator_trnid()[actuator.id][0] as usize;
+        let name = |joint: usize| self.model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
+        if self.model.actuator_trntype()[actuator.id] == MjtTrn::mjTRN_JOINT {
+            return vec![(name(target), 1.0)];
+        }
+        let first = self.model.tendon_adr()[target] as usize;
+        let path = first..first + self.model.tendon_num()[target] as usize;
+        path.filter(|&wrap| self.model.wrap_type()[wrap] == MjtWrap::mjWRAP_JOINT)
+            .map(|wrap| (name(self.model.wrap_objid()[wrap] as usize), self.model.wrap_prm()[wrap]))
+            .collect()
+    }
+
+    /// Returns whether the scene has a joint, an actuator, a site, a keyframe or a body of this name.
     pub fn has(&self, kind: &str, name: &str) -> bool {
         let kind = match kind {
             "joint" => MjtObjBase::mjOBJ_JOINT,
             "actuator" => MjtObjBase::mjOBJ_ACTUATOR,
+            "site" => MjtObjBase::mjOBJ_SITE,
+            "keyframe" => MjtObjBase::mjOBJ_KEY,
             _ => MjtObjBase::mjOBJ_BODY,
         };
         self.model.name_to_id(kind, name).is_some()
@@ -261,20 +309,5 @@ impl Scene {
             && self.model.actuator_biastype()[id] == MjtBias::mjBIAS_AFFINE
             && kp > 0.0
             && self.model.actuator_biasprm()[id][1] == -kp
-    }
-
-    fn check_sum(&self, tendon: &str, id: usize, joints: &[String]) -> Result<()> {
-        let first = self.model.tendon_adr()[id] as usize;
-        let path = first..first + self.model.tendon_num()[id] as usize;
-        let mut parts: Vec<(usize, f64)> = path
-            .filter(|&wrap| self.model.wrap_type()[wrap] == MjtWrap::mjWRAP_JOINT)
-            .map(|wrap| (self.model.wrap_objid()[wrap] as usize, self.model.wrap_prm()[wrap]))
-            .collect();
-        let part = |joint: &String| Ok((self.find(MjtObjBase::mjOBJ_JOINT, "joint", joint)?, 1.0));
-        let mut expected = joints.iter().map(part).collect::<Result<Vec<_>>>()?;
-        parts.sort_by_key(|&(joint, _)| joint);
-        expected.sort_by_key(|&(joint, _)| joint);
-        ensure!(parts == expected, "tendon `{tendon}` must be the sum {}", joints.join(" + "));
-        Ok(())
     }
 }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
 
-use super::{Body, Mocap, Scene};
-use crate::quat::Quat;
+use super::{Actuator, Body, Frame, Mocap, Scene};
+use crate::quat::{self, Quat};
 
 /// The validity of the state after a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -167,15 +167,36 @@ impl Simulation {
         Ok(())
     }
 
-    /// Returns the pose of a body's frame.
-    pub fn pose(&self, Body(id): Body) -> Pose {
-        Pose { position: self.data.xpos()[id], orientation: self.data.xquat()[id] }
+    /// Returns the lengths of actuators at `qpos`: angles, sums of angles, or lengths of tendons in m.
+    pub fn lengths<'a>(&'a mut self, actuators: &'a [Actuator]) -> impl Iterator<Item = f64> + 'a {
+        self.data.kinematics();
+        self.data.com_pos();
+        self.data.tendon_comp();
+        self.data.transmission();
+        actuators.iter().map(|actuator| self.data.actuator_length()[actuator.id])
     }
 
-    /// Returns the velocity of a body's frame at its origin.
-    pub fn velocity(&self, Body(id): Body) -> Velocity {
-        // XBODY is the frame's origin; BODY would be the centre of mass.
-        let [wx, wy, wz, x, y, z] = self.data.object_velocity(MjtObjBase::mjOBJ_XBODY, id, false);
+    /// Returns the pose of a frame.
+    pub fn pose(&self, frame: Frame) -> Pose {
+        match frame {
+            Frame::Body(Body(id)) => Pose { position: self.data.xpos()[id], orientation: self.data.xquat()[id] },
+            Frame::Site(id) => {
+                let model = self.data.model();
+                let body = self.data.xquat()[model.site_bodyid()[id] as usize];
+                let orientation = quat::mul(body, model.site_quat()[id]);
+                Pose { position: self.data.site_xpos()[id], orientation }
+            }
+        }
+    }
+
+    /// Returns the velocity of a frame at its origin.
+    pub fn velocity(&self, frame: Frame) -> Velocity {
+        let (kind, id) = match frame {
+            // XBODY is the frame's origin; BODY would be the centre of mass.
+            Frame::Body(Body(id)) => (MjtObjBase::mjOBJ_XBODY, id),
+            Frame::Site(id) => (MjtObjBase::mjOBJ_SITE, id),
+        };
+        let [wx, wy, wz, x, y, z] = self.data.object_velocity(kind, id, false);
         Velocity { linear: [x, y, z], angular: [wx, wy, wz] }
     }
 

@@ -27,10 +27,36 @@ struct Inertia {
     second: [[f64; 3]; 3],
 }
 
+/// The form of a body with all that is attached to it.
+struct Form {
+    shapes: Vec<Shape>,
+    inertia: Inertia,
+    /// Whether parts of it move.
+    moves: bool,
+}
+
 impl Scene {
     /// Returns the numbers of the rotations in [`CUBE_ROTATIONS`] that map a body, with all that is attached to it, onto itself.
     /// With moving parts there is only the one that rotates nothing.
-    pub fn symmetry(&self, Body(top): Body) -> Vec<usize> {
+    pub fn symmetry(&self, body: Body) -> Vec<usize> {
+        let form = self.form(body);
+        let turns = CUBE_ROTATIONS.iter().map(|turn| quat::normalized(turn.map(f64::from)));
+        turns.enumerate().filter(|&(i, turn)| i == 0 || form.holds(turn)).map(|(i, _)| i).collect()
+    }
+
+    /// Returns the axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
+    pub fn round_axes(&self, body: Body) -> Vec<char> {
+        let form = self.form(body);
+        let about = |axis: usize| {
+            let (sin, cos) = 0.5_f64.sin_cos();
+            let mut turn = [cos, 0.0, 0.0, 0.0];
+            turn[1 + axis] = sin;
+            form.holds(turn)
+        };
+        "xyz".chars().enumerate().filter(|&(axis, _)| about(axis)).map(|(_, name)| name).collect()
+    }
+
+    fn form(&self, Body(top): Body) -> Form {
         let model = &self.model;
         let mut frames: Vec<Option<([f64; 3], Quat)>> = vec![None; model.nbody() as usize];
         frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
@@ -51,13 +77,15 @@ impl Scene {
             let (kind, data, size) = (model.geom_type()[geom], model.geom_dataid()[geom], model.geom_size()[geom]);
             touches(model, geom).then_some(Shape { kind, data, size, position, orientation })
         };
-        let shapes: Vec<Shape> = (0..model.ngeom() as usize).filter_map(shape).collect();
-        let holds = |turn: Quat| {
-            let onto = |shape: &Shape| shapes.iter().any(|other| shape.turned(turn).fills(other));
-            inertia.is_kept(turn) && shapes.iter().all(onto)
-        };
-        let turns = CUBE_ROTATIONS.iter().map(|turn| quat::normalized(turn.map(f64::from)));
-        turns.enumerate().filter(|&(i, turn)| i == 0 || !moves && holds(turn)).map(|(i, _)| i).collect()
+        Form { shapes: (0..model.ngeom() as usize).filter_map(shape).collect(), inertia, moves }
+    }
+}
+
+impl Form {
+    /// Returns whether a rotation maps it onto itself.
+    fn holds(&self, turn: Quat) -> bool {
+        let onto = |shape: &Shape| self.shapes.iter().any(|other| shape.turned(turn).fills(other));
+        !self.moves && self.inertia.is_kept(turn) && self.shapes.iter().all(onto)
     }
 }
 
@@ -153,15 +181,16 @@ impl Inertia {
 mod tests {
     use std::io::Write;
 
-    use super::super::Compilation;
+    use super::super::{Compilation, Cone};
     use super::*;
 
-    fn symmetry_of(object: &str) -> usize {
+    fn scene_with(object: &str) -> (Scene, Body) {
         let text = format!("<mujoco><worldbody><body name='cube'><freejoint/>{object}</body></worldbody></mujoco>");
         let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
         file.write_all(text.as_bytes()).unwrap();
-        let scene = Scene::load(Some(file.path()), &Compilation::plain(0.01)).unwrap();
-        scene.symmetry(scene.body("cube").unwrap()).len()
+        let scene = Scene::load(Some(file.path()), &Compilation::plain(0.01, Cone::Scene)).unwrap();
+        let body = scene.body("cube").unwrap();
+        (scene, body)
     }
 
     #[test]
@@ -187,13 +216,28 @@ mod tests {
             (1, &format!("{cube}<body><joint/><geom type='sphere' size='.01'/></body>")),
             (8, "<inertial pos='0 0 0' mass='.1' diaginertia='1e-4 1e-4 1.1e-4'/><geom type='sphere' size='.03'/>"),
         ] {
-            assert_eq!(symmetry_of(object), rotations, "{object}");
+            let (scene, body) = scene_with(object);
+            assert_eq!(scene.symmetry(body).len(), rotations, "{object}");
+        }
+    }
+
+    #[test]
+    fn a_round_object_has_axes_about_which_no_turn_can_be_seen() {
+        for (axes, object) in [
+            ("", "<geom type='box' size='.025 .025 .025'/>"),
+            ("xyz", "<geom type='sphere' size='.03'/>"),
+            ("z", "<geom type='cylinder' size='.025 .025'/>"),
+            ("y", "<geom type='capsule' size='.02 .025' euler='90 0 0'/>"),
+            ("", "<geom type='cylinder' size='.025 .025'/><geom type='box' size='.01 .01 .01' pos='.02 0 0'/>"),
+        ] {
+            let (scene, body) = scene_with(object);
+            assert_eq!(scene.round_axes(body).iter().collect::<String>(), axes, "{object}");
         }
     }
 
     #[test]
     fn the_cube_of_the_built_in_scene_has_all_24() {
-        let scene = Scene::load(None, &Compilation::plain(0.01)).unwrap();
+        let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
         assert_eq!(scene.symmetry(scene.body("cube").unwrap()), (0..24).collect::<Vec<_>>());
     }
 }

@@ -141,14 +141,14 @@ impl Variants {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Compilation;
     use super::super::compilation::BUILTIN;
+    use super::super::{Compilation, Cone};
     use super::*;
 
     #[test]
     fn the_boxes_of_a_shifted_body_are_those_that_mujoco_compiles() {
         // The boxes in which contacts are searched are kept in the frame of the inertia; `mj_setConst` updates them.
-        let compilation = Compilation { object: "cube", shifts: true, ..Compilation::plain(0.01) };
+        let compilation = Compilation { object: "cube".into(), shifts: true, ..Compilation::plain(0.01, Cone::Scene) };
         let scene = Scene::load(None, &compilation).unwrap();
         let shift = Change::CentreOfMass(scene.body("cube").unwrap(), [0.01, -0.004, 0.002]);
         let shifted = scene.varied(&[shift]).model;

@@ -9,13 +9,14 @@ use crate::config::Config;
 use crate::evaluate::{Actor, Episodes};
 use crate::os::{self, Requests};
 use crate::ppo::Policy;
+use crate::repose::Task;
 use crate::run::Animation;
 use crate::schedule::panic_message;
 use crate::see::EpisodeFilms;
 
 /// Prepares the films of a training that wants some. If pictures cannot be drawn, prints a warning, and there are none.
-pub(super) fn films(config: &Config) -> Option<EpisodeFilms> {
-    let films = (config.run.film_every > 0).then(|| EpisodeFilms::new(&config.env))?;
+pub(super) fn films(task: &Task, config: &Config) -> Option<EpisodeFilms> {
+    let films = (config.run.film_every > 0).then(|| EpisodeFilms::new(task))?;
     films.inspect_err(|error| os::say(&format!("warning: {}", absent(error)))).ok()
 }
 

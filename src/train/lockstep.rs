@@ -40,10 +40,10 @@ struct Vote {
 pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
     let mut plan = Plan::receive(exchange)?;
-    let task = plan.load_task()?;
+    let loaded = plan.load_task()?;
     os::start_threads(plan.config.run.threads)?;
     let exchange = exchange.clone().over(plan.config.shards())?;
-    let mut session = Session::new(plan, task, exchange)?;
+    let mut session = Session::new(plan, loaded, exchange)?;
     session.agent.exchange.expect_alike(&session.scene)?;
     requests.wait_for_end();
     // The state that the saver begins with.

@@ -97,7 +97,8 @@ mod tests {
     fn histograms_are_those_of_the_quantities_whose_names_they_have() {
         let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
         let config = Config::resolve(None, &sets.map(|set| set.parse().unwrap())).unwrap();
-        let mut agent = Agent::for_task(&Task::new(&config.env).unwrap(), &config, Exchange::alone(1)).unwrap();
+        let mut agent =
+            Agent::for_task(&Task::new(&config.env, &config.hand).unwrap(), &config, Exchange::alone(1)).unwrap();
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let found = histograms(&agent.rollout);
         let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };

@@ -5,6 +5,7 @@ mod films;
 mod hints;
 mod lockstep;
 mod log;
+mod mobility;
 mod outcome;
 mod saver;
 mod session;
@@ -30,6 +31,7 @@ use films::film;
 use hints::hints;
 use lockstep::{STOPPED, follow};
 use log::{Ended, described, histograms, row, tags};
+use mobility::mobility;
 use outcome::Outcome;
 use saver::{Lead, Saver};
 use session::Session;
@@ -60,12 +62,11 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
-    if let Some(warning) = session.task.symmetry_warning(session.config.ppo.symmetry) {
-        os::say(&format!("warning: {warning}"));
-    }
     if !args.quiet {
         let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
-        session.task.notes().iter().chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
+        let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
+        let mobility = own_scene.then(|| mobility(&session.task));
+        session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
     if args.resume.is_none()
@@ -300,8 +301,8 @@ mod tests {
 
     fn from_scratch(sets: &[Override]) -> Session {
         let mut plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default()).unwrap();
-        let task = plan.load_task().unwrap();
-        Session::new(plan, task, Exchange::alone(1)).unwrap()
+        let loaded = plan.load_task().unwrap();
+        Session::new(plan, loaded, Exchange::alone(1)).unwrap()
     }
 
     fn saver_of(session: &Session, place: (RunFolder, Locked)) -> Saver {

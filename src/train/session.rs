@@ -16,7 +16,7 @@ use crate::evaluate::expect_finite_actions;
 use crate::os;
 use crate::ppo::{Checkpoint, Evaluation};
 use crate::ranks::Exchange;
-use crate::repose::{Repose, Task};
+use crate::repose::{Record, Repose, Task};
 use crate::run::RunFolder;
 #[cfg(feature = "video")]
 use crate::see::EpisodeFilms;
@@ -44,6 +44,8 @@ pub(super) struct Session {
     pub dumps: bool,
     /// The fingerprint of the scene.
     pub scene: String,
+    /// The hand and the object of the policy.
+    pub hand: Record,
 }
 
 impl Session {
@@ -53,12 +55,12 @@ impl Session {
     /// Fails as [`Plan::of`] and [`Session::new`] do, or if the run folder cannot be created.
     pub(super) fn lead(args: &TrainArgs, exchange: &Exchange) -> Result<(Self, Saver)> {
         let (mut plan, existing) = Plan::of(args)?;
-        let task = plan.load_task()?;
+        let loaded = plan.load_task()?;
         let exchange = exchange.clone().over(plan.config.shards())?;
         plan.send(&exchange)?;
         let threads = plan.config.run.threads;
         os::start_threads(threads)?;
-        let session = Self::new(plan, task, exchange)?;
+        let session = Self::new(plan, loaded, exchange)?;
         if let Some(warning) = session.agent.exchange.expect_alike(&session.scene)?.filter(|_| threads == 0) {
             os::say(&format!("warning: {warning}"));
         }
@@ -71,17 +73,17 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Sets up the planned training of a task.
+    /// Sets up the planned training of a task by a policy with this record.
     ///
     /// # Errors
     /// Fails if the precision cannot be used, or if it cannot start from what is planned.
-    pub(super) fn new(plan: Plan, task: Arc<Task>, exchange: Exchange) -> Result<Self> {
+    pub(super) fn new(plan: Plan, (task, hand): (Arc<Task>, Record), exchange: Exchange) -> Result<Self> {
         let Plan { mut config, from, best, context, dumps } = plan;
         let set_up = || {
             // As it is saved.
             config.run.shards = config.shards();
             #[cfg(feature = "video")]
-            let films = exchange.is_first().then(|| films(&config)).flatten();
+            let films = exchange.is_first().then(|| films(&task, &config)).flatten();
             #[cfg(not(feature = "video"))]
             if config.run.film_every > 0 {
                 os::say(&format!("warning: run.film_every: no films in this session: {}", crate::see::NO_FILMS));
@@ -89,6 +91,7 @@ impl Session {
             let agent = Agent::for_task(&task, &config, exchange)?;
             let mut session = Self {
                 scene: task.scene().fingerprint(),
+                hand,
                 config,
                 task,
                 agent,
@@ -128,6 +131,7 @@ impl Session {
     pub(super) fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
         checkpoint.scene = Some(self.scene.clone());
+        checkpoint.hand = Some(self.hand.to_text());
         checkpoint
     }
 

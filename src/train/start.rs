@@ -15,7 +15,7 @@ use crate::load::{self, MODEL, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
 use crate::ranks::Exchange;
-use crate::repose::{SPACES, Task};
+use crate::repose::{Record, Task};
 use crate::run::{self, RunFolder};
 
 /// The settings of a training and what it starts from.
@@ -149,7 +149,8 @@ impl Plan {
         let plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
-        checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), SPACES, config.run.seed)?;
+        let spaces = load::record(&checkpoint, &parent.ppo.net())?.spaces();
+        checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), spaces, config.run.seed)?;
         let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
         let progress = &mut checkpoint.progress;
         ensure!(
@@ -164,15 +165,24 @@ impl Plan {
         Ok(Self { from: Some((Takes::Fork, checkpoint)), ..plan })
     }
 
-    /// Loads the task, and takes over what its scene gives.
+    /// Loads the task for the policy of the plan, and takes over what its scene gives. Returns it with the policy's record.
     ///
     /// # Errors
-    /// Fails if the scene cannot be used.
-    pub(super) fn load_task(&mut self) -> Result<Arc<Task>> {
-        let task = Task::new(&self.config.env);
-        let task = if let Some(context) = &self.context { task.with_context(|| context.clone()) } else { task }?;
-        self.config.env = task.config().clone();
-        Ok(task)
+    /// Fails if the scene cannot be used, or if the policy is for another hand.
+    pub(super) fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
+        let load = || {
+            let (config, net) = (&self.config, self.config.ppo.net());
+            let task = Task::new(&config.env, &config.hand)?;
+            let record = match &self.from {
+                Some((_, checkpoint)) => load::record(checkpoint, &net)?,
+                None => task.record().with(net.symmetry),
+            };
+            Ok((task.for_policy(&record)?, record))
+        };
+        let loaded: Result<_> = load();
+        let loaded = if let Some(context) = &self.context { loaded.context(context.clone()) } else { loaded }?;
+        self.config.env = loaded.0.config().clone();
+        Ok(loaded)
     }
 
     /// Sends the plan to the others, if there are any.
@@ -247,7 +257,7 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
 /// Checks that a policy with this net can begin a training with these settings.
 fn expect_net(checkpoint: &Checkpoint, policy: &NetConfig, config: &Config) -> Result<()> {
     let net = config.ppo.net();
-    checkpoint.expect_policy(&net, &SPACES)?;
+    checkpoint.expect_policy(&net, &load::record(checkpoint, policy)?.spaces())?;
     let (found, expected) = ((policy.activation, policy.symmetry), (net.activation, net.symmetry));
     ensure!(
         found == expected,
@@ -274,7 +284,7 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
-    let same = checkpoint.is_of_scene(&Task::new(&before)?.scene().fingerprint());
+    let same = checkpoint.is_of_scene(&Task::new(&before, &config.hand)?.scene().fingerprint());
     ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork keeps", config.env.model);
     Ok(())
 }

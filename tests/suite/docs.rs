@@ -1,9 +1,10 @@
 //! The documents: what they repeat of the program is true, their links lead somewhere, their lines can be read in a diff.
 
+use crate::support::task;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shadow_repose::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS, OBSERVATION};
+use shadow_repose::repose::{ACTUATORS, FINGERTIPS, Group, JOINTS};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -29,12 +30,17 @@ fn documents() -> Vec<PathBuf> {
 #[test]
 fn the_table_of_the_observation_is_the_one_of_the_program() {
     let text = read("docs/OBSERVATION.md");
-    for Group { name, start, length, unit } in OBSERVATION {
+    let groups = task(&[]).hand().layout.groups;
+    for Group { name, start, length, unit, .. } in groups {
         let row = format!("| {start} … {} | `{name}` | {length} | {unit} |", start + length - 1);
         assert!(text.contains(&row), "{row}");
     }
-    assert_eq!(text.lines().filter(|line| line.contains(" … ") && line.starts_with("| ")).count(), OBSERVATION.len());
-    for (what, names) in [("joints", &JOINTS[..]), ("actuators", &ACTUATORS), ("fingertips", &FINGERTIPS)] {
+    assert_eq!(text.lines().filter(|line| line.contains(" … ") && line.starts_with("| ")).count(), groups.len());
+    for (what, names) in [
+        ("joints", &JOINTS[..]),
+        ("actuators", &ACTUATORS),
+        ("fingertips", &FINGERTIPS.map(|tip| format!("rh_{tip}")).each_ref().map(String::as_str)),
+    ] {
         let row = format!("| {what} | {} |", names.join(" "));
         assert!(text.contains(&row), "{row}");
     }

@@ -16,6 +16,14 @@ fn python() -> Option<OsString> {
     python
 }
 
+/// Runs deploy.py in a folder with these arguments, if there is a Python for it.
+pub(crate) fn check_in_python(folder: &Path, args: &[&str]) {
+    let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
+    if let Some(python) = python() {
+        runs(&python, folder, &[&[deploy], args].concat());
+    }
+}
+
 fn runs(python: &OsString, folder: &Path, args: &[&str]) {
     let output = Command::new(python).args(args).current_dir(folder).output().unwrap();
     let said = String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(&output);

@@ -132,7 +132,7 @@ fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
     fs::write(folder.join("other.xml"), other).unwrap();
     for (set, reason) in [
         ("env.num_envs=8", "env.num_envs = 8: a fork keeps 16"),
-        ("ppo.symmetry=none", "ppo.symmetry = none: a fork keeps cube"),
+        ("ppo.symmetry=none", "ppo.symmetry = none: a fork keeps object"),
         ("ppo.activation=tanh", "ppo.activation = tanh: a fork keeps elu"),
         ("env.model=other.xml", "not the scene of the checkpoint"),
         ("ppo.hidden=[16,4]", "ppo.hidden = [16, 4]: nets of [16, 8] can only be made wider"),

@@ -18,6 +18,7 @@ mod fork;
 mod goal_times;
 mod mpi;
 mod outputs;
+mod own_hand;
 mod own_scene;
 mod permissions;
 #[cfg(feature = "video")]

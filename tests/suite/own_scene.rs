@@ -82,7 +82,10 @@ fn what_is_replaced_of_a_users_scene_is_said_at_the_start() {
     let folder = folder.path();
     let timestep = "env.sim_dt = 0.01 s replaces the timestep of ";
     for said in [played(folder, &["--policy", "zero", "--set", MOVED]).1, trained(folder, "r", &["--set", MOVED])] {
-        assert!(said.contains(timestep) && said.contains("0.002 s") && said.contains("not used: `home`"), "{said}");
+        assert!(
+            said.contains(timestep) && said.contains("0.002 s") && said.contains("start in the keyframe `home`"),
+            "{said}"
+        );
     }
     let own = ["--policy", "zero", "--set", MOVED, "--set", "env.sim_dt=0.002"];
     assert!(!played(folder, &own).1.contains(timestep), "it is the same");
@@ -102,7 +105,17 @@ fn an_object_with_less_symmetry_than_the_policy_assumes_is_warned_of() {
     assert!(play(["--ckpt", "builtin"], "env.model=box.xml").contains(alike));
     assert!(!play(["--ckpt", "builtin"], "env.model=cube.xml").contains("alike"));
     assert!(!play(["--policy", "zero"], "env.model=box.xml").contains("alike"), "no policy, no symmetry");
-    assert!(trained(folder, "r", &["--set", "env.model=box.xml"]).contains(alike));
-    let none = ["--set", "env.model=box.xml", "--set", "ppo.symmetry=none"];
-    assert!(!trained(folder, "n", &none).contains("alike"));
+    let train_with = |run: &str, symmetry: &str| {
+        let symmetry = format!("ppo.symmetry={symmetry}");
+        trained(folder, run, &["--set", "env.model=box.xml", "--set", &symmetry])
+    };
+    assert!(train_with("cube", "cube").contains(alike));
+    assert!(!train_with("none", "none").contains("alike"));
+    let said = train_with("object", "object");
+    assert!(
+        said.contains("4 of the 24 rotations of a cube map `cube` onto itself") && !said.contains("alike"),
+        "{said}"
+    );
+    assert!(!play(["--ckpt", "object"], "env.model=box.xml").contains("alike"), "it keeps the four");
+    assert!(play(["--ckpt", "object"], "env.model=box.xml").contains("4 of the 24"));
 }

@@ -10,14 +10,14 @@ use std::time::{Duration, Instant};
 use openh264::decoder::Decoder;
 use openh264::formats::YUVSource;
 use shadow_repose::env::Env;
-use shadow_repose::repose::{ACTION_SIZE, Repose, Task};
+use shadow_repose::repose::{Repose, Task};
 use shadow_repose::sim::{Camera, Look, Quality, mesh_files};
 use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
 use crate::support::{
-    colours_of_the_cube, command, env_config, events, must_be_possible, program, started, stderr, succeeded, train,
+    colours_of_the_cube, command, events, must_be_possible, program, started, stderr, succeeded, task, train,
 };
 
 /// Returns whether pictures can be drawn here. Without EGL it prints a note, or fails if CI has installed EGL.
@@ -191,8 +191,8 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
         camera: Some(Camera { azimuth: 10.0, elevation: -80.0, distance: 2.0 }),
         quality: Quality::Fast,
     };
-    let config = env_config(&[]);
-    let (plain, dressed) = (Task::new(&config).unwrap(), Task::for_display(&config, &look).unwrap());
+    let plain = task(&[]);
+    let dressed = plain.for_display(&look).unwrap();
     same_physics(&plain, &dressed);
 }
 
@@ -200,7 +200,7 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
 fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
     let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) = (started(plain), started(dressed));
     for step in 0..400 {
-        let action: Vec<f32> = (0..ACTION_SIZE).map(|i| ((step * (i + 3)) as f32 * 0.07).sin()).collect();
+        let action: Vec<f32> = (0..20).map(|i| ((step * (i + 3)) as f32 * 0.07).sin()).collect();
         let transitions = [&mut plain, &mut dressed].map(|(env, observation)| env.step(&action, observation));
         assert_eq!(transitions[0], transitions[1]);
         assert_eq!(plain.1, dressed.1);
@@ -220,9 +220,9 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     let bare = bare.join("\n").replace("<default>\n", "<default>\n    <geom mass=\".02\"/>\n");
     assert!(bare.contains("<geom mass="));
     std::fs::write(&path, bare).unwrap();
-    let config = env_config(&[&format!("env.model={}", path.display())]);
+    let plain = task(&[&format!("env.model={}", path.display())]);
     let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
-    let (plain, furnished) = (Task::new(&config).unwrap(), Task::for_display(&config, &look).unwrap());
+    let furnished = plain.for_display(&look).unwrap();
     let geoms = [&plain, &furnished].map(|task| task.scene().geoms());
     assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
     same_physics(&plain, &furnished);
@@ -242,7 +242,7 @@ fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
         camera: None,
         quality: Quality::Fast,
     };
-    let refusal = Task::for_display(&env_config(&[]), &look).err().unwrap().to_string();
+    let refusal = task(&[]).for_display(&look).err().unwrap().to_string();
     assert!(refusal.contains(".obj"), "{refusal}");
 }
 

@@ -36,16 +36,20 @@ impl PointMass {
     }
 }
 
+const SPACES: Spaces = Spaces {
+    observation_size: 2,
+    action_size: 2,
+    cube_and_goal: None,
+    distance: |_, observation| observation[0].hypot(observation[1]),
+};
+
 impl Env for PointMass {
     /// The distance at the end of the episode.
     type Episode = f64;
     type Lesson = ();
-    const SPACES: Spaces = Spaces {
-        observation_size: 2,
-        action_size: 2,
-        cube_and_goal: None,
-        distance: |observation| observation[0].hypot(observation[1]),
-    };
+    fn spaces(&self) -> Spaces {
+        SPACES
+    }
 
     fn set_lesson(&mut self, (): ()) {}
 
@@ -137,7 +141,7 @@ fn ppo_learns_with_candles_tensors_too() {
 #[test]
 fn ppo_learns_in_bf16_where_the_processor_has_it() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
-    if Ppo::new(&settings, PointMass::SPACES, 0, Exchange::alone(1)).is_ok() {
+    if Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).is_ok() {
         let [first, last] = distances(&settings, 0);
         assert!(first > 0.5 && last < 0.15, "{first} → {last}");
     }
@@ -147,14 +151,14 @@ fn ppo_learns_in_bf16_where_the_processor_has_it() {
 fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
     let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
     let settings = PpoConfig { std, ..settings() };
-    let mut ppo = Ppo::new(&settings, PointMass::SPACES, 0, Exchange::alone(1)).unwrap();
+    let mut ppo = Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).unwrap();
     assert!((ppo.policy().std() - 0.5).abs() < 1e-6);
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
         ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
         assert!((ppo.policy().std() - expected).abs() < 1e-6, "{env_steps}");
     }
     let at_once = PpoConfig { std: Ramp { steps: 0, ..std }, ..settings };
-    let ppo = Ppo::new(&at_once, PointMass::SPACES, 0, Exchange::alone(1)).unwrap();
+    let ppo = Ppo::new(&at_once, SPACES, 0, Exchange::alone(1)).unwrap();
     assert!((ppo.policy().std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
 }
 

@@ -3,11 +3,11 @@
 use rand::RngExt;
 use shadow_repose::env::{End, EnvBlock, EnvPool};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{ACTION_SIZE, OBSERVATION_SIZE, Repose};
+use shadow_repose::repose::Repose;
 use shadow_repose::rng;
 use shadow_repose::schedule::in_rounds;
 
-use crate::support::task;
+use crate::support::{OBSERVATION_SIZE, task};
 
 struct Played {
     /// Observations of all environments after each step.
@@ -29,7 +29,7 @@ struct Block<'a> {
 impl Block<'_> {
     /// Steps the block; `actions` are those of all environments.
     fn step(&mut self, actions: &[f32]) {
-        let actions = &actions[self.first * ACTION_SIZE..][..self.envs.count() * ACTION_SIZE];
+        let actions = &actions[self.first * 20..][..self.envs.count() * 20];
         self.envs.step(actions, &mut self.rewards, &mut self.observations).unwrap();
         self.seen.push((self.observations.clone(), self.rewards.clone()));
         for (i, end) in self.envs.ends.iter().enumerate() {
@@ -39,7 +39,7 @@ impl Block<'_> {
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
             if *end == Some(End::Truncated) {
                 // The final observation is that of this environment: it shows its last action.
-                let action = &actions[i * ACTION_SIZE..][..ACTION_SIZE];
+                let action = &actions[i * 20..][..20];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
                 assert_eq!(self.envs.final_observations[rows][137..], last);
                 self.truncated += 1;
@@ -52,8 +52,7 @@ impl Block<'_> {
 fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: impl Fn(usize, usize) -> f32) -> Played {
     let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let task = task(settings);
-    let actions: Vec<Vec<f32>> =
-        (0..steps).map(|step| (0..envs * ACTION_SIZE).map(|i| action(step, i)).collect()).collect();
+    let actions: Vec<Vec<f32>> = (0..steps).map(|step| (0..envs * 20).map(|i| action(step, i)).collect()).collect();
     threads.install(|| {
         let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect(), &Exchange::alone(1));
         let sizes = pool.block_sizes();
@@ -108,7 +107,7 @@ fn the_first_episodes_start_at_random_ages() {
 
 #[test]
 fn an_environment_does_the_same_alone_as_among_others() {
-    let action = |step: usize, i: usize| if i < ACTION_SIZE { 0.01 * (step + 1) as f32 } else { 1.0 };
+    let action = |step: usize, i: usize| if i < 20 { 0.01 * (step + 1) as f32 } else { 1.0 };
     let first_row = |envs: usize| {
         let played = play(2, envs, 20, &["env.fall_dist=10"], action);
         let last = played.observations.len() - envs * OBSERVATION_SIZE;
@@ -135,10 +134,10 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             let mut seen = Vec::new();
             for (block, rows) in pool.blocks.iter_mut().zip(observations) {
                 let n = block.count();
-                let actions: Vec<f32> = (0..n * ACTION_SIZE).map(|i| action(step, first + i)).collect();
+                let actions: Vec<f32> = (0..n * 20).map(|i| action(step, first + i)).collect();
                 let mut rewards = vec![0.0; n];
                 block.step(&actions, &mut rewards, rows).unwrap();
-                first += n * ACTION_SIZE;
+                first += n * 20;
                 seen.push((rewards, block.ends.clone(), rows.clone()));
             }
             seen

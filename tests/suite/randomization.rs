@@ -11,11 +11,11 @@ use shadow_repose::config::{Config, Ramp};
 use shadow_repose::env::{Env, EnvState, Resumable};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::load::Loaded;
-use shadow_repose::repose::{EpisodePhysics, Lesson, OBSERVATION_SIZE, Randomization, Repose, Score, Task};
+use shadow_repose::repose::{EpisodePhysics, Lesson, Randomization, Repose, Score};
 use shadow_repose::rng;
 
 use crate::support::{
-    SCENE, command, config, metrics, names, program, started, stderr, succeeded, task, train, weights,
+    OBSERVATION_SIZE, SCENE, command, config, metrics, names, program, started, stderr, succeeded, task, train, weights,
 };
 use crate::survival::{send, unstable_scene};
 
@@ -59,9 +59,8 @@ fn each_quantity_is_varied_as_if_the_scene_said_so() {
     let (before, of_cube) = SCENE.split_once("<body name=\"cube\"").unwrap();
     let (cube, after) = of_cube.split_once("</body>").unwrap();
     let cube_of = |cube: String| format!("{before}<body name=\"cube\"{cube}</body>{after}");
-    let larger = cube_of(
-        scaled(&scaled(cube, "size", 1.25), "pos", 1.25).replace("pos=\"0.4125 0 0.36875\"", "pos=\".33 0 .295\""),
-    );
+    let moved = format!("pos=\"{} 0 {}\"", 1.25 * 0.33, 1.25 * 0.295);
+    let larger = cube_of(scaled(&scaled(cube, "size", 1.25), "pos", 1.25).replace(&moved, "pos=\".33 0 .295\""));
     let hand = format!("{}<body name=\"cube\"{of_cube}", scaled(&scaled(before, "mass", 1.5), "diaginertia", 1.5));
     let inertia =
         "inertial pos=\".004 -.002 .003\" mass=\".028\" diaginertia=\".00001166667 .00001166667 .00001166667\"";
@@ -156,7 +155,7 @@ fn noise_and_bias_are_seen_but_the_hand_is_where_it_is() {
         let mut seen = Vec::new();
         for _ in 0..200 {
             let _ = env.step(&[0.1; 20], &mut observation);
-            let joints = task.hand().joints;
+            let joints = &task.hand().joints;
             let off = |i: usize| f64::from(observation[i]) - env.simulation().qpos()[joints[i].qpos];
             seen.push((off(0), observation[30], env.simulation().qpos().to_vec()));
         }
@@ -189,7 +188,7 @@ fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<EpisodePhysi
     env.set_lesson(lesson);
     let draw = move |episode| {
         let rng = rng::stream(0, "episode", episode);
-        randomization.as_ref().and_then(|randomization| randomization.draw(&rng, lesson.randomized))
+        randomization.as_ref().and_then(|randomization| randomization.draw(&rng, lesson.randomized, task.hand()))
     };
     (env, draw)
 }
@@ -386,7 +385,7 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
         let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
         let loaded = Loaded::find(Some(&place), &sets).unwrap();
         let episodes = Episodes { seed: 0, purpose: "evaluation", first: 0, count };
-        let (task, actor) = (Task::new(&loaded.config).unwrap(), Actor::Mean(loaded.policy.freeze()));
+        let (task, actor) = (loaded.task().unwrap(), Actor::Mean(loaded.policy.freeze()));
         let trial = Trial { task: &task, actor: &actor, episodes, stop: &AtomicBool::new(false) };
         let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
         Score::of(&played).rot_dist

@@ -3,17 +3,17 @@
 use std::path::PathBuf;
 
 use shadow_repose::env::Env;
-use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, Task};
-use shadow_repose::sim::{Compilation, Physics, Scene, Simulation};
+use shadow_repose::repose::{Hand, Repose, Task};
+use shadow_repose::sim::{Compilation, Cone, Parts, Physics, Scene, Simulation};
 
-use crate::support::{SCENE, env_config, started, task};
+use crate::support::{OBSERVATION_SIZE, SCENE, config, env_config, started, task};
 
 /// Writes `text` as a scene, tries to create a task from it, and returns the error message.
 fn refusal(text: &str) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = write(&folder, text);
     let setting = format!("env.model={}", path.display());
-    match Task::new(&env_config(&[&setting])) {
+    match Task::new(&env_config(&[&setting]), &Parts::default()) {
         Ok(_) => panic!("must be refused"),
         Err(error) => format!("{error:#}"),
     }
@@ -47,8 +47,8 @@ fn assert_range(found: [f64; 2], expected: [f64; 2]) {
 
 #[test]
 fn the_scene_has_the_joints_actuators_and_limits_of_the_hand() {
-    let scene = Scene::load(None, &Compilation::plain(0.01)).unwrap();
-    let hand = Hand::bind(&scene).unwrap();
+    let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
+    let hand = Hand::bind(&scene, Hand::find(&scene, &Parts::default()).unwrap()).unwrap();
     assert_eq!(scene.controls(), 20);
     for (name, range) in [
         ("rh_WRJ2", [-0.523599, 0.174533]),
@@ -112,7 +112,7 @@ fn bodies_are_of_the_same_instant_as_joints() {
         let _ = env.step(&[0.5; 20], &mut observation);
     }
     // Another simulation with the same joint positions and velocities, whose bodies are computed from these alone.
-    let tip = task.scene().body("rh_ffdistal").unwrap();
+    let tip = task.scene().frame("rh_ffdistal").unwrap();
     let mut other = Simulation::new(task.scene());
     other.qpos_mut().copy_from_slice(env.simulation().qpos());
     other.qvel_mut().copy_from_slice(env.simulation().qvel());
@@ -149,31 +149,33 @@ fn an_own_scene_may_list_its_parts_in_any_order() {
 }
 
 #[test]
-fn what_is_missing_in_an_own_scene_is_named_with_its_file() {
-    for (from, to, named) in [
-        ("rh_LFJ5", "rh_other", "`rh_LFJ5`"),
-        ("name=\"rh_A_MFJ0\"", "name=\"other\"", "`rh_A_MFJ0`"),
-        ("rh_thdistal", "rh_thumbtip", "`rh_thdistal`"),
-        ("<body name=\"cube\"", "<body name=\"die\"", "`cube`"),
-        ("<body name=\"target\"", "<body name=\"aim\"", "`target`"),
-        ("name=\"rh_RFJ0\"", "name=\"other\"", "`rh_RFJ0`"),
+fn parts_of_an_own_scene_may_have_other_names() {
+    for (from, to) in [
+        ("rh_LFJ5", "rh_other"),
+        ("name=\"rh_A_MFJ0\"", "name=\"other\""),
+        ("rh_thdistal", "rh_thumbtip"),
+        ("<body name=\"cube\"", "<body name=\"die\""),
+        ("<body name=\"target\"", "<body name=\"aim\""),
+        ("rh_", "lh_"),
     ] {
-        let text = edited(from, to).replace(
-            "tendon=\"rh_RFJ0\"",
-            if named == "`rh_RFJ0`" { "tendon=\"other\"" } else { "tendon=\"rh_RFJ0\"" },
-        );
-        let message = refusal(&text);
-        assert!(message.contains(named) && message.contains("own_scene.xml"), "{message}");
+        let folder = tempfile::tempdir().unwrap();
+        let task = task(&[&format!("env.model={}", write(&folder, &edited(from, to)).display())]);
+        let spaces = task.spaces();
+        assert_eq!((spaces.observation_size, spaces.action_size), (157, 20), "{to}");
     }
 }
 
 #[test]
 fn all_names_that_are_missing_come_in_one_message() {
-    let message = refusal(&SCENE.replace("rh_", "lh_"));
-    for name in ["joint `rh_THJ5`", "joint `rh_WRJ1`", "actuator `rh_A_FFJ0`", "body `rh_thdistal`"] {
+    let folder = tempfile::tempdir().unwrap();
+    let model = format!("env.model={}", write(&folder, SCENE).display());
+    let names = ["hand.joints=[\"a\",\"rh_WRJ1\",\"b\"]", "hand.fingertips=[\"c\"]", "hand.object=d", "hand.goal=e"];
+    let config = config(&[&[&model[..]], &names[..]].concat());
+    let message = format!("{:#}", Task::new(&config.env, &config.hand).err().unwrap());
+    for name in ["own_scene.xml: has no joint `a`, joint `b`", "body or site `c`, body `d`, body `e`"] {
         assert!(message.contains(name), "{name}: {message}");
     }
-    assert!(!message.contains("`cube`"), "{message}");
+    assert!(!message.contains("rh_WRJ1"), "{message}");
 }
 
 #[test]
@@ -190,10 +192,9 @@ fn what_mujoco_says_of_a_scene_is_not_cut_off() {
 fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
     refused_when_edited(&[
         ("<joint name=\"rh_THJ3\"", "<joint name=\"rh_THJ3\" type=\"slide\"", "`rh_THJ3` must be a hinge"),
-        ("<freejoint name=\"cube\"/>", "<joint name=\"c\" type=\"ball\"/>", "`cube` must have a free joint"),
-        ("mocap=\"true\"", "", "`target` must have mocap"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive the joint `rh_FFJ3`"),
-        ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_MFJ0` must be the sum"),
+        ("<freejoint name=\"cube\"/>", "<joint name=\"c\" type=\"ball\"/>", "no body with a free joint"),
+        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive rh_FFJ3"),
+        ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_A_MFJ0` must drive rh_MFJ1 + rh_MFJ2"),
         ("ctrlrange=\"0 3.1415\"", "", "must have one control with a ctrlrange"),
         ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"2\"/>", "`rh_A_FFJ3` must have a gear of 1"),
         ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"-1\"/>", "`rh_A_FFJ3` must have a gear of 1"),
@@ -208,7 +209,7 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
         ("integrator=\"implicitfast\"", "integrator=\"RK4\"", "RK4"),
         ("</mujoco>", "", "MuJoCo refuses this scene"),
     ]);
-    let missing = format!("{:#}", Task::new(&env_config(&["env.model=nowhere.xml"])).err().unwrap());
+    let missing = format!("{:#}", Task::new(&env_config(&["env.model=nowhere.xml"]), &Parts::default()).err().unwrap());
     assert!(missing.contains("nowhere.xml") && missing.contains("no such file"), "{missing}");
 }
 

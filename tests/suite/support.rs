@@ -9,8 +9,11 @@ use shadow_repose::agent::Agent;
 use shadow_repose::config::{Config, EnvConfig, Override};
 use shadow_repose::env::Env;
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{OBSERVATION_SIZE, Repose, Task};
+use shadow_repose::repose::{Repose, Task};
 use shadow_repose::rng;
+
+/// The size of an observation of the built-in hand.
+pub(crate) const OBSERVATION_SIZE: usize = 157;
 
 /// The built-in scene as text.
 pub(crate) const SCENE: &str = include_str!("../../assets/shadow_hand/scene.xml");
@@ -36,7 +39,8 @@ pub(crate) fn config(settings: &[&str]) -> Config {
 
 /// Returns the task with these settings.
 pub(crate) fn task(settings: &[&str]) -> Arc<Task> {
-    Task::new(&config(settings).env).unwrap()
+    let config = config(settings);
+    Task::new(&config.env, &config.hand).unwrap()
 }
 
 /// Returns the `[env]` settings of the default configuration with these settings applied over it.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use rand::RngExt;
 use shadow_repose::rng;
-use shadow_repose::sim::{Compilation, Physics, Scene, Simulation};
+use shadow_repose::sim::{Compilation, Cone, Physics, Scene, Simulation};
 
 use crate::support::{SCENE, command, events, metrics, names, program, stderr, succeeded, train, weights};
 
@@ -341,7 +341,7 @@ fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
     let diverged: u64 = rows[1..].iter().map(|row| row[column].parse::<u64>().unwrap()).sum();
     let dumps = names(&folder.path().join("run/diverged"));
     assert!(diverged > 100 && dumps.len() as u64 == diverged, "{diverged} diverged, {} dumps", dumps.len());
-    let mut simulation = Simulation::new(&Scene::load(Some(&model), &Compilation::plain(0.01)).unwrap());
+    let mut simulation = Simulation::new(&Scene::load(Some(&model), &Compilation::plain(0.01, Cone::Scene)).unwrap());
     for dump in [&dumps[0], &dumps[dumps.len() - 1]] {
         let text = fs::read_to_string(folder.path().join("run/diverged").join(dump)).unwrap();
         let dump: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -5,11 +5,11 @@ use std::sync::atomic::AtomicBool;
 
 use shadow_repose::env::{End, Env};
 use shadow_repose::quat::{self, Quat};
-use shadow_repose::repose::{Hand, OBSERVATION_SIZE, Repose, Step, Task, task_reward};
+use shadow_repose::repose::{Repose, Step, Task, task_reward};
 use shadow_repose::rng;
 use shadow_repose::sim::{Pose, Velocity};
 
-use crate::support::{config, env_config, started, started_agent, task};
+use crate::support::{OBSERVATION_SIZE, config, env_config, started, started_agent, task};
 
 const STILL: [f32; 20] = [0.0; 20];
 
@@ -38,7 +38,7 @@ fn assert_close(found: &[f32], expected: &[f64]) {
 fn observations_land_at_their_indices() {
     let task = task(&[]);
     let (mut env, mut observation) = started(&task);
-    let hand = Hand::bind(task.scene()).unwrap();
+    let hand = task.hand();
     let cube = hand.cube;
     // A quarter turn about z, with w < 0: the observation shows the opposite sign.
     let orientation = [-FRAC_1_SQRT_2, 0.0, 0.0, -FRAC_1_SQRT_2];
@@ -71,7 +71,7 @@ fn observations_land_at_their_indices() {
     let relative = quat::canonical(quat::mul(orientation, quat::conj(env.goal())));
     assert_close(&observation[68..72], &relative);
     for (i, name) in ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"].iter().enumerate() {
-        let body = task.scene().body(name).unwrap();
+        let body = task.scene().frame(name).unwrap();
         let Pose { position, orientation: turned } = env.simulation().pose(body);
         let Velocity { linear, angular } = env.simulation().velocity(body);
         let expected: Vec<f64> = position.into_iter().chain(turned).chain(linear).chain(angular).collect();
@@ -85,7 +85,7 @@ fn observations_land_at_their_indices() {
 fn fingertip_velocities_are_those_of_the_frames_origin() {
     let task = task(&[]);
     let (mut env, _) = started(&task);
-    let tip = task.scene().body("rh_mfdistal").unwrap();
+    let tip = task.scene().frame("rh_mfdistal").unwrap();
     let joint = task.scene().hinge("rh_MFJ3").unwrap();
     let simulation = env.simulation_mut();
     simulation.qvel_mut().fill(0.0);
@@ -106,7 +106,7 @@ fn fingertip_velocities_are_those_of_the_frames_origin() {
 #[test]
 fn actions_are_clipped_and_scaled_to_the_control_ranges() {
     let task = task(&["env.act_moving_average=1"]);
-    let hand = Hand::bind(task.scene()).unwrap();
+    let hand = task.hand();
     let (mut env, mut observation) = started(&task);
     let mut action = [0.0f32; 20];
     (action[0], action[7], action[19]) = (3.0, -1.5, 0.5);
@@ -128,7 +128,7 @@ fn actions_are_clipped_and_scaled_to_the_control_ranges() {
 #[test]
 fn smoothing_averages_targets_and_begins_at_the_reset_joints() {
     let task = task(&["env.act_moving_average=0.25"]);
-    let hand = Hand::bind(task.scene()).unwrap();
+    let hand = task.hand();
     let (mut env, mut observation) = started(&task);
     let angle = |env: &Repose, name: &str| env.simulation().qpos()[task.scene().hinge(name).unwrap().qpos];
     let (single, coupled) = (angle(&env, "rh_FFJ3"), angle(&env, "rh_FFJ2") + angle(&env, "rh_FFJ1"));
@@ -244,7 +244,7 @@ fn an_action_that_is_not_a_number_ends_the_episode_as_diverged() {
 #[test]
 fn resets_stay_within_the_noise_and_the_joints_limits() {
     let task = task(&["env.reset_dof_vel_noise=0.3"]);
-    let hand = Hand::bind(task.scene()).unwrap();
+    let hand = task.hand();
     let mut env = Repose::new(&task);
     let mut observation = vec![0.0; OBSERVATION_SIZE];
     let (mut angles, mut starts) = (Vec::new(), Vec::new());
@@ -273,7 +273,7 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
 #[test]
 fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning_goes_on() {
     let config = config(&["env.num_envs=200", "ppo.hidden=[16]"]);
-    let mut agent = started_agent(&Task::new(&config.env).unwrap(), &config);
+    let mut agent = started_agent(&Task::new(&config.env, &config.hand).unwrap(), &config);
     let never = AtomicBool::new(false);
     for iteration in 1..=6 {
         let poison = [f64::NAN, f64::INFINITY, -1e200][iteration % 3];
@@ -297,7 +297,7 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
 
 #[test]
 fn every_scale_of_the_reward_is_a_setting() {
-    let step = |action| Step { rot_dist: 0.3, goal_dist: 0.1, action: [action; 20], ..Step::default() };
+    let step = |action| Step { rot_dist: 0.3, goal_dist: 0.1, action: vec![action; 20], ..Step::default() };
     let paid = |set: &str| task_reward(&env_config(&[set]), &step(0.5)).values();
     let default = [1.0 / 0.4, -1.0, -0.0002 * 5.0, 0.0, 0.0];
     for (set, term, expected) in [
@@ -325,10 +325,10 @@ fn where_cube_and_target_are_and_how_an_episode_begins_are_settings() {
     let (mut env, mut observation) = started(&task);
     assert_close(&observation[48..51], &[0.3, 0.02, 0.31]);
     assert_close(&observation[61..64], &[0.3, 0.02, 0.31]);
-    let target = env.simulation().pose(task.scene().body("target").unwrap()).position;
+    let target = env.simulation().pose(task.scene().frame("target").unwrap()).position;
     assert_close(&target.map(|x| x as f32), &[0.3, 0.02, 0.71]);
     assert_close(&observation[..24], &[0.0; 24]);
-    let joint = Hand::bind(task.scene()).unwrap().joints[3];
+    let joint = task.hand().joints[3];
     env.simulation_mut().qvel_mut()[joint.dof] = 3.0;
     env.observe(&mut observation);
     assert_close(&observation[27..28], &[1.5]);

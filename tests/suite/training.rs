@@ -8,10 +8,10 @@ use shadow_repose::env::{End, Env, EnvPool};
 use shadow_repose::ppo::Perception;
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{Lesson, OBSERVATION_SIZE, Repose, SPACES};
+use shadow_repose::repose::{Lesson, Repose};
 use shadow_repose::rng;
 
-use crate::support::{config, program, started, started_agent, stderr, succeeded, task, train};
+use crate::support::{OBSERVATION_SIZE, config, program, started, started_agent, stderr, succeeded, task, train};
 
 const CUBE_ORIENTATION: usize = 51;
 const GOAL_ORIENTATION: usize = 64;
@@ -60,7 +60,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "their orientations differ");
         for row in [&mut seen, &mut other_seen] {
-            Perception::new(Symmetry::Cube, &SPACES).unwrap().canonicalize(row);
+            Perception::new(Symmetry::Cube, &task.spaces()).unwrap().canonicalize(row);
         }
         // All but the goals: both environments drew the same one, for cubes of different orientation.
         for same in [0..64, 72..157] {

@@ -1,0 +1,79 @@
+//! The mirror image of a hand: what it observes as the hand on the other side would, mirrored in the plane y = 0 of the world.
+
+use anyhow::{Result, ensure};
+
+use super::observation::{Layout, TIP_QUAT};
+use super::record::Record;
+use crate::quat::{self, Quat};
+
+/// The largest difference of mirrored fingertips from those of the policy's hand: m, and of the components of quaternions.
+const TOLERANCE: f64 = 1e-4;
+
+/// Turns observations of a hand into those of its mirror image.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Mirror {
+    /// The values that change their sign, by index.
+    signs: Vec<usize>,
+    /// For each fingertip the index of its orientation, and the rotation between the mirrored frame and that of the other hand.
+    tips: Vec<(usize, Quat)>,
+}
+
+/// Returns the mirrored rotation: its axis is mirrored like a point, and its sense is the opposite one.
+fn mirrored([w, x, y, z]: Quat) -> Quat {
+    [w, -x, y, -z]
+}
+
+impl Mirror {
+    /// Returns the mirror from the hand of `here` to the hand of `policy`.
+    ///
+    /// # Errors
+    /// Fails if the fingertips of one are not where those of the other are in the mirror, in any of the recorded poses.
+    pub(super) fn new(here: &Record, policy: &Record, layout: &Layout) -> Result<Self> {
+        let count = here.fingertips.len();
+        let tip = |record: &Record, i: usize| -> ([f64; 3], Quat) {
+            let [x, y, z, qw, qx, qy, qz] = record.tips[i];
+            ([x, y, z], [qw, qx, qy, qz])
+        };
+        let mut tips = Vec::new();
+        for (i, start) in layout.tips().enumerate() {
+            let between = |at: usize| {
+                let ((_, own), (_, other)) = (tip(here, at), tip(policy, at));
+                quat::mul(quat::conj(mirrored(own)), other)
+            };
+            let turn = between(i);
+            for at in [i, i + count] {
+                let (([x, y, z], _), (other, _)) = (tip(here, at), tip(policy, at));
+                let apart = [x, -y, z].iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                let turned = between(at).iter().zip(turn).map(|(a, b)| a * b).sum::<f64>();
+                ensure!(
+                    apart <= TOLERANCE && turned >= 1.0 - TOLERANCE,
+                    "the hand is not the mirror image of the policy's in the plane y = 0: the fingertip `{}` is {:.1} mm off",
+                    here.fingertips[i],
+                    1e3 * apart
+                );
+            }
+            tips.push((start + TIP_QUAT, turn));
+        }
+        Ok(Self { signs: layout.mirrored(), tips })
+    }
+
+    /// Mirrors an observation in place.
+    pub(super) fn apply(&self, observation: &mut [f32]) {
+        self.signs.iter().for_each(|&i| observation[i] = -observation[i]);
+        for &(at, turn) in &self.tips {
+            let own: [f32; 4] = *observation[at..].first_chunk().expect("an orientation");
+            let turned = quat::mul(own, turn.map(|x| x as f32));
+            observation[at..at + 4].copy_from_slice(&turned);
+        }
+    }
+
+    /// Returns it as a matrix `[O, O]`: an observation as a row times it is the mirrored one.
+    pub(super) fn matrix(&self, size: usize) -> Vec<f32> {
+        let mut matrix = vec![0.0; size * size];
+        for (i, row) in matrix.chunks_exact_mut(size).enumerate() {
+            row[i] = 1.0;
+            self.apply(row);
+        }
+        matrix
+    }
+}

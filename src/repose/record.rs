@@ -1,0 +1,144 @@
+//! What a policy's file says of the hand and the object that it was trained with.
+
+use anyhow::{Context, Result, bail, ensure};
+use serde::{Deserialize, Serialize};
+
+use super::hand::Hand;
+use super::observation::Layout;
+use crate::config::Symmetry;
+use crate::os::shortened;
+use crate::quat::CUBE_ROTATIONS;
+use crate::sim::{Parts, Scene, Simulation};
+use crate::spaces::Spaces;
+
+/// The most bytes of a record that are read; that of the Shadow Hand has three thousand.
+const LONGEST: usize = 1 << 16;
+
+/// The fractions of the ranges of joints, in turn, at which the poses of fingertips are recorded.
+const POSES: [[f64; 3]; 2] = [[0.3, 0.5, 0.6], [0.7, 0.2, 0.4]];
+
+/// A hand and an object, by what a policy depends on. Lists are in the orders of observations and actions.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// The names of the joints.
+    pub joints: Vec<String>,
+    /// The names of the actuators.
+    pub actuators: Vec<String>,
+    /// The control ranges of the actuators, rad, or m for tendons along a path in space.
+    pub ranges: Vec<[f64; 2]>,
+    /// The joints that each actuator drives, with the coefficients of their sum.
+    pub driven: Vec<Vec<(String, f64)>>,
+    /// The names of the fingertips.
+    pub fingertips: Vec<String>,
+    /// The poses of the fingertips in two poses of the hand, relative to the first of the fingertips' trees: position in m,
+    /// orientation w,x,y,z.
+    pub tips: Vec<[f64; 7]>,
+    /// The rotations of a cube, by number, that a policy takes for the same.
+    pub symmetry: Vec<usize>,
+}
+
+impl Record {
+    /// Returns the record of a hand in its scene, and of an object with these rotations.
+    pub(super) fn of(hand: &Hand, scene: &Scene, symmetry: Vec<usize>) -> Self {
+        let Parts { joints, actuators, fingertips, .. } = hand.parts.clone();
+        let ranges = hand.actuators.iter().map(|actuator| actuator.range).collect();
+        let tips = POSES.iter().flat_map(|fractions| tips_at(hand, scene, fractions)).collect();
+        Self { joints, actuators, ranges, driven: hand.driven.clone(), fingertips, tips, symmetry }
+    }
+
+    /// Reads the record in a file.
+    ///
+    /// # Errors
+    /// Fails if it is too long or damaged.
+    pub fn parse(text: &str) -> Result<Self> {
+        ensure!(text.len() <= LONGEST, "its metadata `hand` has {} bytes; at most {LONGEST} are read", text.len());
+        let record: Self = serde_json::from_str(text).context("its metadata `hand`")?;
+        let [joints, actuators, tips] = [&record.joints, &record.actuators, &record.fingertips].map(Vec::len);
+        let lists = [record.ranges.len(), record.driven.len(), record.tips.len(), record.symmetry.len()];
+        let fits = lists[..2] == [actuators; 2] && lists[2] == POSES.len() * tips && joints > 0 && actuators > 0;
+        let symmetry = record.symmetry.first() == Some(&0) && record.symmetry.iter().all(|&rotation| rotation < 24);
+        ensure!(fits && symmetry, "its metadata `hand` has lists of other lengths than its hand needs");
+        Ok(record)
+    }
+
+    /// Returns the record of a policy with this setting: by default it takes for the same what the object maps onto itself.
+    pub fn with(mut self, symmetry: Symmetry) -> Self {
+        match symmetry {
+            Symmetry::None => self.symmetry = vec![0],
+            Symmetry::Cube => self.symmetry = (0..CUBE_ROTATIONS.len()).collect(),
+            Symmetry::Object => {}
+        }
+        self
+    }
+
+    /// Returns the text for a file.
+    ///
+    /// # Panics
+    /// Never panics: all of it can be written as JSON.
+    pub fn to_text(&self) -> String {
+        serde_json::to_string(self).expect("names and numbers")
+    }
+
+    /// Returns the observations and actions of a policy for it.
+    pub fn spaces(&self) -> Spaces {
+        Layout::new(self.joints.len(), self.fingertips.len(), self.actuators.len()).spaces(&self.symmetry)
+    }
+
+    /// Checks that a policy for this hand can act with the hand `there` of a scene, perhaps in the mirror, and returns a warning if
+    /// an action means another angle there.
+    ///
+    /// # Errors
+    /// Fails with the names that differ.
+    pub(super) fn expect_fits(&self, there: &Self, mirrors: bool, scene: &str) -> Result<Option<String>> {
+        let lists = |record: &Self| [record.joints.clone(), record.actuators.clone(), record.fingertips.clone()];
+        let (own, found) = (lists(self), lists(there));
+        let alike = |own: &[String], found: &[String], names: fn(&str, &str) -> bool| {
+            own.len() == found.len() && own.iter().zip(found).all(|(own, found)| names(found, own))
+        };
+        let is_other_hand = alike(&own[0], &found[0], is_other_side);
+        let mut differ = Vec::new();
+        for ((what, own), found) in ["joints", "actuators", "fingertips"].into_iter().zip(&own).zip(&found) {
+            if !alike(own, found, is_named) && !(mirrors && alike(own, found, is_other_side)) {
+                let [own, found] = [own, found].map(|names| shortened(&names.join(" ")));
+                differ.push(format!("{what} {found}, not {own}"));
+            }
+        }
+        if !differ.is_empty() {
+            let hint = if is_other_hand { "; --mirror plays the policy of one hand with the other" } else { "" };
+            bail!("the policy is for another hand: {scene} has {}{hint}", differ.join("; "));
+        }
+        let apart = |i: usize| (0..2).any(|end| (self.ranges[i][end] - there.ranges[i][end]).abs() > 1e-4);
+        let others: Vec<&str> = (0..self.ranges.len()).filter(|&i| apart(i)).map(|i| &*there.actuators[i]).collect();
+        Ok((!others.is_empty()).then(|| {
+            let names = shortened(&others.join(" "));
+            format!("an action means another angle than in training: the control ranges of {names} differ")
+        }))
+    }
+}
+
+/// Returns whether a name in a scene is that of a policy, perhaps with a prefix more.
+fn is_named(found: &str, own: &str) -> bool {
+    found.strip_suffix(own).is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(['/', '_', '-', '.', ':']))
+}
+
+/// Returns whether a name differs only in the letter of the side: `lh_` and `rh_`, `left` and `right`.
+fn is_other_side(found: &str, own: &str) -> bool {
+    [("lh_", "rh_"), ("rh_", "lh_"), ("left", "right"), ("right", "left")]
+        .iter()
+        .any(|(here, there)| found.contains(here) && is_named(&found.replace(here, there), own))
+}
+
+/// Returns the poses of the fingertips in a pose of the hand.
+fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
+    let mut sim = Simulation::new(scene);
+    for (joint, fraction) in hand.joints.iter().zip(fractions.iter().cycle()) {
+        sim.qpos_mut()[joint.qpos] = joint.range[0] + fraction * (joint.range[1] - joint.range[0]);
+    }
+    sim.refresh();
+    let pose = |tip| {
+        let pose = sim.pose(tip);
+        let ([x, y, z], [qw, qx, qy, qz]) = (pose.position, pose.orientation);
+        [x, y, z, qw, qx, qy, qz]
+    };
+    hand.fingertips.iter().map(|&tip| pose(tip)).collect()
+}

@@ -1,0 +1,56 @@
+//! How far random actions turn the object: a hand that hardly moves it learns slowly.
+
+use std::sync::Arc;
+
+use rand_distr::{Distribution, Normal};
+use rayon::prelude::*;
+
+use crate::env::Env;
+use crate::quat;
+use crate::repose::{Repose, Task};
+use crate::rng;
+
+/// The number of episodes, and their steps; in the first ones the object settles.
+const EPISODES: u64 = 16;
+const STEPS: usize = 400;
+const SETTLING: usize = 60;
+
+/// The standard deviation of the actions, which is that of an untrained policy by default.
+const STD: f32 = 0.6;
+
+/// The mobility of the built-in hand, rad in 100 steps.
+const OF_BUILTIN: f64 = 3.4;
+
+/// Measures the mobility of a task's hand, and returns a sentence about it.
+pub(super) fn mobility(task: &Arc<Task>) -> String {
+    let played = (0..EPISODES).into_par_iter().map(|episode| play(task, episode));
+    let (turned, steps, drops) = played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
+    let (rate, object) = (100.0 * turned / f64::from(steps.max(1)), &task.hand().parts.object);
+    format!(
+        "random actions turn `{object}` by {rate:.2} rad in 100 steps (the built-in hand: {OF_BUILTIN}), and drop it in {drops} of \
+         {EPISODES} episodes; docs/HANDS.md tells what raises the first"
+    )
+}
+
+/// Returns how far the object turned, in how many steps, and whether it was dropped.
+fn play(task: &Arc<Task>, episode: u64) -> (f64, u32, u32) {
+    let (mut env, spaces) = (Repose::new(task), task.spaces());
+    let (mut observation, mut action) = (vec![0.0; spaces.observation_size], vec![0.0; spaces.action_size]);
+    let mut rng = rng::stream(0, "mobility", episode);
+    let normal = Normal::new(0.0, STD).expect("a standard deviation");
+    env.reset(rng::stream(0, "mobility of", episode), &mut observation);
+    let (mut turned, mut steps) = (0.0, 0);
+    for step in 0..STEPS {
+        let before = env.cube().orientation;
+        action.fill_with(|| normal.sample(&mut rng));
+        let end = env.step(&action, &mut observation).end;
+        if step >= SETTLING {
+            turned += quat::angle_between(env.cube().orientation, before);
+            steps += 1;
+        }
+        if end.is_some() {
+            return (turned, steps, u32::from(env.episode().dropped));
+        }
+    }
+    (turned, steps, 0)
+}

@@ -1,0 +1,183 @@
+//! Hands of other kinds, found by the structure of their scene, and the mirror image of the built-in one.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+use shadow_repose::env::Env;
+use shadow_repose::repose::{Repose, Task};
+use shadow_repose::rng;
+
+use crate::support::{SCENE, env_config, program, stderr, succeeded, train};
+
+/// A hand of three fingers: nine joints, six actuators, tendons, sites, and a box.
+const THREE_FINGERS: &str = include_str!("three_fingers.xml");
+
+/// The built-in scene in the mirror, the plane y = 0, with the names of a left hand.
+fn left_scene() -> String {
+    let signs =
+        [("pos=\"", [1.0, -1.0, 1.0, 1.0]), ("quat=\"", [1.0, -1.0, 1.0, -1.0]), ("axis=\"", [-1.0, 1.0, -1.0, 1.0])];
+    let mut scene = SCENE.replace("rh_", "lh_");
+    for (attribute, signs) in signs {
+        let parts = scene.split(attribute).map(str::to_owned).collect::<Vec<_>>();
+        let mirrored = parts.iter().enumerate().map(|(i, part)| {
+            let (numbers, rest) = part.split_once('"').unwrap();
+            if i == 0 {
+                return part.clone();
+            }
+            let numbers =
+                numbers.split_whitespace().zip(signs).map(|(x, sign)| (sign * x.parse::<f64>().unwrap()).to_string());
+            format!("{}\"{rest}", numbers.collect::<Vec<_>>().join(" "))
+        });
+        scene = mirrored.collect::<Vec<_>>().join(attribute);
+    }
+    scene
+}
+
+/// Writes a scene into a new folder, and returns it with the setting that names it.
+fn placed(scene: &str) -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("scene.xml"), scene).unwrap();
+    let set = format!("env.model={}", folder.path().join("scene.xml").display());
+    (folder, set)
+}
+
+fn refusal(scene: &str, sets: &[&str]) -> String {
+    let (_folder, model) = placed(scene);
+    let config = crate::support::config(&[&[&model[..]], sets].concat());
+    format!("{:#}", Task::new(&config.env, &config.hand).err().expect("it is refused"))
+}
+
+fn header(trace: &Path) -> Value {
+    serde_json::from_str(fs::read_to_string(trace).unwrap().lines().next().unwrap()).unwrap()
+}
+
+#[test]
+fn a_hand_of_another_kind_is_trained_resumed_played_and_exported() {
+    let (folder, model) = placed(THREE_FINGERS);
+    let folder = folder.path();
+    let tips = "hand.fingertips=[\"α end\",\"β end\",\"γ end\"]";
+    let own = ["--set", &model, "--set", tips, "--run-dir", "run"];
+    let said = stderr(&succeeded(program(folder, &train(&[&["--total-steps", "256"], &own[..]].concat()))));
+    assert!(said.contains("random actions turn `block` by") && said.contains("keyframe `cupped`"), "{said}");
+    let config = fs::read_to_string(folder.join("run/config.toml")).unwrap();
+    for line in ["num_hand_dofs = 9", "num_actuators = 6", "goal_position = [0.0, 0.0, 0.245]", "\"α end\""] {
+        assert!(config.contains(line), "{line}: {config}");
+    }
+    succeeded(program(folder, &["train", "--resume", "run", "--set", &model, "--total-steps", "384"]));
+    let play = ["play", "--ckpt", "run", "--set", &model, "--json", "--episodes", "2", "--trace", "t.jsonl"];
+    succeeded(program(folder, &play));
+    let header = header(&folder.join("t.jsonl"));
+    assert_eq!(header["joint_names"].as_array().unwrap().len(), 9);
+    assert_eq!(header["actuator_names"][1], "α bends");
+    assert_eq!(header["fingertip_names"][2], "γ end");
+    let groups = header["observation"].as_array().unwrap();
+    assert_eq!(groups.iter().map(|group| group["length"].as_u64().unwrap()).sum::<u64>(), 18 + 24 + 39 + 6);
+    succeeded(program(folder, &["export", "--ckpt", "run", "--set", &model]));
+    let scene = folder.join("scene.xml");
+    crate::export::check_in_python(folder, &["policy.onnx", "--scene", scene.to_str().unwrap(), "--check", "t.jsonl"]);
+}
+
+#[test]
+fn a_policy_of_another_hand_is_refused_by_the_names_that_differ() {
+    let (folder, model) = placed(THREE_FINGERS);
+    let folder = folder.path();
+    let said = stderr(&program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", &model]));
+    assert!(said.contains("for another hand") && said.contains("α turn") && said.contains("rh_THJ5"), "{said}");
+    assert!(!said.contains("--mirror"), "{said}");
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
+    let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", "env.model=builtin"]));
+    assert!(said.contains("for another hand") && said.contains("has joints rh_THJ5"), "{said}");
+    let said = stderr(&program(folder, &["train", "--init", "builtin", "--run-dir", "other", "--set", &model]));
+    assert!(said.contains("for another hand"), "{said}");
+}
+
+#[test]
+fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
+    let (folder, model) = placed(&SCENE.replace("ctrlrange=\"0 3.1415\"", "ctrlrange=\"0 3\""));
+    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
+    let said = stderr(&succeeded(program(folder.path(), &[&play[..], &["--set", &model]].concat())));
+    assert!(said.contains("control ranges of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"), "{said}");
+}
+
+#[test]
+fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting_that_mends_it() {
+    let block = THREE_FINGERS.split("<body name=\"block\"").nth(1).unwrap().split("</body>").next().unwrap();
+    let block = format!("<body name=\"block\"{block}</body>");
+    let without = THREE_FINGERS.replace(&block, "").replace("0 .6 .4 0 0 .245 1 0 0 0", "0 .6 .4");
+    let two = THREE_FINGERS.replace(&block, &format!("{block}{}", block.replace("block", "other")));
+    let two = two.replace("0 0 .245 1 0 0 0", "0 0 .245 1 0 0 0 0 0 .3 1 0 0 0");
+    let goals = "<body name=\"g1\" mocap=\"true\"/><body name=\"g2\" mocap=\"true\"/></worldbody>";
+    let both = two.replace("</worldbody>", goals);
+    for (scene, sets, parts) in [
+        (&without, &[][..], &["<body name=\"cube\" pos=\"X Y Z\"><freejoint/>"][..]),
+        (&two, &[], &["several bodies with a free joint, `block`, `other`: name one by hand.object"]),
+        (&both, &[], &["name one by hand.object", "several mocap bodies, `g1`, `g2`: name one by hand.goal"]),
+        (&THREE_FINGERS.replace("name=\"α distal\" ", ""), &[], &["body 4 of the compiled scene needs a name"]),
+        (
+            &THREE_FINGERS.replace("<position name=\"α turns\" ", "<motor name=\"α turns\" "),
+            &[],
+            &["`α turns` must be a position servo"],
+        ),
+        (
+            &THREE_FINGERS.to_owned(),
+            &["hand.joints=[\"α turn\",\"δ\"]", "hand.goal=none"],
+            &["has no joint `δ`, body `none`"],
+        ),
+        (&THREE_FINGERS.to_owned(), &["hand.start=flat"], &["has no keyframe `flat`"]),
+        (
+            &THREE_FINGERS.to_owned(),
+            &["env.num_hand_dofs=24"],
+            &["env.num_hand_dofs = 24: the hand of ", "has 9 joints"],
+        ),
+        (&"<mujoco/>".to_owned(), &[], &["has no hand", "hand.joints and hand.actuators", "<freejoint/>"]),
+    ] {
+        let message = refusal(scene, sets);
+        assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} in {message}");
+    }
+    let (_folder, model) = placed(&both);
+    let config = crate::support::config(&[&model, "hand.object=other", "hand.goal=g2"]);
+    let task = Task::new(&config.env, &config.hand).unwrap();
+    assert_eq!((&*task.hand().parts.object, &*task.hand().parts.goal), ("other", "g2"));
+}
+
+#[test]
+fn a_scene_that_shows_no_goal_gets_one_that_touches_nothing() {
+    let (_folder, model) = placed(THREE_FINGERS);
+    let task = Task::new(&env_config(&[&model]), &Default::default()).unwrap();
+    let mut env = Repose::new(&task);
+    let mut observation = vec![0.0; task.spaces().observation_size];
+    env.reset(rng::stream(0, "test", 0), &mut observation);
+    let goal = task.scene().frame(&task.hand().parts.goal).unwrap();
+    let pose = env.simulation().pose(goal);
+    assert!((pose.position[2] - 0.445).abs() < 1e-9, "{pose:?}");
+    assert_eq!(pose.orientation.map(|x| x as f32), env.goal().map(|x| x as f32));
+}
+
+#[test]
+fn the_mirror_image_of_the_hand_sees_and_does_in_the_mirror_what_the_hand_does() {
+    let (folder, model) = placed(&left_scene());
+    let folder = folder.path();
+    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "4", "--set", &model];
+    let said = stderr(&program(folder, &play));
+    assert!(said.contains("for another hand") && said.contains("--mirror"), "{said}");
+    let goals = |args: &[&str]| -> f64 {
+        let score: Value = serde_json::from_slice(&succeeded(program(folder, args)).stdout).unwrap();
+        score["goals_per_episode"].as_f64().unwrap()
+    };
+    assert!(goals(&[&play[..], &["--mirror"]].concat()) > 6.0, "the right hand reaches more than nine");
+    let trace =
+        ["play", "--ckpt", "builtin", "--mirror", "--json", "--episodes", "2", "--trace", "t.jsonl", "--set", &model];
+    succeeded(program(folder, &trace));
+    succeeded(program(folder, &["export", "--ckpt", "builtin", "--mirror", "--set", &model]));
+    let run = ["--init", "builtin", "--mirror", "--total-steps", "128", "--run-dir", "run", "--set", &model];
+    let small = ["env.num_envs=16", "ppo.horizon=8", "run.eval_episodes=2", "randomization.share=0"];
+    let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
+    succeeded(program(folder, &[&["train"], &run[..], &small].concat()));
+    assert!(
+        goals(&["play", "--ckpt", "run", "--json", "--episodes", "4", "--set", &model]) > 4.0,
+        "it knows that it mirrors"
+    );
+    let wrong = program(folder, &["play", "--ckpt", "builtin", "--mirror", "--headless"]);
+    assert!(stderr(&wrong).contains("not the mirror image"), "{}", stderr(&wrong));
+}
