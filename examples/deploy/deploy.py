@@ -8,6 +8,7 @@ or newer; `pip install -r requirements.txt`.
 """
 
 import argparse
+import contextlib
 import json
 import pathlib
 import sys
@@ -21,7 +22,22 @@ SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
 # Settings that older files do not have.
 NOMINAL = dict.fromkeys(["hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale"], 1.0)
 NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "action_delay": 0, "noise": {}, "bias": {}}
+# What the file and its settings must say.
+FACTS = set("action_offset action_scale config ema_alpha fingertip_names hinge_names joint_names object_name observation_names "
+            "observation_sizes start_keyframe".split())
+SETTINGS = set("sim_dt ctrl_dt friction_scale cube_mass_scale goal_position reset_position_noise reset_dof_pos_noise "
+               "reset_dof_vel_noise vel_obs_scale fall_dist success_tolerance success_hold max_consecutive_successes "
+               "max_episode_seconds".split())
 OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
+
+
+@contextlib.contextmanager
+def read_from(file):
+    """Ends the program with one sentence if the file does not hold what is looked for in it."""
+    try:
+        yield
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+        sys.exit(f"error: {file} is incomplete or garbled: {type(error).__name__}: {str(error).split(chr(10))[0]}")
 
 
 class Policy:
@@ -35,11 +51,14 @@ class Policy:
         except Exception as error:  # onnxruntime's errors have no common class
             sys.exit(f"error: {path} is not an ONNX file that can be run: {error}")
         self.facts = self.session.get_modelmeta().custom_metadata_map
-        if "hinge_names" not in self.facts:
-            sys.exit(f"error: {path} does not name the parts of its hand; export it again")
+        if missing := FACTS - self.facts.keys():
+            sys.exit(f"error: {path} does not say its {', '.join(sorted(missing))}; export it again")
 
     def numbers(self, key):
-        return np.array([float(number) for number in self.facts[key].split(",")])
+        numbers = np.array([float(number) for number in self.facts[key].split(",")])
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{key} is not finite")
+        return numbers
 
     def names(self, key):
         return self.facts[key].split(",")
@@ -57,6 +76,11 @@ class Hand:
     def __init__(self, policy, scene):
         env = NOMINAL | tomllib.loads(policy.facts["config"])["env"]
         self.env = env
+        if missing := SETTINGS - env.keys():
+            raise KeyError(f"no env.{', env.'.join(sorted(missing))}")
+        for key, value in env.items():
+            if isinstance(value, (float, list)) and not np.isfinite(value).all():
+                raise ValueError(f"env.{key} is not finite")
         for key in ("noise", "bias"):
             if env[key]:
                 sys.exit(f"error: the policy was exported with env.{key}, which this program does not simulate")
@@ -66,8 +90,8 @@ class Hand:
             self.tips = [frame(self.model, name) for name in policy.names("fingertip_names")]
             self.actuators = [self.model.actuator(name) for name in policy.names("joint_names")]
             cube = self.model.body(policy.facts["object_name"])
-        except KeyError as error:
-            sys.exit(f"error: {scene} is not the policy's hand: {error.args[0].splitlines()[0]}")
+        except (KeyError, ValueError) as error:
+            sys.exit(f"error: {scene} is not the policy's hand: {str(error.args[0]).splitlines()[0]}")
         self.data = mujoco.MjData(self.model)
         self.substeps = round(env["ctrl_dt"] / env["sim_dt"])
         self.angle = np.array([joint.qposadr[0] for joint in joints])
@@ -84,7 +108,7 @@ class Hand:
         # An action of -1 … 1 asks for a target within the control range: offset + scale * action.
         self.controls = np.array([actuator.id for actuator in self.actuators])
         self.offset, self.scale = policy.numbers("action_offset"), policy.numbers("action_scale")
-        self.alpha = float(policy.facts["ema_alpha"])
+        [self.alpha] = policy.numbers("ema_alpha")
         ranges = np.array([actuator.ctrlrange for actuator in self.actuators])
         if not np.allclose(ranges, np.stack([self.offset - self.scale, self.offset + self.scale], 1), rtol=0, atol=1e-9):
             sys.exit(f"error: the actuators of {scene} have other ranges than those that the policy was exported for")
@@ -267,9 +291,12 @@ def play(policy, hand, episodes, seed):
 
 def score(played):
     goals, lengths, drops = played.T
-    margin = 1.96 * goals.std(ddof=1) / len(goals) ** 0.5 if len(goals) > 1 else float("nan")
-    return {"episodes": len(goals), "goals_per_episode": goals.mean(), "goals_ci95": [goals.mean() - margin, goals.mean() + margin],
-            "drop_rate": drops.mean(), "episode_length": lengths.mean()}
+    interval = [None, None]  # one episode has none
+    if len(goals) > 1:
+        margin = 1.96 * goals.std(ddof=1) / len(goals) ** 0.5
+        interval = [goals.mean() - margin, goals.mean() + margin]
+    return {"episodes": len(goals), "goals_per_episode": goals.mean(), "goals_ci95": interval, "drop_rate": drops.mean(),
+            "episode_length": lengths.mean()}
 
 
 def check(policy, hand, trace):
@@ -278,6 +305,8 @@ def check(policy, hand, trace):
         header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
     except (OSError, ValueError) as error:
         sys.exit(f"error: {trace} is not a complete trace: {error}")
+    if "sim_dt" not in header:
+        sys.exit(f"error: {trace} does not begin with the header of a trace, so its task is not known")
     if header.get("noise") or header.get("bias"):
         sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
     for key in sorted(header.keys() & hand.env.keys() - {"model"}):
@@ -317,16 +346,23 @@ def main():
     args = parser.parse_args()
     if args.episodes < 1:
         parser.error("--episodes must be at least 1")
-    policy = Policy(args.policy)
-    hand = Hand(policy, args.scene)
+    if args.seed < 0:
+        parser.error("--seed must not be negative")
+    with read_from(args.policy):
+        policy = Policy(args.policy)
+        hand = Hand(policy, args.scene)
     if args.check:
-        sys.exit(0 if check(policy, hand, args.check) else "error: too far off")
-    found = score(play(policy, hand, args.episodes, args.seed))
+        with read_from(args.check):
+            alike = check(policy, hand, args.check)
+        sys.exit(0 if alike else "error: too far off")
+    with read_from(args.policy):
+        found = score(play(policy, hand, args.episodes, args.seed))
     if args.json:
         print(json.dumps(found))
     else:
         low, high = found["goals_ci95"]
-        print(f"{found['goals_per_episode']:.2f} goals per episode ({low:.2f} … {high:.2f}), drops {100 * found['drop_rate']:.1f} %")
+        interval = "" if low is None else f" ({low:.2f} … {high:.2f})"
+        print(f"{found['goals_per_episode']:.2f} goals per episode{interval}, drops {100 * found['drop_rate']:.1f} %")
 
 
 if __name__ == "__main__":

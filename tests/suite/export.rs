@@ -155,6 +155,72 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
     }
 }
 
+/// Writes copies of a policy with odd metadata, and traces with odd records: each by its name.
+const GARBLE: &str = "
+import json, onnx
+def garbled(name, key, value):
+    model = onnx.load('policy.onnx')
+    facts = {fact.key: fact.value for fact in model.metadata_props} | {key: value}
+    onnx.helper.set_model_props(model, {key: value for key, value in facts.items() if value is not None})
+    onnx.save(model, name)
+config = next(fact.value for fact in onnx.load('policy.onnx').metadata_props if fact.key == 'config')
+garbled('nan.onnx', 'ema_alpha', 'nan')
+garbled('inf.onnx', 'action_scale', 'inf,' * 19 + 'inf')
+garbled('far.onnx', 'config', config.replace('fall_dist = ', 'fall_dist = nan # '))
+garbled('bare.onnx', 'config', None)
+garbled('toml.onnx', 'config', '[env')
+garbled('empty.onnx', 'config', '')
+garbled('words.onnx', 'action_offset', 'much')
+garbled('key.onnx', 'start_keyframe', '99')
+garbled('short.onnx', 'config', '[env]\\nctrl_dt = 0.01\\nsim_dt = 0.01')
+header, *records = open('trace.jsonl').read().splitlines()
+open('headless', 'w').write('\\n'.join(records))
+for name, key, value in [('lacking', 'qpos', ...), ('words', 'qpos', 'much'), ('null', 'obs', None), ('short', 'action', [1])]:
+    record = json.loads(records[1]) | {key: value}
+    record = {key: value for key, value in record.items() if value is not ...}
+    open(name, 'w').write('\\n'.join([header, records[0], json.dumps(record), *records[2:]]))
+open('list', 'w').write('\\n'.join([header, '[]', *records]))
+";
+
+#[test]
+fn the_example_in_python_refuses_garbled_policies_and_traces_in_a_sentence() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let short = ["--ckpt", "builtin", "--set", "env.max_episode_seconds=0.1"];
+    let play = ["play", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+    succeeded(program(folder, &[&play[..], &short].concat()));
+    succeeded(program(folder, &[&["export"], &short[..]].concat()));
+    runs(&python, folder, &["-c", GARBLE]);
+    let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
+    let said = |args: &[&str]| {
+        let output = Command::new(&python).arg(deploy).args(args).current_dir(folder).output().unwrap();
+        (output.status.success(), String::from_utf8(output.stdout.clone()).unwrap(), stderr(&output))
+    };
+    for policy in ["nan", "inf", "far", "bare", "toml", "empty", "words", "key", "short"] {
+        let file = format!("{policy}.onnx");
+        for args in [&["--check", "trace.jsonl"][..], &["--episodes", "1"]] {
+            let (success, _, error) = said(&[&[&file[..]], args].concat());
+            let told = error.starts_with(&format!("error: {file}")) && error.trim().lines().count() == 1;
+            assert!(!success && told, "{policy} {args:?}: {error}");
+        }
+    }
+    for trace in ["headless", "lacking", "words", "null", "short", "list"] {
+        let (success, _, error) = said(&["policy.onnx", "--check", trace]);
+        let told = error.starts_with(&format!("error: {trace} ")) && error.trim().lines().count() == 1;
+        assert!(!success && told, "{trace}: {error}");
+    }
+    for args in [["--seed", "-1"], ["--scene", "nowhere.xml"]] {
+        let (success, _, error) = said(&[&["policy.onnx"], &args[..]].concat());
+        assert!(!success && error.contains("error: ") && !error.contains("Traceback"), "{args:?}: {error}");
+    }
+    // One episode has no interval.
+    let (success, json, error) = said(&["policy.onnx", "--episodes", "1", "--json"]);
+    let score: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert!(success && score["goals_ci95"] == serde_json::json!([null, null]), "{json}{error}");
+    assert!(!said(&["policy.onnx", "--episodes", "1"]).1.contains("nan"));
+}
+
 #[test]
 fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_know() {
     let folder = tempfile::tempdir().unwrap();
