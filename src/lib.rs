@@ -32,8 +32,8 @@
 //! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
 //! | [`config`] | all settings, their defaults and rules | os, sim |
-//! | [`sim`] | the only interface to MuJoCo | quat, schedule |
-//! | [`run`] | the folder of a run and its logs | os |
+//! | [`sim`] | the only interface to MuJoCo | os, quat, schedule |
+//! | [`run`] | the folder of a run and its logs | os, sim |
 //! | [`draw`] | charts, films and pictures as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |
 //! | [`tags`] | what a training logs: names, meanings, units | repose |

@@ -46,7 +46,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     let config = task.config();
     for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
         let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
-        run::expect_output(output, policy.into_iter().chain(config.model_file()))?;
+        run::expect_output(output, policy, config.model_file())?;
     }
     os::start_threads(args.threads)?;
     if args.robustness {

@@ -55,7 +55,7 @@ struct Run {
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
-    run::expect_output(&args.out, tables.iter().map(PathBuf::as_path))?;
+    run::expect_output(&args.out, tables.iter().map(PathBuf::as_path), None)?;
     let output = OutputFile::create(&args.out)?;
     draw::picture_format(&output)?;
     let asked = args.metric.iter().map(|name| (&name[..], None));

@@ -37,7 +37,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     if let Some(path) = &args.screenshot {
-        run::expect_output(path, args.settings.config.as_deref().into_iter().chain(config.env.model_file()))?;
+        run::expect_output(path, args.settings.config.as_deref(), config.env.model_file())?;
     }
     let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
     let episodes = Episodes::scored(args.seed, usize::MAX);

@@ -59,12 +59,13 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
     }
     let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
+    let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     if let Some(out) = &args.out {
-        run::expect_output(out, args.settings.config.as_deref().into_iter().chain(origin.file()))?;
+        let read = args.settings.config.as_deref().into_iter().chain(origin.file());
+        run::expect_output(out, read, config.env.model_file())?;
     }
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
     output.as_ref().map(draw::picture_format).transpose()?;
-    let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env, &config.hand)?;

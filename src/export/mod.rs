@@ -37,7 +37,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let task = loaded.task().context("the ranges of the actuators are those of the scene")?;
     loaded.config = task.config().clone();
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
-    run::expect_output(&args.out, loaded.origin.file().into_iter().chain(loaded.config.model_file()))?;
+    run::expect_output(&args.out, loaded.origin.file(), loaded.config.model_file())?;
     let output = os::OutputFile::create(&args.out)?;
     let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, task.hand()));
     output.finish(&bytes)?;

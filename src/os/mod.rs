@@ -20,7 +20,8 @@ pub use lock::{LOCK, Locked};
 pub use machine::{Machine, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OUR_PARTIAL, OutputFile, expect_folder, is_abandoned, make_own, name_also, put_aside, sync_folder, write_whole,
+    OUR_PARTIAL, OutputFile, expect_folder, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder,
+    write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, progress_bar};
 pub use similar::similar;

@@ -175,13 +175,14 @@ impl OutputFile {
 
     /// Whether the path `other` leads to the same file.
     pub fn is_of(&self, other: &Path) -> bool {
-        let target = |path: &Path| {
-            end_of_links(path)
-                .ok()
-                .and_then(|end| Some((folder_of(&end).canonicalize().ok()?, end.file_name()?.to_owned())))
-        };
-        target(&self.path).is_some() && target(&self.path) == target(other)
+        final_path(&self.path).is_some_and(|path| Some(path) == final_path(other))
     }
+}
+
+/// Returns the absolute path to which a path leads through links; the file need not exist, but its folder must.
+pub fn final_path(path: &Path) -> Option<PathBuf> {
+    let end = end_of_links(path).ok()?;
+    Some(folder_of(&end).canonicalize().ok()?.join(end.file_name()?))
 }
 
 /// Writes one of the program's own files atomically: a reader finds either the whole old file or the whole new one.

@@ -14,16 +14,16 @@ use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync
 /// The default folder of runs.
 const RUNS: &str = "runs/shadow-hand-repose";
 
-const CONFIG: &str = "config.toml";
-const VERSION: &str = "version.txt";
-const POLICY: &str = "policy.safetensors";
+pub(super) const CONFIG: &str = "config.toml";
+pub(super) const VERSION: &str = "version.txt";
+pub(super) const POLICY: &str = "policy.safetensors";
 pub(super) const DIVERGED: &str = "diverged";
 /// A file with this name asks the training to stop.
 const STOP: &str = "stop";
 /// A file with this name says that the training is not to be continued.
 const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
-pub(super) const OURS: [&str; 10] =
+const OURS: [&str; 10] =
     [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
@@ -126,11 +126,10 @@ impl RunFolder {
     /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
         let run = Self::around(place)?;
-        // A folder that may not be read would look empty.
-        match fs::read_dir(run.checkpoints().folder()) {
-            Err(error) if error.kind() != ErrorKind::NotFound => {
-                Err(error).cannot("read", run.checkpoints().folder())?
-            }
+        // A folder that may not be listed or entered would look empty.
+        let checkpoints = run.checkpoints();
+        match fs::read_dir(checkpoints.folder()).and_then(|_| fs::metadata(checkpoints.folder().join("."))) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", checkpoints.folder())?,
             _ => {}
         }
         Ok(run)

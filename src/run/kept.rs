@@ -1,33 +1,62 @@
 //! Which files an output may not replace.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 
 use super::checkpoints::CHECKPOINTS;
-use super::folder::{DIVERGED, OURS, RunFolder};
-use crate::os::{LOCK, same_file};
+use super::folder::{CONFIG, DIVERGED, METRICS, POLICY, RunFolder, VERSION};
+use crate::os::{LOCK, final_path, same_file};
+use crate::sim::scene_files;
 
-/// The prefixes of the names of checkpoints and of dumps.
-const NUMBERED: [&str; 3] = ["iteration-", "latest.", "best."];
+/// The names of the files that a run keeps in its folder; a star stands for anything.
+const IN_RUN: [&str; 8] =
+    [CONFIG, VERSION, POLICY, LOCK, METRICS, "metrics.before-*.csv", "events.out.*", ".shadow-repose-*"];
 
-/// Checks that an output replaces neither one of the files that are `read` nor a file that a run keeps. New names in the folder of
-/// a run are free.
+/// The same for the folders of its checkpoints and of its dumps.
+const INSIDE: [&str; 7] = [
+    "iteration-*.safetensors",
+    "iteration-*.later",
+    "iteration-*.json",
+    "latest.safetensors",
+    "best.safetensors",
+    "best*.damaged",
+    ".shadow-repose-*",
+];
+
+/// Checks that an output replaces neither one of the files that are `read`, nor one of those of the `scene`, and that it has no
+/// name that a run keeps for its own files. Other names in the folder of a run are free.
 ///
 /// # Errors
-/// Fails if it would, through whatever links.
-pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>) -> Result<()> {
-    if let Some(read) = read.into_iter().find(|read| same_file(path, read)) {
+/// Fails if it does, through whatever links.
+pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, scene: Option<&Path>) -> Result<()> {
+    let mut read = read.into_iter().map(PathBuf::from).chain(scene.map(scene_files).unwrap_or_default());
+    if let Some(read) = read.find(|read| same_file(path, read)) {
         bail!("{}: would replace {}, which is read; choose another name", path.display(), read.display());
     }
-    let Ok(whole) = path.canonicalize() else { return Ok(()) };
+    let Some(whole) = final_path(path) else { return Ok(()) };
     let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
-    let inner = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let (run, names) = if inner { (folder.parent(), &NUMBERED[..]) } else { (Some(folder), &OURS[..]) };
+    let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
+    let (run, names) = if inside { (folder.parent(), &INSIDE[..]) } else { (Some(folder), &IN_RUN[..]) };
     let run = RunFolder::at(run.unwrap_or(folder).to_owned());
     let is_run = run.checkpoints().begun() || run.path().join(LOCK).exists();
-    let ours = names.iter().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()));
+    let name = name.to_string_lossy();
+    let is_kept = names.iter().any(|kept| match kept.split_once('*') {
+        Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
+        None => name == *kept,
+    });
     let place = run.path().display();
-    ensure!(!is_run || !ours, "{}: the run {place} keeps this file; choose another name", path.display());
+    ensure!(!is_run || !is_kept, "{}: the run {place} keeps a file of this name; choose another name", path.display());
+    Ok(())
+}
+
+/// Checks that a new run in `folder` does not replace the policy that it begins with.
+///
+/// # Errors
+/// Fails if it does.
+pub fn expect_other_policy(folder: &Path, init: &Path) -> Result<()> {
+    let own = RunFolder::at(folder.to_owned()).policy();
+    let replaces = same_file(&own, init);
+    ensure!(!replaces, "{}: would replace the policy that --init reads; choose another --run-dir", own.display());
     Ok(())
 }

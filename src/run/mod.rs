@@ -15,7 +15,7 @@ pub use checkpoints::Checkpoints;
 pub use events::SETTINGS;
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use histogram::{Histogram, histogram};
-pub use kept::expect_output;
+pub use kept::{expect_other_policy, expect_output};
 pub use report::Report;
 pub use summary::{Animation, Descriptions, Media};
 pub use table::{MetricsTable, read_metrics, table_of};

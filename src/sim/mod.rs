@@ -5,6 +5,7 @@
 
 mod compilation;
 mod fatal;
+mod files;
 mod fingerprint;
 mod finite;
 mod furnish;
@@ -25,6 +26,7 @@ mod viewer;
 
 pub use compilation::{Compilation, Cone, origin};
 pub use fatal::{before_fatal_error, stepping};
+pub use files::scene_files;
 pub use look::{Camera, Look, Quality, mesh_files};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};

@@ -349,11 +349,11 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
         (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "is read"),
         (&["export"], &["--ckpt", "p.safetensors", "--out", "soft.svg"], "is read"),
         (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/best.safetensors"], "is read"),
-        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "keeps this file"),
-        (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "keeps this file"),
-        (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "keeps this file"),
+        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "keeps a file"),
+        (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "keeps a file"),
+        (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "keeps a file"),
         (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "is read"),
-        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "keeps this file"),
+        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "keeps a file"),
         (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "is read"),
         (&["play", "--robustness", "--out", "hard.svg"], &own, "is read"),
         (&["plot", "table.svg"], &["--out", "table.svg"], "is read"),
@@ -371,5 +371,109 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
     for _ in 0..2 {
         succeeded(program(folder, &["export", "--ckpt", "run", "--out", "run/policy.onnx"]));
         succeeded(program(folder, &["export", "--ckpt", "run", "--out", "run/checkpoints/mine.onnx"]));
+    }
+}
+
+#[test]
+fn no_output_replaces_a_file_that_a_scene_reads() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    ["scenes/parts", "scenes/meshes"].iter().for_each(|inner| fs::create_dir_all(folder.join(inner)).unwrap());
+    let scene = SCENE.replacen(
+        "autolimits=\"true\"/>",
+        "autolimits=\"true\" meshdir = 'meshes'/><include file='parts/more.svg'/>",
+        1,
+    );
+    for name in ["scenes/s.xml", "scenes/s.svg"] {
+        fs::write(folder.join(name), &scene).unwrap();
+    }
+    let more = "<mujoco><asset><mesh name=\"m\"\n file = \"m.obj\"/></asset></mujoco>";
+    fs::write(folder.join("scenes/parts/more.svg"), more).unwrap();
+    let corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    fs::write(folder.join("scenes/meshes/m.obj"), corners).unwrap();
+    std::os::unix::fs::symlink("scenes/meshes/m.obj", folder.join("link")).unwrap();
+    let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
+    let bench = ["bench", "--only", "iteration", "--set", "env.num_envs=16", "--set", "ppo.hidden=[8]"];
+    let refused: [(&[&str], &[&str], &str); 6] = [
+        (&["export", "--ckpt", "builtin"], &["--out", "scenes/parts/more.svg"], "s.xml"),
+        (&["export", "--ckpt", "builtin"], &["--out", "link"], "s.xml"),
+        (&play, &["--trace", "scenes/meshes/m.obj", "--policy", "zero"], "s.xml"),
+        (&play, &["--robustness", "--out", "scenes/parts/more.svg", "--ckpt", "builtin"], "s.xml"),
+        (&bench, &["--out", "scenes/parts/more.svg"], "s.xml"),
+        (&bench, &["--out", "scenes/s.svg"], "s.svg"),
+    ];
+    for (command, more, scene) in refused {
+        let model = format!("env.model=scenes/{scene}");
+        let output = program(folder, &[command, more, &["--set", &model]].concat());
+        let said = stderr(&output);
+        assert!(output.status.code() == Some(1) && said.contains("is read"), "{more:?}: {said}");
+    }
+    assert_eq!(fs::read_to_string(folder.join("scenes/meshes/m.obj")).unwrap(), corners);
+    assert_eq!(fs::read_to_string(folder.join("scenes/parts/more.svg")).unwrap(), more);
+    assert_eq!(fs::read_to_string(folder.join("scenes/s.svg")).unwrap(), scene);
+    // What the scene does not read is free.
+    let model = ["--ckpt", "builtin", "--set", "env.model=scenes/s.xml"];
+    succeeded(program(folder, &[&["export", "--out", "scenes/meshes/other.obj"], &model[..]].concat()));
+}
+
+#[test]
+fn in_a_run_only_the_names_of_its_own_files_are_taken_even_before_they_are_there() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let export = |out: &str| program(folder, &["export", "--ckpt", "builtin", "--out", out]);
+    for free in [
+        "run/checkpoints/best.onnx",
+        "run/checkpoints/latest.onnx",
+        "run/checkpoints/iteration-00000001.onnx",
+        "run/checkpoints.svg",
+        "run/diverged.svg",
+        "run/metrics.csv.svg",
+        "run/policy.safetensors.onnx",
+    ] {
+        (0..2).for_each(|_| drop(succeeded(export(free))));
+    }
+    std::os::unix::fs::symlink("run/checkpoints/iteration-00000098.safetensors", folder.join("link")).unwrap();
+    for taken in [
+        "run/checkpoints/iteration-00000099.safetensors",
+        "run/checkpoints/iteration-99.safetensors",
+        "run/../run/metrics.before-3.csv",
+        "link",
+    ] {
+        let output = export(taken);
+        let said = stderr(&output);
+        assert!(
+            output.status.code() == Some(1) && said.contains("the run ") && said.contains("keeps"),
+            "{taken}: {said}"
+        );
+    }
+    succeeded(program(folder, &["train", "--resume", "run", "--total-steps", "256"]));
+}
+
+#[test]
+fn foreign_words_neither_steer_the_terminal_nor_begin_lines() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let scene = SCENE.replacen("name=\"cube\" type=\"box\"", "name=\"cu\u{202e}\u{2066}be\" type=\"box\"", 1);
+    fs::write(folder.join("s.xml"), scene.replacen("friction=\"1.2\"", "friction=\"nan\"", 1)).unwrap();
+    fs::write(folder.join("own.toml"), "[env]\n\"a\\nerror: \\u202eb\" = 1\n\"\\u200f\" = 1").unwrap();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let latest = folder.join("run/checkpoints/latest.safetensors");
+    let mut bad = shadow_repose::ppo::Checkpoint::parse(&fs::read(latest).unwrap()).unwrap();
+    bad.config = bad.config.replace("model = \"builtin\"", "model = \"\\nerror: \\u202eb\"");
+    fs::write(folder.join("p.safetensors"), bad.to_bytes().unwrap()).unwrap();
+    let lock = fs::File::options().write(true).truncate(true).open(folder.join("run/run.lock")).unwrap();
+    lock.lock().unwrap();
+    fs::write(folder.join("run/run.lock"), "\n\nerror: all lost\u{202e}").unwrap();
+    for args in [
+        &["play", "--policy", "zero", "--set", "env.model=s.xml", "--headless"][..],
+        &["train", "--config", "own.toml"],
+        &["play", "--ckpt", "p.safetensors", "--headless"],
+        &["train", "--resume", "run", "--total-steps", "256"],
+    ] {
+        let said = stderr(&program(folder, args));
+        let errors = said.lines().filter(|line| line.trim_start().starts_with("error")).count();
+        let steers = |c: char| ('\u{200b}'..'\u{2070}').contains(&c) && !"–—‘’“”…".contains(c);
+        assert!(errors == 1 && !said.contains(steers), "{args:?}: {said:?}");
     }
 }

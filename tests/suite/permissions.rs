@@ -47,14 +47,17 @@ fn checkpoints_that_may_not_be_read_are_not_taken_for_none() {
     let folder = place.path();
     succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
     let checkpoints = folder.join("run/checkpoints");
-    set_mode(&checkpoints, 0o000);
-    for args in [
-        ["play", "--headless", "--ckpt", "run"],
-        ["export", "--out=policy.onnx", "--ckpt", "run"],
-        ["train", "--quiet", "--resume", "run"],
-        ["train", "--quiet", "--fork", "run"],
-    ] {
-        refused_to_a_user(folder, &args, "cannot read run/checkpoints: Permission denied");
+    // Neither listed nor entered, or only listed, or only entered.
+    for mode in [0o000, 0o444, 0o111] {
+        set_mode(&checkpoints, mode);
+        for args in [
+            ["play", "--headless", "--ckpt", "run"],
+            ["export", "--out=policy.onnx", "--ckpt", "run"],
+            ["train", "--quiet", "--resume", "run"],
+            ["train", "--quiet", "--fork", "run"],
+        ] {
+            refused_to_a_user(folder, &args, "cannot read run/checkpoints: Permission denied");
+        }
     }
     set_mode(&checkpoints, 0o755);
 }

@@ -1,0 +1,55 @@
+//! Which files a scene reads.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::ensure;
+
+use crate::os::read_bytes_if;
+
+/// Returns the files that a scene may read: its own, those that it includes, meshes, textures, height fields. Each is looked for in
+/// every folder that the scene names, so that some may be none of its files.
+pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
+    let folder_of = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
+    let top = folder_of(scene);
+    let (mut files, mut folders, mut names) = (vec![scene.to_owned()], BTreeSet::new(), BTreeSet::new());
+    let mut known = BTreeSet::from([scene.to_owned()]);
+    let mut done = 0;
+    while done < files.len() {
+        let text = xml(&files[done]);
+        let attributes = attributes(&text).collect::<Vec<_>>();
+        folders.extend((!attributes.is_empty()).then(|| folder_of(&files[done])));
+        done += 1;
+        for (name, value) in attributes {
+            if name.ends_with("dir") {
+                folders.insert(top.join(value));
+            } else if name.starts_with("file") {
+                names.insert(PathBuf::from(value));
+                // With `strippath`, only the last part counts.
+                names.extend(Path::new(value).file_name().map(PathBuf::from));
+            }
+        }
+        let found = folders.iter().flat_map(|folder| names.iter().map(|name| folder.join(name)));
+        let found: Vec<PathBuf> = found.filter(|path| !known.contains(path) && path.is_file()).collect();
+        known.extend(found.iter().cloned());
+        files.extend(found);
+    }
+    files
+}
+
+/// Returns the text of a file that begins as XML does; of another, nothing.
+fn xml(path: &Path) -> String {
+    let begins = |start: &[u8]| Ok(ensure!(start.trim_ascii_start().starts_with(b"<")));
+    let bytes = read_bytes_if(path, begins).unwrap_or_default();
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
+/// Returns the names and values of all attributes.
+fn attributes(text: &str) -> impl Iterator<Item = (&str, &str)> {
+    text.match_indices('=').filter_map(|(at, _)| {
+        let name = text[..at].trim_end().rsplit(|c: char| !c.is_alphanumeric()).next()?;
+        let value = text[at + 1..].trim_start();
+        let quote = value.chars().next().filter(|c| "\"'".contains(*c))?;
+        Some((name, value[1..].split(quote).next()?))
+    })
+}
