@@ -133,6 +133,18 @@ pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     Ok(())
 }
 
+/// Checks the value that the policy gives to the start of an episode of this task, which only a training needs. Its square must be
+/// finite, too: learning minimises squares.
+///
+/// # Errors
+/// Fails if the value is not finite.
+pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
+    let (player, policy, mut value) = (Player::new(task, Episodes::scored(0, 1)), policy.freeze(), [0.0_f32]);
+    policy.values(&player.observation, &mut value, &mut policy.workspace(1));
+    ensure!((value[0] * value[0]).is_finite(), "the values of the policy are not finite");
+    Ok(())
+}
+
 impl Trial<'_> {
     /// Plays the episodes and returns them in order, or `None` if they were interrupted. The observer sees the steps of one
     /// episode in order, interleaved with those of others.

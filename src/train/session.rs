@@ -12,12 +12,12 @@ use super::start::{Plan, Takes};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::evaluate::expect_finite_actions;
+use crate::evaluate::{expect_finite_actions, expect_finite_values};
 use crate::os;
 use crate::ppo::{Checkpoint, Evaluation};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
-use crate::run::RunFolder;
+use crate::run::{self, RunFolder};
 #[cfg(feature = "video")]
 use crate::see::EpisodeFilms;
 
@@ -54,6 +54,9 @@ impl Session {
     /// # Errors
     /// Fails as [`Plan::of`] and [`Session::new`] do, or if the run folder cannot be created.
     pub(super) fn lead(args: &TrainArgs, exchange: &Exchange) -> Result<(Self, Saver)> {
+        if let (Some(folder), Some(init)) = (&args.run_dir, &args.init) {
+            run::expect_other_policy(folder, init)?;
+        }
         let (mut plan, existing) = Plan::of(args)?;
         let loaded = plan.load_task()?;
         let exchange = exchange.clone().over(plan.config.shards())?;
@@ -115,7 +118,8 @@ impl Session {
         let agent = &mut self.agent;
         if let Takes::Policy = takes {
             agent.ppo.begin_with(&checkpoint)?;
-            return expect_finite_actions(&self.task, agent.ppo.policy());
+            expect_finite_actions(&self.task, agent.ppo.policy())?;
+            return expect_finite_values(&self.task, agent.ppo.policy());
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {
