@@ -162,9 +162,6 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     }
 }
 
-/// The most characters of an unknown name that a message shows.
-const LONGEST_SHOWN: usize = 64;
-
 fn unknown(name: &str) -> String {
     // Within a section that is known, or a ramp, only what belongs there is suggested.
     let (whole, last) = name.rsplit_once('.').unwrap_or(("", name));
@@ -179,8 +176,7 @@ fn unknown(name: &str) -> String {
     let nearest = near.or(holds);
     let hint = nearest.map(|nearest| format!("did you mean {nearest}?"));
     let hint = hint.unwrap_or_else(|| "configs/repose.toml lists all of them".into());
-    let cut = if name.len() > LONGEST_SHOWN { "…" } else { "" };
-    format!("{}{cut}: unknown key; {hint}", name.chars().take(LONGEST_SHOWN).collect::<String>())
+    format!("{}: unknown key; {hint}", shortened(name))
 }
 
 #[cfg(test)]

@@ -49,6 +49,13 @@ const LONGEST_DELAY: u32 = 1000;
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
 const FARTHEST: f64 = 100.0;
 
+/// The most bytes of a path, and of a name in it, that the system takes.
+const LONGEST_PATH: usize = 4095;
+const LONGEST_NAME: usize = 255;
+
+/// The least and the largest magnitude of a value that is not 0: much of what is computed from them is computed in `f32`.
+const IN_F32: [f64; 2] = [1e-37, 1e38];
+
 /// Returns every rule that the values break, as "key = value: must …".
 pub(super) fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
@@ -61,10 +68,15 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
     }
     let limited = ["env.", "training.", "randomization."];
-    for (key, value) in settings(&table).filter(|(key, _)| limited.iter().any(|section| key.starts_with(section))) {
-        let too_large = floats(value).into_iter().find(|x| x.abs() > LARGEST);
-        if let Some(x) = too_large.filter(|_| key != "training.hold") {
-            rules.check(false, &key, brief(x), &format!("be at most {LARGEST} in magnitude"));
+    let [least, most] = IN_F32;
+    for (key, value) in settings(&table).filter(|(key, _)| key != "training.hold") {
+        let most = if limited.iter().any(|section| key.starts_with(section)) { LARGEST } else { most };
+        let values = floats(value);
+        if let Some(&x) = values.iter().find(|x| x.abs() > most) {
+            rules.check(false, &key, brief(x), &format!("be at most {} in magnitude", brief(most)));
+        }
+        if let Some(&x) = values.iter().find(|x| **x != 0.0 && x.abs() < least) {
+            rules.check(false, &key, brief(x), &format!("be 0, or at least {least:e} in magnitude"));
         }
     }
     env(config, &mut rules);
@@ -90,7 +102,10 @@ fn env(config: &Config, rules: &mut Rules) {
     let near = place.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
     rules.check(near, "env.goal_position", format!("{place:?}"), &rule);
-    rules.check(!env.model.is_empty(), "env.model", &env.model, "be a path or \"builtin\"");
+    let names = |path: &str| path.split('/').all(|name| name.len() <= LONGEST_NAME);
+    let is_path =
+        |path: &str| (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control);
+    rules.check(is_path(&env.model), "env.model", &env.model, "be a path or \"builtin\"");
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     let rule = format!("be a whole multiple of env.sim_dt = {}, at most 10000 times it", env.sim_dt);

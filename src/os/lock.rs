@@ -15,7 +15,7 @@ use anyhow::{Context, Result, bail, ensure};
 use super::file::{Cannot, expect_named};
 use super::machine::Machine;
 use super::output::Unfinished;
-use super::say;
+use super::{say, shortened};
 
 /// The name of the lock file.
 pub const LOCK: &str = "run.lock";
@@ -145,7 +145,7 @@ impl Drop for Renewal {
 fn holder(path: &Path) -> String {
     let mut holder = String::new();
     let _ = File::open(path).and_then(|file| file.take(100).read_to_string(&mut holder));
-    holder
+    shortened(&holder)
 }
 
 /// Returns the name of this program, as lock files are signed with it.

@@ -71,12 +71,13 @@ fn sources(folder: &Path) -> Vec<(String, String)> {
 /// The id of the running process, or 0. It leads its own process group, since python3 may be a script that starts another one.
 static AT_WORK: AtomicU32 = AtomicU32::new(0);
 
-/// Kills the running processes, if any: they would keep writing to their folder after this program has ended.
+/// Kills the running processes, if any: they would keep writing to their folder after this program has ended. `kill` is built into
+/// the shell, so that no file of this name is looked for.
 #[allow(dead_code)]
 pub(crate) fn stop() {
     let id = AT_WORK.load(Ordering::Relaxed);
     if id != 0 {
-        let _ = Command::new("kill").args(["-KILL", "--", &format!("-{id}")]).status();
+        let _ = Command::new("/bin/sh").args(["-c", &format!("kill -KILL -{id}")]).env_clear().status();
     }
 }
 
@@ -111,6 +112,14 @@ fn run(command: &mut Command) -> Result<String, String> {
         return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let lines: Vec<&str> = said.lines().filter(|l| !l.trim().is_empty()).collect();
-    Err(format!("python3 failed: {}", lines[lines.len().saturating_sub(3)..].join(" / ")))
+    let lines: Vec<String> = said.lines().filter(|line| !line.trim().is_empty()).map(shortened).collect();
+    let status = output.status.to_string();
+    let last = if lines.is_empty() { status } else { lines[lines.len().saturating_sub(3)..].join(" / ") };
+    Err(format!("python3 failed: {last}"))
+}
+
+/// Returns at most 100 characters of a line.
+fn shortened(line: &str) -> String {
+    let start: String = line.chars().take(100).collect();
+    if start.len() < line.len() { format!("{start}…") } else { start }
 }

@@ -41,13 +41,19 @@ pub fn speak_as(name: &str) {
     let _ = SPEAKER.set(format!("{name}: "));
 }
 
-/// Prints a line to stderr. Control characters are escaped, since the line may quote an untrusted file.
+/// Whether a character steers the terminal, is not seen, or changes the direction or the lines of the text around it.
+fn is_steering(c: char) -> bool {
+    let unseen = matches!(c, '\u{ad}' | '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}');
+    c.is_control() || unseen || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
+}
+
+/// Prints a line to stderr. Characters that steer the terminal are escaped, since the line may quote an untrusted file.
 pub fn say(line: &str) {
     let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
     for c in line.chars() {
         match c {
             '\n' | '\t' => harmless.push(c),
-            c if c.is_control() => harmless.extend(c.escape_default()),
+            c if is_steering(c) => harmless.extend(c.escape_unicode()),
             c => harmless.push(c),
         }
     }

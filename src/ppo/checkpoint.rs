@@ -4,7 +4,7 @@
 //!
 //! Reading is strict: the arrays must be exactly those that the configuration describes, with the same shapes.
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 
 use super::format::{Array, Content};
 use super::parameters::{Layout, View};
@@ -69,7 +69,9 @@ impl Checkpoint {
         let config = text("config")?;
         let long = config.len();
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
-        let progress = serde_json::from_str(&text("progress")?).context("its metadata `progress`")?;
+        let progress = serde_json::from_str(&text("progress")?);
+        let progress =
+            progress.map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
         let [provenance, scene, hand] = [PROVENANCE, SCENE, HAND].map(|key| content.texts.remove(key));
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata has an unknown `{}`", shortened(key));
@@ -168,7 +170,8 @@ impl Checkpoint {
 
     fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
         let found = self.shape(name).with_context(|| format!("tensor `{name}` is missing"))?;
-        ensure!(found == shape, "tensor `{name}` has the shape {found:?}, expected {shape:?}");
+        let [said, expected] = [found, shape].map(|sizes| shortened(&format!("{sizes:?}")));
+        ensure!(found == shape, "tensor `{name}` has the shape {said}, expected {expected}");
         Ok(())
     }
 

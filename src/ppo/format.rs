@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 
 use anyhow::{Context, Result, bail, ensure};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 
 use crate::os::shortened;
 
@@ -122,7 +122,10 @@ type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
 
 fn read(bytes: &[u8]) -> Result<Raw<'_>> {
     expect_safetensors(bytes)?;
-    let whole = |error| Damaged(format!("not a complete safetensors file ({error}); it may be cut off"));
+    let whole = |error: SafeTensorError| {
+        let reason = shortened(&error.to_string());
+        Damaged(format!("not a complete safetensors file ({reason}); it may be cut off"))
+    };
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
     let texts = header.metadata().clone().context("no metadata: not a file of this program")?;
     let mut views = SafeTensors::deserialize(bytes).map_err(whole)?.tensors();

@@ -253,20 +253,37 @@ fn usage_errors_exit_with_2() {
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
-#[test]
-fn a_policy_whose_actions_overflow_is_named_as_such_by_every_command() {
-    let place = tempfile::tempdir().unwrap();
-    let folder = place.path();
+/// Writes a copy of the built-in policy in which the weights of this tensor overflow.
+fn write_overflowing(tensor: &str, path: &Path) {
     let bytes = include_bytes!("../../assets/policies/repose.safetensors");
     let header = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
     let facts: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).unwrap();
-    let offset = |i: usize| 8 + header + facts["actor.0.weight"]["data_offsets"][i].as_u64().unwrap() as usize;
+    let offset = |i: usize| 8 + header + facts[tensor]["data_offsets"][i].as_u64().unwrap() as usize;
     let mut bytes = bytes.to_vec();
     for (i, weight) in bytes[offset(0)..offset(1)].chunks_exact_mut(4).enumerate() {
         let large = if i % 2 == 0 { 3e38_f32 } else { -3e38 };
         weight.copy_from_slice(&large.to_le_bytes());
     }
-    fs::write(folder.join("p.safetensors"), shadow_repose::ppo::sealed(&bytes).unwrap()).unwrap();
+    fs::write(path, shadow_repose::ppo::sealed(&bytes).unwrap()).unwrap();
+}
+
+#[test]
+fn a_policy_whose_values_overflow_is_refused_where_training_begins_with_it() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    write_overflowing("critic.0.weight", &folder.join("p.safetensors"));
+    let init = ["--init", "p.safetensors", "--run-dir", "run", "--set", "ppo.hidden=[512,256,128]"];
+    refused(folder, &train(&init), 1, &["the values of the policy are not finite"]);
+    assert_eq!(names(folder), ["p.safetensors"]);
+    // Playing needs no values.
+    succeeded(program(folder, &["play", "--ckpt", "p.safetensors", "--headless", "--episodes", "1"]));
+}
+
+#[test]
+fn a_policy_whose_actions_overflow_is_named_as_such_by_every_command() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    write_overflowing("actor.0.weight", &folder.join("p.safetensors"));
     for args in [
         &["play", "--ckpt", "p.safetensors", "--headless", "--episodes", "2"][..],
         &["export", "--ckpt", "p.safetensors"],
@@ -314,4 +331,83 @@ fn what_comes_from_a_foreign_file_is_quoted_in_a_hundred_characters() {
         let said = stderr(&output);
         assert!(output.status.code() == Some(1) && said.len() < 1000, "{} bytes", said.len());
     }
+}
+
+#[test]
+fn the_policy_that_a_training_begins_with_is_not_replaced_by_its_own() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    fs::create_dir(folder.join("half")).unwrap();
+    fs::copy(folder.join("run/policy.safetensors"), folder.join("half/policy.safetensors")).unwrap();
+    fs::write(folder.join("half/run.lock"), "").unwrap();
+    std::os::unix::fs::symlink("half/policy.safetensors", folder.join("link")).unwrap();
+    for init in ["half/policy.safetensors", "link"] {
+        let args = train(&["--init", init, "--run-dir", "half", "--total-steps", "128"]);
+        refused(folder, &args, 1, &["half/policy.safetensors: would replace the policy that --init reads"]);
+    }
+    assert_eq!(names(&folder.join("half")), ["policy.safetensors", "run.lock"]);
+    succeeded(program(folder, &train(&["--init", "run", "--run-dir", "half", "--total-steps", "128"])));
+}
+
+#[test]
+fn numbers_that_the_learner_would_take_for_0_or_infinity_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for (set, told) in [
+        ("ppo.std=1e-320", "ppo.std = "),
+        ("ppo.std.to=1e-50", "ppo.std = "),
+        ("ppo.clip=1e-320", "ppo.clip = "),
+        ("ppo.reward_scale=1e-60", "ppo.reward_scale = "),
+        ("ppo.learning_rate_range=[1e-90,1]", "ppo.learning_rate_range = "),
+        ("training.hold_reward=1e-60", "training.hold_reward = "),
+        ("env.rot_reward_scale=-1e-60", "env.rot_reward_scale = "),
+        ("env.noise.joint_pos=1e-60", "env.noise = "),
+    ] {
+        refused(folder.path(), &["train", "--set", set], 1, &[told, "must be 0, or at least 1e-37 in magnitude"]);
+    }
+    let told = "ppo.away_std = 1e308: must be at most 1e38 in magnitude";
+    refused(folder.path(), &["train", "--set", "ppo.away_std=1e308"], 1, &[told]);
+    assert_eq!(names(folder.path()), [""; 0]);
+}
+
+#[test]
+fn what_a_policy_or_a_scene_says_is_cut_to_a_hundred_characters() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = place.path();
+    let long = "9".repeat(50_000);
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let good = Checkpoint::parse(&fs::read(folder.join("run/policy.safetensors")).unwrap()).unwrap();
+    let mut odd = vec![good.clone(), good.clone()];
+    odd[0].insert("actor.0.weight", Array::F32(vec![1; 50_000], vec![0.0]));
+    odd[1].config = good.config.replace("model = \"builtin\"", &format!("model = \"{long}\""));
+    let mut files: Vec<Vec<u8>> = odd.iter().map(|odd| odd.to_bytes().unwrap()).collect();
+    let bytes = good.to_bytes().unwrap();
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    let mut texts = header.metadata().clone().unwrap();
+    texts.insert("progress".into(), format!("{{\"{long}\": 1}}"));
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap().tensors();
+    files.push(shadow_repose::ppo::sealed(&safetensors::serialize(tensors, Some(texts)).unwrap()).unwrap());
+    let brief = |args: &[&str], told: &str| {
+        let output = program(folder, args);
+        let said = stderr(&output);
+        assert!(
+            output.status.code() == Some(1) && said.len() < 700 && said.contains(told),
+            "{told}: {} bytes",
+            said.len()
+        );
+    };
+    for (bytes, told) in files.iter().zip(["has the shape [1, 1", "env.model = 999", "`progress`: unknown field `999"])
+    {
+        fs::write(folder.join("p.safetensors"), bytes).unwrap();
+        brief(&["play", "--ckpt", "p.safetensors", "--headless"], told);
+    }
+    fs::write(folder.join("own.toml"), format!("[env]\nmodel = \"{long}\"\n")).unwrap();
+    brief(&["train", "--config", "own.toml"], "env.model = 999");
+    let named = format!("env.model={}.xml", "9".repeat(250));
+    let scene =
+        crate::support::SCENE.replacen("name=\"cube\" type=\"box\"", &format!("name=\"{long}\" type=\"box\""), 1);
+    fs::write(folder.join("s.xml"), scene.replacen("friction=\"1.2\"", "friction=\"nan\"", 1)).unwrap();
+    brief(&["play", "--policy", "zero", "--set", "env.model=s.xml", "--headless"], "s.xml: geom_friction of geom `999");
+    // The path that a user names stays whole.
+    brief(&["play", "--policy", "zero", "--set", &named, "--headless"], &named[10..]);
 }

@@ -3,10 +3,18 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
 
 use shadow_repose::sim::mesh_files;
 
 use crate::support::{command, names, stderr};
+
+/// Writes an executable script.
+fn write_script(path: &Path, text: &str) {
+    fs::write(path, format!("#!/bin/sh\n{text}\n")).unwrap();
+    fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
+}
 
 /// Draws a picture, for which the meshes are fetched, and returns what the program says. What the folder and the variables contain
 /// is hostile.
@@ -93,4 +101,49 @@ fn damaged_meshes_are_fetched_again_and_where_that_fails_the_folder_to_delete_is
     assert!(said.contains("fetching the meshes") && said.contains("python3 could not be started"), "{said}");
     let advice = format!("the meshes in {} are damaged; deleting this folder may help", meshes.display());
     assert!(said.contains(&advice), "{said}");
+}
+
+#[test]
+fn what_python_says_is_cut_and_where_it_says_nothing_its_status_is_told() {
+    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let path = format!("{}:{}", place.path().display(), std::env::var("PATH").unwrap());
+    for (script, told) in [
+        ("head -c 1000000 /dev/zero | tr '\\0' x >&2; exit 1", "python3 failed: xxx"),
+        ("for i in 1 2 3; do head -c 100000 /dev/zero | tr '\\0' $i >&2; echo >&2; done; exit 1", " / 333"),
+        ("exit 3", "python3 failed: exit status: 3"),
+    ] {
+        write_script(&place.path().join("python3"), script);
+        let said = draw(place.path(), cache.path(), &[("PATH", &path)]);
+        assert!(said.len() < 1500 && said.contains(told), "{script}: {} bytes", said.len());
+    }
+}
+
+#[test]
+fn a_signal_ends_python_without_executing_a_file_named_kill() {
+    let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let (folder, log) = (place.path(), cache.path().join("log"));
+    write_script(&folder.join("kill"), "touch PWNED");
+    fs::create_dir(folder.join("bin")).unwrap();
+    write_script(
+        &folder.join("bin/python3"),
+        &format!("echo $$ > '{0}.new'; mv '{0}.new' '{0}'; exec sleep 100", log.display()),
+    );
+    let path = format!(".:{}:{}", folder.join("bin").display(), std::env::var("PATH").unwrap());
+    let args = ["view", "--screenshot", "hand.png", "--size", "64x64", "--quality", "fast"];
+    let mut child = command(folder, &args).env("XDG_CACHE_HOME", cache.path()).env("PATH", path).spawn().unwrap();
+    let begun = Instant::now();
+    let within = |time: u64| begun.elapsed() < Duration::from_secs(time);
+    while !log.exists() && within(60) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let id = fs::read_to_string(&log).unwrap();
+    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    assert!(!child.wait().unwrap().success());
+    // Dead, or waiting for whoever adopted it to notice.
+    let status = || fs::read_to_string(format!("/proc/{}/status", id.trim())).unwrap_or_default();
+    let runs = || !status().is_empty() && !status().contains("State:\tZ");
+    while runs() && within(70) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(!runs() && !folder.join("PWNED").exists(), "{}", status());
 }
