@@ -135,7 +135,8 @@ fn parse_error(file: &Path) -> Option<String> {
 }
 
 fn refused(error: impl Display) -> Error {
-    anyhow!("MuJoCo refuses this scene: {error}")
+    // A name in the scene may have several lines.
+    anyhow!("MuJoCo refuses this scene: {}", error.to_string().replace('\n', "\n  "))
 }
 
 /// Returns the name of a scene's file, for messages.

@@ -10,8 +10,16 @@ macro_rules! arrays {
     ($model:ident[$geom:ident]: $($array:ident)*) => { &[$(&$model.$array()[$geom]),*] };
 }
 
+/// Lists those of these arrays of a model in which something differs from MuJoCo's default.
+macro_rules! unusual {
+    ($model:ident: $($array:ident $default:expr),*) => {
+        [$((stringify!($array), $model.$array().iter().any(|x| *x != $default).then(|| format!("{:?}", $model.$array())))),*]
+    };
+}
+
 /// Returns a checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
-/// nothing are left out, and so are sensors, keyframes and plugins.
+/// nothing are left out, and so are sensors, keyframes and plugins. What version 0.3 did not take counts only where it is unusual,
+/// so that the checksum of other scenes stays.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| parts.iter().for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()));
@@ -23,7 +31,8 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         dof_armature dof_damping dof_frictionloss dof_solref dof_solimp
     });
     for geom in 0..model.ngeom() as usize {
-        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 {
+        let is_paired = model.pair_geom1().iter().chain(model.pair_geom2()).any(|&paired| paired as usize == geom);
+        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 && !is_paired {
             continue;
         }
         take(arrays! { model[geom]:
@@ -34,6 +43,10 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
             let mesh = model.geom_dataid()[geom] as usize;
             let (first, count) = (model.mesh_vertadr()[mesh] as usize, model.mesh_vertnum()[mesh] as usize);
             take(&[&&model.mesh_vert()[first..first + count]]);
+        } else if model.geom_type()[geom] == MjtGeomBase::mjGEOM_HFIELD {
+            let field = model.geom_dataid()[geom] as usize;
+            let (first, count) = (model.hfield_adr()[field], model.hfield_nrow()[field] * model.hfield_ncol()[field]);
+            take(&[&model.hfield_size()[field], &&model.hfield_data()[first as usize..(first + count) as usize]]);
         }
     }
     take(arrays! { model:
@@ -46,6 +59,16 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         eq_type eq_obj1id eq_obj2id eq_active0 eq_data eq_solref eq_solimp exclude_signature
         pair_signature pair_dim pair_friction pair_solref pair_margin pair_gap
     });
+    let (none, solref, solimp) = ([0.0; 2], [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]);
+    let unusual = unusual! { model:
+        actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
+        tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,
+        tendon_solref_fri solref, tendon_solimp_fri solimp, tendon_margin 0.0, tendon_actfrclimited false,
+        pair_solimp solimp, pair_solreffriction none
+    };
+    for (name, array) in unusual {
+        array.into_iter().for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
+    }
     format!("{:08x}", hasher.finalize())
 }
 

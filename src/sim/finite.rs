@@ -6,6 +6,8 @@ use anyhow::{Context, Result, anyhow};
 use mujoco_rs::prelude::{MjModel, MjtObjBase};
 use tempfile::NamedTempFile;
 
+use crate::os::shortened;
+
 /// Returns a description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
 /// prints every array of a model, so that none is forgotten here.
 ///
@@ -19,13 +21,26 @@ pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let mut text = Vec::new();
     file.reopen().and_then(|mut file| file.read_to_end(&mut text)).context(context)?;
     let found = first_in(&String::from_utf8_lossy(&text));
-    Ok(found.map(|(quantity, object)| {
+    let found = found.map(|(quantity, object)| {
         // A degree of freedom has no name, but it belongs to a joint that may have one.
         let of_joint = object.strip_prefix("DOF ").and_then(|dof| model.dof_jntid().get(dof.parse::<usize>().ok()?));
         let joint = of_joint.and_then(|&joint| model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint as usize));
-        let object = joint.map_or(object, |name| format!("joint `{name}`"));
+        let object = joint.map_or(object, |name| format!("joint `{}`", shortened(name)));
         if object.is_empty() { quantity } else { format!("{quantity} of {object}") }
-    }))
+    });
+    Ok(found.or_else(|| first_in_assets(model)))
+}
+
+/// Returns the same for the arrays that MuJoCo does not print.
+fn first_in_assets(model: &MjModel) -> Option<String> {
+    let of = |starts: &[i32], at: usize| starts.iter().rposition(|&start| start as usize <= at).unwrap_or_default();
+    let height = model.hfield_data().iter().position(|x| !x.is_finite());
+    let height = height.map(|at| ("hfield_data", "hfield", MjtObjBase::mjOBJ_HFIELD, of(model.hfield_adr(), at)));
+    let vertex = model.mesh_vert().iter().position(|vertex| !vertex.iter().all(|x| x.is_finite()));
+    let vertex = vertex.map(|at| ("mesh_vert", "mesh", MjtObjBase::mjOBJ_MESH, of(model.mesh_vertadr(), at)));
+    let (quantity, kind, object, id) = height.or(vertex)?;
+    let name = model.id_to_name(object, id).unwrap_or_default();
+    Some(format!("{quantity} of {kind} `{}`", shortened(name)))
 }
 
 /// What MuJoCo computes when it compiles a model, besides what has a name that ends with 0.
@@ -44,7 +59,7 @@ fn first_in(text: &str) -> Option<(String, String)> {
             name = Some(named.trim());
         } else if heading != "STATISTIC" && odd() {
             let kind = heading.split(' ').next().unwrap_or_default().to_lowercase();
-            let object = name.map_or(heading.to_owned(), |name| format!("{kind} `{name}`"));
+            let object = name.map_or(heading.to_owned(), |name| format!("{kind} `{}`", shortened(name)));
             if indented && !first.ends_with('0') && !DERIVED.contains(&first) {
                 return Some((first.to_owned(), object));
             }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
 use mujoco_rs::prelude::{
-    MjModel, MjtBias, MjtDyn, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn, MjtWrap,
+    MjModel, MjtBias, MjtDisableBit, MjtDyn, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn,
+    MjtWrap,
 };
 
 use super::Look;
@@ -14,6 +15,14 @@ use super::fatal::quieten_mujoco;
 use super::fingerprint::fingerprint;
 use super::finite::not_finite;
 use super::furnish::furnished;
+use crate::os::shortened;
+
+/// What a scene may not disable: nothing could be held without it.
+const NEEDED: [(&str, MjtDisableBit); 3] = [
+    ("constraint", MjtDisableBit::mjDSBL_CONSTRAINT),
+    ("contact", MjtDisableBit::mjDSBL_CONTACT),
+    ("actuation", MjtDisableBit::mjDSBL_ACTUATION),
+];
 
 /// A compiled MuJoCo model that any number of simulations can share.
 #[derive(Clone)]
@@ -125,6 +134,9 @@ impl Scene {
         compilation.set_options(&mut model);
         let halves = model.opt().integrator != MjtIntegrator::mjINT_RK4 as i32;
         ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
+        for (flag, bit) in NEEDED {
+            ensure!(model.opt().disableflags & bit as i32 == 0, "{flag} must not be disabled in its <flag>");
+        }
         let awake = model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 == 0;
         ensure!(awake, "sleep is not part of the state that MuJoCo can save; leave sleep switched off");
         Ok(Self { model: Arc::new(model), own_timestep })
@@ -156,7 +168,7 @@ impl Scene {
     /// Fails if there is no such joint, it is not a hinge, or it has no limits.
     pub fn hinge(&self, name: &str) -> Result<Hinge> {
         let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
-        let kind = self.model.jnt_type()[id];
+        let (name, kind) = (shortened(name), self.model.jnt_type()[id]);
         ensure!(kind == MjtJoint::mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
         ensure!(self.model.jnt_limited()[id], "joint `{name}` must have a range");
         Ok(Hinge {
@@ -174,7 +186,7 @@ impl Scene {
         let body = self.body(name)?;
         let joint = usize::try_from(self.model.body_jntadr()[body.0]).ok();
         let free = joint.filter(|&j| self.model.jnt_type()[j] == MjtJoint::mjJNT_FREE);
-        let joint = free.with_context(|| format!("body `{name}` must have a free joint"))?;
+        let joint = free.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
         let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
         Ok(FreeJoint { body, qpos, dof })
     }
@@ -247,7 +259,7 @@ impl Scene {
     pub fn mocap(&self, name: &str) -> Result<Mocap> {
         let Body(body) = self.body(name)?;
         let id = usize::try_from(self.model.body_mocapid()[body]).ok();
-        Ok(Mocap(id.with_context(|| format!("body `{name}` must have mocap=\"true\""))?))
+        Ok(Mocap(id.with_context(|| format!("body `{}` must have mocap=\"true\"", shortened(name)))?))
     }
 
     /// Finds the actuator `name`, which must be a position servo with one limited control that moves a joint or a tendon.
@@ -256,8 +268,11 @@ impl Scene {
     /// Fails if there is no such actuator, or if it is of another kind.
     pub fn servo(&self, name: &str) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
+        let (name, group) = (shortened(name), self.model.actuator_group()[id]);
         let is_servo = self.is_position_servo(id);
         ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
+        let is_disabled = (0..31).contains(&group) && self.model.opt().disableactuator >> group & 1 == 1;
+        ensure!(!is_disabled, "actuator `{name}` must not be disabled by its group {group}");
         let moves = matches!(self.model.actuator_trntype()[id], MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_TENDON);
         ensure!(moves, "actuator `{name}` must drive a joint or a tendon");
         let is_angle = self.model.actuator_gear()[id][0] == 1.0;
@@ -299,7 +314,7 @@ impl Scene {
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
-        self.model.name_to_id(kind, name).with_context(|| format!("has no {what} `{name}`"))
+        self.model.name_to_id(kind, name).with_context(|| format!("has no {what} `{}`", shortened(name)))
     }
 
     /// Returns whether the force is kp · (control - length), with or without damping.
@@ -308,6 +323,6 @@ impl Scene {
         self.model.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
             && self.model.actuator_biastype()[id] == MjtBias::mjBIAS_AFFINE
             && kp > 0.0
-            && self.model.actuator_biasprm()[id][1] == -kp
+            && self.model.actuator_biasprm()[id][..2] == [0.0, -kp]
     }
 }

@@ -7,6 +7,7 @@ use mujoco_rs::prelude::{MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
 use serde::{Deserialize, Serialize};
 
 use super::Scene;
+use crate::os::shortened;
 
 /// The names of what a task uses in a scene. What is empty is found by structure.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -81,7 +82,8 @@ impl Scene {
                 (true, [Err(problem)]) => problems.push(problem.clone()),
                 (true, []) => problems.extend(none.map(str::to_owned)),
                 (true, several) => {
-                    let names: Vec<String> = several.iter().flatten().map(|name| format!("`{name}`")).collect();
+                    let names: Vec<String> =
+                        several.iter().flatten().map(|name| format!("`{}`", shortened(name))).collect();
                     problems.push(format!("has several {what}, {}: name one by {setting}", names.join(", ")));
                 }
             }

@@ -14,6 +14,7 @@ mod experiment;
 mod export;
 #[cfg(feature = "video")]
 mod fetching;
+mod foreign_scene;
 mod fork;
 mod goal_times;
 mod mpi;

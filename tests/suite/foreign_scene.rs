@@ -1,0 +1,95 @@
+//! Scenes of users with what MuJoCo accepts and the task does not.
+
+use std::fs;
+
+use shadow_repose::repose::Task;
+use shadow_repose::sim::{Compilation, Cone, Parts, Scene};
+
+use crate::support::{SCENE, env_config};
+
+/// Returns the built-in scene with these texts replaced.
+#[track_caller]
+fn edited(edits: &[(&str, &str)]) -> String {
+    edits.iter().fold(SCENE.to_owned(), |text, (from, to)| {
+        assert!(text.contains(from), "{from}");
+        text.replacen(from, to, 1)
+    })
+}
+
+/// Fails unless the scene with these texts replaced is refused with this part of a message.
+#[track_caller]
+fn refused(edits: &[(&str, &str)], part: &str) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.xml");
+    fs::write(&path, edited(edits)).unwrap();
+    let model = format!("env.model={}", path.display());
+    let message = Task::new(&env_config(&[&model]), &Parts::default()).err().map(|error| format!("{error:#}"));
+    assert!(message.as_ref().is_some_and(|message| message.contains(part)), "{part}: {message:?}");
+}
+
+const SERVO: &str = "<position name=\"rh_A_FFJ3\" class=\"hand\" joint=\"rh_FFJ3\"/>";
+
+#[test]
+fn a_height_that_is_no_number_is_named() {
+    let field =
+        "<asset><hfield name=\"hills\" nrow=\"3\" ncol=\"3\" size=\"1 1 .1 .1\" elevation=\"0 0 0 0 nan 0 0 0 1\"/>";
+    let geom = "<worldbody><geom type=\"hfield\" hfield=\"hills\" pos=\"0 0 -1\"/>";
+    refused(&[("<asset>", field), ("<worldbody>", geom)], "hfield_data of hfield `hills` is not a finite number");
+}
+
+#[test]
+fn a_servo_with_a_constant_force_is_none() {
+    // MuJoCo itself takes a positive third number for a damping ratio.
+    let servo = "<general name=\"rh_A_FFJ3\" joint=\"rh_FFJ3\" ctrlrange=\"-.2 1.5\" gaintype=\"fixed\" gainprm=\"1\" \
+                 biastype=\"affine\" biasprm=\".5 -1 0\"/>";
+    refused(&[(SERVO, servo)], "`rh_A_FFJ3` must be a position servo");
+}
+
+#[test]
+fn servos_and_contacts_that_the_scene_disables_are_named() {
+    let disabled = ("<flag island=\"disable\"/>", "<flag island=\"disable\" actuation=\"disable\"/>");
+    refused(&[disabled], "actuation must not be disabled");
+    for flag in ["contact", "constraint"] {
+        let to = format!("<flag island=\"disable\" {flag}=\"disable\"/>");
+        refused(&[("<flag island=\"disable\"/>", &to)], &format!("{flag} must not be disabled"));
+    }
+    let grouped = SERVO.replace("/>", " group=\"4\"/>");
+    let option = ("<option ", "<option actuatorgroupdisable=\"4\" ");
+    refused(&[(SERVO, &grouped), option], "`rh_A_FFJ3` must not be disabled by its group 4");
+}
+
+#[test]
+fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    let plain = Compilation::plain(0.01, Cone::Scene);
+    let print = |edits: &[(&str, &str)]| {
+        let path = folder.path().join("own.xml");
+        fs::write(&path, edited(edits)).unwrap();
+        Scene::load(Some(&path), &plain).unwrap().fingerprint()
+    };
+    let builtin = Scene::load(None, &plain).unwrap().fingerprint();
+    // Checkpoints of earlier versions hold this one.
+    assert_eq!(builtin, "bdf8dcb5");
+    assert_eq!(print(&[]), builtin);
+    for servo in ["armature=\".01\"", "damping=\".1\""] {
+        let own = SERVO.replace("/>", &format!(" {servo}/>"));
+        assert_ne!(print(&[(SERVO, &own)]), builtin, "{servo}");
+    }
+    for limit in ["solreflimit=\".05 1\"", "solimplimit=\".8 .9 .001\"", "margin=\".1\""] {
+        let tendon = format!("<fixed name=\"rh_FFJ0\" limited=\"true\" range=\"0 3\" {limit}>");
+        let usual = "<fixed name=\"rh_FFJ0\" limited=\"true\" range=\"0 3\">";
+        let from = "<fixed name=\"rh_FFJ0\">";
+        assert_ne!(print(&[(from, &tendon)]), print(&[(from, usual)]), "{limit}");
+    }
+    let ball = |size: &str| {
+        format!("<worldbody><geom name=\"ball\" type=\"sphere\" size=\"{size}\" contype=\"0\" conaffinity=\"0\"/>")
+    };
+    let pair = ("</worldbody>", "</worldbody><contact><pair geom1=\"ball\" geom2=\"cube\"/></contact>");
+    let with = |size: &str, paired: bool| {
+        let ball = ball(size);
+        let edits = [("<worldbody>", &ball[..]), pair];
+        print(&edits[..if paired { 2 } else { 1 }])
+    };
+    assert_eq!(with(".1", false), with(".2", false));
+    assert_ne!(with(".1", true), with(".2", true));
+}
