@@ -16,12 +16,29 @@ pub fn completions(shell: Shell) -> Result<()> {
     let (mut text, mut program) = (Vec::new(), command());
     if shell != Shell::Bash {
         clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
-        return os::print(&String::from_utf8(text)?);
+        let more = if shell == Shell::Fish { after_commands(&program) } else { String::new() };
+        return os::print(&(String::from_utf8(text)? + &more));
     }
     // For a name with a hyphen, clap_complete 4.6 writes a script whose commands have two names, and completes nothing after one.
     clap_complete::generate(shell, &mut program.name("shadow_repose"), "shadow_repose", &mut text);
     let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
     os::print(&text)
+}
+
+/// Returns what clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
+fn after_commands(program: &clap::Command) -> String {
+    let names = |command: &clap::Command| command.get_subcommands().map(|of| of.get_name().to_owned()).collect();
+    let values = |command: &clap::Command| {
+        let values = command.get_positionals().flat_map(clap::Arg::get_possible_values);
+        values.map(|value| value.get_name().to_owned()).collect::<Vec<_>>()
+    };
+    let commands = program.get_subcommands().map(|command| (command.get_name(), values(command)));
+    let commands = commands.chain([("help", names(program))]).filter(|(_, words)| !words.is_empty());
+    let line = |(name, words): (&str, Vec<String>)| {
+        let words = words.join(" ");
+        format!("complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n")
+    };
+    commands.map(line).collect()
 }
 
 /// Prints a manual page of all commands.

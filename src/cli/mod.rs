@@ -302,7 +302,7 @@ pub struct Shot {
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
     pub camera: Option<Camera>,
     /// Rendering quality; high adds shadows, reflections and smooth edges [default: fast for a film, else high]
-    #[arg(long, value_parser = quality, value_name = "fast|high", help_heading = PICTURE)]
+    #[arg(long, value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
     pub quality: Option<Quality>,
     /// Show the primitives used for collisions instead of the hand's meshes
     #[arg(long, help_heading = PICTURE)]

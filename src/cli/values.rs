@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+
 use crate::sim::{Camera, Quality};
 
 /// The largest integer in a TOML file.
@@ -41,12 +43,9 @@ pub(super) fn time(text: &str) -> Result<Duration, String> {
     time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
 }
 
-pub(super) fn quality(text: &str) -> Result<Quality, String> {
-    match text {
-        "fast" => Ok(Quality::Fast),
-        "high" => Ok(Quality::High),
-        _ => Err("must be fast or high".into()),
-    }
+pub(super) fn quality() -> impl TypedValueParser<Value = Quality> {
+    // Shells complete them.
+    PossibleValuesParser::new(["fast", "high"]).map(|text| if text == "fast" { Quality::Fast } else { Quality::High })
 }
 
 pub(super) fn seconds(text: &str) -> Result<f64, String> {

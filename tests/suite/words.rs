@@ -83,6 +83,8 @@ fn shells_complete_options_and_values_after_a_command() {
         (&["play", "--rob"], "--robustness"),
         (&["bench", "--only", "it"], "iteration"),
         (&["completions", "zs"], "zsh"),
+        (&["play", "--quality", "fa"], "fast"),
+        (&["view", "--quality", "hi"], "high"),
         (&["pla"], "play"),
     ];
     for (words, expected) in cases {
@@ -96,6 +98,14 @@ fn shells_complete_options_and_values_after_a_command() {
         let text = format!("source '{fish}'; complete -C 'shadow-repose {line}'");
         if let Some(found) = shell("fish", &["--no-config", "-c", &text]) {
             assert!(found.lines().any(|answer| answer.split('\t').next() == Some(expected)), "fish: {line}: {found}");
+        }
+    }
+    for (line, expected) in [("completions ", "bash elvish fish powershell zsh"), ("help ", &COMMANDS.join(" "))] {
+        let text = format!("source '{fish}'; complete -C 'shadow-repose {line}'");
+        if let Some(found) = shell("fish", &["--no-config", "-c", &text]) {
+            let found: Vec<&str> = found.lines().filter_map(|answer| answer.split('\t').next()).collect();
+            assert!(expected.split(' ').all(|word| found.contains(&word)), "fish: {line}: {found:?}");
+            assert!(found.len() < 10, "no files: {found:?}");
         }
     }
 }
