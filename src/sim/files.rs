@@ -3,9 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use anyhow::ensure;
-
-use crate::os::read_bytes_if;
+use crate::os::read_bytes;
 
 /// Returns the files that a scene may read: its own, those that it includes, meshes, textures, height fields. Each is looked for in
 /// every folder that the scene names, so that some may be none of its files.
@@ -16,7 +14,9 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     let mut known = BTreeSet::from([scene.to_owned()]);
     let mut done = 0;
     while done < files.len() {
-        let text = xml(&files[done]);
+        // What is no XML names no files.
+        let bytes = read_bytes(&files[done]).unwrap_or_default();
+        let text = String::from_utf8_lossy(&bytes);
         let attributes = attributes(&text).collect::<Vec<_>>();
         folders.extend((!attributes.is_empty()).then(|| folder_of(&files[done])));
         done += 1;
@@ -35,13 +35,6 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
         files.extend(found);
     }
     files
-}
-
-/// Returns the text of a file that begins as XML does; of another, nothing.
-fn xml(path: &Path) -> String {
-    let begins = |start: &[u8]| Ok(ensure!(start.trim_ascii_start().starts_with(b"<")));
-    let bytes = read_bytes_if(path, begins).unwrap_or_default();
-    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 /// Returns the names and values of all attributes.

@@ -377,7 +377,7 @@ fn what_a_policy_or_a_scene_says_is_cut_to_a_hundred_characters() {
     let long = "9".repeat(50_000);
     succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
     let good = Checkpoint::parse(&fs::read(folder.join("run/policy.safetensors")).unwrap()).unwrap();
-    let mut odd = vec![good.clone(), good.clone()];
+    let mut odd = [good.clone(), good.clone()];
     odd[0].insert("actor.0.weight", Array::F32(vec![1; 50_000], vec![0.0]));
     odd[1].config = good.config.replace("model = \"builtin\"", &format!("model = \"{long}\""));
     let mut files: Vec<Vec<u8>> = odd.iter().map(|odd| odd.to_bytes().unwrap()).collect();
