@@ -19,6 +19,7 @@ pub const BASE: &str = include_str!("../../configs/repose.toml");
 pub use applicability::expect_used;
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
+pub use rules::FARTHEST;
 pub use settings::{
     Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, NetConfig, OfScene, PpoConfig, Precision,
     RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig,

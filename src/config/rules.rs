@@ -47,7 +47,7 @@ const LARGEST: f64 = 1e9;
 const LONGEST_DELAY: u32 = 1000;
 
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
-const FARTHEST: f64 = 100.0;
+pub const FARTHEST: f64 = 100.0;
 
 /// The most bytes of a path, and of a name in it, that the system takes.
 const LONGEST_PATH: usize = 4095;

@@ -93,7 +93,12 @@ impl Hand {
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
         let actuators = each(&parts.actuators, |actuator| scene.servo(actuator), &mut problems);
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
+        let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
+        for (joint, _) in driven.iter().flatten() {
+            problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
+        }
         if !problems.is_empty() {
+            problems.dedup();
             bail!(problems.join("; "));
         }
         let controls = scene.controls();
@@ -102,7 +107,6 @@ impl Hand {
             "has {controls} controls, but it must have exactly the {} of the hand",
             actuators.len()
         );
-        let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
         let mut roots: Vec<Body> = Vec::new();
         for root in fingertips.iter().map(|&tip| scene.root(scene.body_of(tip))) {
             if !roots.contains(&root) {

@@ -98,7 +98,8 @@ impl Record {
         let is_other_hand = alike(&own[0], &found[0], is_other_side);
         let mut differ = Vec::new();
         for ((what, own), found) in ["joints", "actuators", "fingertips"].into_iter().zip(&own).zip(&found) {
-            if !alike(own, found, is_named) && !(mirrors && alike(own, found, is_other_side)) {
+            let fits = alike(own, found, is_named) || mirrors && alike(own, found, is_other_side);
+            if !fits {
                 let [own, found] = [own, found].map(|names| shortened(&names.join(" ")));
                 differ.push(format!("{what} {found}, not {own}"));
             }

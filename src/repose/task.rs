@@ -8,7 +8,7 @@ use super::mirror::Mirror;
 use super::physics::Physics;
 use super::sensing::NoiseStd;
 use super::{Hand, Record};
-use crate::config::EnvConfig;
+use crate::config::{EnvConfig, FARTHEST};
 use crate::os;
 use crate::quat::CUBE_ROTATIONS;
 use crate::sim::{Compilation, Look, Parts, Scene, origin};
@@ -57,6 +57,8 @@ impl Task {
         let hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
         config.goal_position.settle(hand.place());
+        let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
+        ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);
         for (setting, key, what, found) in [
             (&mut config.num_hand_dofs, "num_hand_dofs", "joints", hand.joints.len()),
             (&mut config.num_actuators, "num_actuators", "actuators", hand.actuators.len()),
@@ -129,8 +131,8 @@ impl Task {
             ));
         }
         notes.push(match place == own {
-            true => format!("the cube starts where {scene} has it: env.goal_position = {place:?}"),
-            false => format!("env.goal_position = {place:?} replaces the place of the cube in {scene}, {own:?}"),
+            true => format!("`{object}` starts where {scene} has it: env.goal_position = {place:?}"),
+            false => format!("env.goal_position = {place:?} replaces the place of `{object}` in {scene}, {own:?}"),
         });
         notes
     }

@@ -21,7 +21,7 @@ pub(super) const DIVERGED: &str = "diverged";
 /// A file with this name asks the training to stop.
 const STOP: &str = "stop";
 /// A file with this name says that the training is not to be continued.
-const FINISHED: &str = "finished";
+pub(super) const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
 const OURS: [&str; 10] =
     [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use super::checkpoints::CHECKPOINTS;
-use super::folder::{CONFIG, DIVERGED, METRICS, POLICY, RunFolder, VERSION};
+use super::folder::{CONFIG, DIVERGED, FINISHED, METRICS, POLICY, RunFolder, VERSION};
 use crate::os::{LOCK, final_path, same_file};
 use crate::sim::scene_files;
 
 /// The names of the files that a run keeps in its folder; a star stands for anything.
-const IN_RUN: [&str; 8] =
-    [CONFIG, VERSION, POLICY, LOCK, METRICS, "metrics.before-*.csv", "events.out.*", ".shadow-repose-*"];
+const IN_RUN: [&str; 9] =
+    [CONFIG, VERSION, POLICY, LOCK, METRICS, FINISHED, "metrics.before-*.csv", "events.out.*", ".shadow-repose-*"];
 
 /// The same for the folders of its checkpoints and of its dumps.
 const INSIDE: [&str; 7] = [

@@ -146,6 +146,7 @@ pub fn origin(file: Option<&Path>) -> String {
 
 /// Adds a mocap body in the shape of the body `name`, where that is, which touches nothing.
 fn add_goal(spec: &mut MjSpec, name: &str, goal: &str) -> Result<()> {
+    ensure!(spec.body_mut(goal).is_none(), "has a body `{goal}` that is no mocap body");
     let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
     let pos = *body.pos();
     let shapes: Vec<_> = body

@@ -343,7 +343,7 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
     });
     let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let own = ["--ckpt", "p.safetensors"];
-    let refused: [(&[&str], &[&str], &str); 14] = [
+    let refused: [(&[&str], &[&str], &str); 15] = [
         (&["export"], &["--ckpt", "p.safetensors", "--out", "p.safetensors"], "is read"),
         (&["export"], &["--ckpt", "p.safetensors", "--out", "./run/../p.safetensors"], "is read"),
         (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "is read"),
@@ -354,6 +354,7 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
         (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "keeps a file"),
         (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "is read"),
         (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "keeps a file"),
+        (&play, &["--trace", "run/finished", "--ckpt", "builtin"], "keeps a file"),
         (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "is read"),
         (&["play", "--robustness", "--out", "hard.svg"], &own, "is read"),
         (&["plot", "table.svg"], &["--out", "table.svg"], "is read"),

@@ -126,6 +126,17 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
         ),
         (&THREE_FINGERS.to_owned(), &["hand.start=flat"], &["has no keyframe `flat`"]),
         (
+            &THREE_FINGERS.replace("axis=\"0 0 1\" range=\"-.4 .4\"", "axis=\"0 0 1\""),
+            &[],
+            &["joint `α turn` must have a range; joint `β turn` must have a range"],
+        ),
+        (&THREE_FINGERS.replace(".245 1 0 0 0", "200 1 0 0 0"), &[], &["`block` starts more than 100 m away"]),
+        (
+            &THREE_FINGERS.replace("</worldbody>", "<body name=\"goal of shadow-repose\"/></worldbody>"),
+            &[],
+            &["has a body `goal of shadow-repose` that is no mocap body"],
+        ),
+        (
             &THREE_FINGERS.to_owned(),
             &["env.num_hand_dofs=24"],
             &["env.num_hand_dofs = 24: the hand of ", "has 9 joints"],

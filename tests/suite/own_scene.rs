@@ -49,10 +49,10 @@ fn the_cube_starts_where_a_users_scene_has_it_unless_the_user_names_a_place() {
     assert_eq!(place, "[1.33,0.0,0.295]", "the policy's file only repeats the default");
     let (place, said) = played(folder, &["--policy", "zero", "--set", MOVED]);
     assert_eq!(place, "[1.33,0.0,0.295]");
-    assert!(said.contains("the cube starts where moved.xml has it: env.goal_position = [1.33, 0.0, 0.295]"), "{said}");
+    assert!(said.contains("`cube` starts where moved.xml has it: env.goal_position = [1.33, 0.0, 0.295]"), "{said}");
     let (place, said) = played(folder, &["--policy", "zero", "--set", MOVED, "--set", DEFAULT_PLACE]);
     assert_eq!(place, "[0.33,0.0,0.295]");
-    assert!(said.contains("replaces the place of the cube in moved.xml, [1.33, 0.0, 0.295]"), "{said}");
+    assert!(said.contains("replaces the place of `cube` in moved.xml, [1.33, 0.0, 0.295]"), "{said}");
     assert_eq!(played(folder, &["--policy", "zero"]).0, "[0.33,0.0,0.295]", "the built-in scene has the default");
 }
 
