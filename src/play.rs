@@ -55,6 +55,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if let (Some(loaded), false) = (&loaded, args.json) {
         os::say(&format!("playing {}", loaded.name));
     }
+    task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.json {
         task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
     }

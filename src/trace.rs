@@ -77,7 +77,10 @@ impl Trace {
 
 fn record(moment: &Moment) -> Value {
     let (env, simulation) = (moment.env, moment.env.simulation());
-    let (qpos, qvel, obs) = (simulation.qpos(), simulation.qvel(), doubles(moment.observation));
+    // The policy of the hand on the other side sees it mirrored.
+    let mut here = vec![0.0; moment.observation.len()];
+    env.observe(&mut here);
+    let (qpos, qvel, obs) = (simulation.qpos(), simulation.qvel(), doubles(&here));
     let (episode, step) = (moment.episode, env.episode().length);
     let Some((action, end)) = moment.step else {
         let goal = env.goal();

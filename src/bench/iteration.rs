@@ -4,7 +4,6 @@
 //! policy acts, whatever nets the settings ask for; these are timed on what it has seen. The environments' own
 //! time is computed by subtraction, so its error is that of the three measured times together.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
@@ -13,7 +12,7 @@ use super::measure::{NEVER, median};
 use super::replay::{RecordingEnv, replay};
 use crate::agent::Agent;
 use crate::config::Config;
-use crate::load::PolicySource;
+use crate::load::{self, PolicySource};
 use crate::ppo::{Ppo, Rollout};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
@@ -38,10 +37,11 @@ pub(super) const PARTS: [(&str, &str); 4] = [
 ///
 /// # Errors
 /// Fails if there is no such policy, or if it does not fit the task.
-pub(super) fn seconds_of_parts(task: &Arc<Task>, config: &Config, origin: &PolicySource) -> Result<[f64; 4]> {
+pub(super) fn seconds_of_parts(config: &Config, origin: &PolicySource) -> Result<[f64; 4]> {
     let mut acting = config.ppo.clone();
     let (checkpoint, of_it) = origin.load_for_any_scene()?;
     let net = of_it.net;
+    let task = &Task::new(&config.env, &config.hand)?.for_policy(&load::record(&checkpoint, &net)?)?;
     (acting.hidden, acting.activation, acting.symmetry) = (net.hidden, net.activation, net.symmetry);
     let randomization = Randomization::new(task, &config.randomization)?;
     let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();

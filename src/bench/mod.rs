@@ -84,7 +84,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         tell(measure(&task, &config)?);
     }
     if args.only == Some(Part::Iteration) {
-        let seconds = seconds_of_parts(&task, &config, &origin)?;
+        let seconds = seconds_of_parts(&config, &origin)?;
         tell((PARTS.iter().zip(seconds).map(|((_, key), seconds)| (*key, seconds)).collect(), table(seconds)));
         output.map_or(Ok(()), |output| picture(&config, seconds).write(output))?;
     }

@@ -177,7 +177,7 @@ pub struct TrainArgs {
     /// settings
     #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
-    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    /// Use the policy of the hand on the other side: this hand is its mirror image
     #[arg(long, requires = "init", help_heading = START)]
     pub mirror: bool,
     /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
@@ -201,7 +201,7 @@ pub struct PlayArgs {
     /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    /// Use the policy of the hand on the other side: this hand is its mirror image
     #[arg(long, help_heading = POLICY)]
     pub mirror: bool,
     /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film, 1]
@@ -258,7 +258,7 @@ pub struct ExportArgs {
     /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Act as the policy of the hand on the other side, whose mirror image this hand is
+    /// Use the policy of the hand on the other side: this hand is its mirror image
     #[arg(long, help_heading = POLICY)]
     pub mirror: bool,
     /// Change one env.* setting that the file tells, e.g. env.model=my_scene.xml; repeatable

@@ -66,8 +66,6 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        // The base itself names nothing.
-        let user = user.filter(|source| source.text != BASE);
         layered(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
@@ -170,6 +168,10 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 
 impl Source {
     fn table(&self) -> Result<(&Path, Table)> {
+        // The base itself names nothing.
+        if self.text == BASE {
+            return Ok((&self.path, Table::new()));
+        }
         let table = self.text.parse().map_err(|error: toml::de::Error| {
             let lines: Vec<String> = error.to_string().lines().map(os::shortened).collect();
             anyhow!("{}: not a TOML file: {}", self.path.display(), lines.join("\n"))

@@ -7,6 +7,7 @@ use toml::{Table, Value};
 use super::overlay::{brief, is_ramp, lookup, number, settings};
 use super::settings::{Backend, Config, Precision};
 use crate::os::shortened;
+use crate::sim::Parts;
 
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule, and so must all values by group.
 
@@ -80,6 +81,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
         }
     }
     env(config, &mut rules);
+    hand(config, &mut rules);
     randomization(config, &table, &mut rules);
     nets(config, &mut rules);
     learning(config, &mut rules);
@@ -93,6 +95,17 @@ fn floats(value: &Value) -> Vec<f64> {
         Value::Array(values) => values.iter().flat_map(floats).collect(),
         Value::Table(ramp) => ramp.values().flat_map(floats).collect(),
         _ => Vec::new(),
+    }
+}
+
+fn hand(config: &Config, rules: &mut Rules) {
+    let Parts { joints, actuators, fingertips, object, goal, start } = &config.hand;
+    let lists = [("hand.joints", joints), ("hand.actuators", actuators), ("hand.fingertips", fingertips)];
+    let listed = lists.into_iter().flat_map(|(key, names)| names.iter().map(move |name| (key, name)));
+    let single = [("hand.object", object), ("hand.goal", goal), ("hand.start", start)];
+    for (key, name) in listed.chain(single.into_iter().filter(|(_, name)| !name.is_empty())) {
+        let fits = !name.is_empty() && name.len() <= 200 && !name.contains(char::is_control);
+        rules.check(fits, key, shortened(name), "hold names of 1 to 200 bytes without control characters");
     }
 }
 

@@ -4,7 +4,7 @@
 mod graph;
 mod onnx;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use toml::{Table, Value};
 
 use crate::cli::ExportArgs;
@@ -36,8 +36,14 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let mut loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = loaded.task().context("the ranges of the actuators are those of the scene")?;
     loaded.config = task.config().clone();
+    task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), loaded.config.model_file())?;
+    let parts = &task.hand().parts;
+    let mut names = [&parts.joints, &parts.actuators, &parts.fingertips].into_iter().flatten();
+    if let Some(name) = names.find(|name| name.contains(',')) {
+        bail!("`{name}`: lists in an exported file are comma-separated, so no name may hold a comma");
+    }
     let output = os::OutputFile::create(&args.out)?;
     let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, task.hand()));
     output.finish(&bytes)?;

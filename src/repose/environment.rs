@@ -234,6 +234,14 @@ impl Repose {
         chance > 0.0 && rng::uniform(&mut self.rng, 0.0, 1.0) < chance
     }
 
+    /// Writes the observation of the current state as the policy sees it: mirrored, if its hand is on the other side.
+    fn show(&self, observation: &mut [f32]) {
+        self.observe(observation);
+        if let Some(mirror) = &self.task.mirror {
+            mirror.apply(observation);
+        }
+    }
+
     /// Writes the observation of the current state, in the order of the hand's layout.
     pub fn observe(&self, observation: &mut [f32]) {
         let (hand, config) = (&self.task.hand, &self.task.config);
@@ -263,9 +271,6 @@ impl Repose {
         cells.put("previous_action", self.now.action.iter().copied().map(f64::from));
         cells.finish();
         self.conditions.disturb(&self.rng, self.episode.length, &self.task, observation);
-        if let Some(mirror) = &self.task.mirror {
-            mirror.apply(observation);
-        }
     }
 }
 
@@ -313,7 +318,7 @@ impl Env for Repose {
         self.last = StepDetails::default();
         self.recorder.clear();
         self.sim.refresh();
-        self.observe(observation);
+        self.show(observation);
     }
 
     fn skip_ahead(&mut self, fraction: f64) {
@@ -367,14 +372,14 @@ impl Env for Repose {
         if reached && !self.lesson.goals_end {
             self.replace_goal();
         }
-        self.observe(observation);
+        self.show(observation);
         Transition { reward: self.lesson.total(reward.total(), &added) as f32, end }
     }
 
     /// Draws another goal and resets the hold counter.
     fn redirect(&mut self, observation: &mut [f32]) {
         self.replace_goal();
-        self.observe(observation);
+        self.show(observation);
     }
 
     fn episode(&self) -> EpisodeStats {
@@ -426,7 +431,7 @@ impl Resumable for Repose {
         self.sums = StepSums::default();
         self.last = StepDetails::default();
         self.recorder.clear();
-        self.observe(observation);
+        self.show(observation);
         Ok(())
     }
 }

@@ -74,33 +74,22 @@ impl Hand {
     /// # Errors
     /// Fails with one message on all names that are missing, and on all that belong to something else.
     pub fn bind(scene: &Scene, parts: Parts) -> Result<Self> {
-        let lists: [(&str, &[String]); 3] =
-            [("joint", &parts.joints), ("actuator", &parts.actuators), ("body or site", &parts.fingertips)];
-        let single = [("body", &parts.object), ("body", &parts.goal), ("keyframe", &parts.start)];
-        let names = lists.into_iter().flat_map(|(kind, names)| names.iter().map(move |name| (kind, name)));
-        let has = |kind: &str, name: &str| match kind {
-            "body or site" => scene.has("body", name) || scene.has("site", name),
-            "keyframe" if name.is_empty() => true,
-            kind => scene.has(kind, name),
-        };
-        let missing: Vec<String> = names
-            .chain(single)
-            .filter(|(kind, name)| !has(kind, name))
-            .map(|(kind, name)| format!("{kind} `{name}`"))
-            .collect();
-        ensure!(missing.is_empty(), "has no {}", missing.join(", "));
         let mut problems = Vec::new();
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
         let actuators = each(&parts.actuators, |actuator| scene.servo(actuator), &mut problems);
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
+        let cube = scene.free_body(&parts.object).map_err(|error| problems.push(error.to_string()));
+        let target = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
+        let keyframe = scene.start(&parts.start).map_err(|error| problems.push(error.to_string()));
         let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
         for (joint, _) in driven.iter().flatten() {
             problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
         }
-        if !problems.is_empty() {
-            problems.dedup();
-            bail!(problems.join("; "));
-        }
+        problems.sort();
+        problems.dedup();
+        let (Ok(cube), Ok(target), Ok(keyframe), []) = (cube, target, keyframe, &problems[..]) else {
+            bail!(problems.join("; "))
+        };
         let controls = scene.controls();
         ensure!(
             controls == actuators.len(),
@@ -113,9 +102,6 @@ impl Hand {
                 roots.push(root);
             }
         }
-        let cube = scene.free_body(&parts.object)?;
-        let target = scene.mocap(&parts.goal)?;
-        let keyframe = scene.start(&parts.start)?;
         let start = scene.pose_of(keyframe);
         let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
         let hand = Self { parts, joints, actuators, driven, fingertips, roots, cube, target, keyframe, start, layout };
@@ -177,5 +163,7 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 
 /// Finds each of these names, and lists what is wrong.
 fn each<T>(names: &[String], find: impl Fn(&str) -> Result<T>, problems: &mut Vec<String>) -> Vec<T> {
+    let twice = names.iter().enumerate().filter(|(i, name)| names[..*i].contains(name));
+    problems.extend(twice.map(|(_, name)| format!("is asked for `{name}` twice")));
     names.iter().filter_map(|name| find(name).map_err(|error| problems.push(error.to_string())).ok()).collect()
 }

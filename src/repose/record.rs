@@ -1,6 +1,6 @@
 //! What a policy's file says of the hand and the object that it was trained with.
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Result, anyhow, bail, ensure};
 use serde::{Deserialize, Serialize};
 
 use super::hand::Hand;
@@ -30,8 +30,7 @@ pub struct Record {
     pub driven: Vec<Vec<(String, f64)>>,
     /// The names of the fingertips.
     pub fingertips: Vec<String>,
-    /// The poses of the fingertips in two poses of the hand, relative to the first of the fingertips' trees: position in m,
-    /// orientation w,x,y,z.
+    /// The poses of the fingertips in two poses of the hand, in the world frame: position in m, orientation w,x,y,z.
     pub tips: Vec<[f64; 7]>,
     /// The rotations of a cube, by number, that a policy takes for the same.
     pub symmetry: Vec<usize>,
@@ -52,7 +51,8 @@ impl Record {
     /// Fails if it is too long or damaged.
     pub fn parse(text: &str) -> Result<Self> {
         ensure!(text.len() <= LONGEST, "its metadata `hand` has {} bytes; at most {LONGEST} are read", text.len());
-        let record: Self = serde_json::from_str(text).context("its metadata `hand`")?;
+        let record = serde_json::from_str::<Self>(text);
+        let record = record.map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
         let [joints, actuators, tips] = [&record.joints, &record.actuators, &record.fingertips].map(Vec::len);
         let lists = [record.ranges.len(), record.driven.len(), record.tips.len(), record.symmetry.len()];
         let fits = lists[..2] == [actuators; 2] && lists[2] == POSES.len() * tips && joints > 0 && actuators > 0;
@@ -90,29 +90,39 @@ impl Record {
     /// # Errors
     /// Fails with the names that differ.
     pub(super) fn expect_fits(&self, there: &Self, mirrors: bool, scene: &str) -> Result<Option<String>> {
-        let lists = |record: &Self| [record.joints.clone(), record.actuators.clone(), record.fingertips.clone()];
-        let (own, found) = (lists(self), lists(there));
-        let alike = |own: &[String], found: &[String], names: fn(&str, &str) -> bool| {
-            own.len() == found.len() && own.iter().zip(found).all(|(own, found)| names(found, own))
-        };
-        let is_other_hand = alike(&own[0], &found[0], is_other_side);
-        let mut differ = Vec::new();
-        for ((what, own), found) in ["joints", "actuators", "fingertips"].into_iter().zip(&own).zip(&found) {
-            let fits = alike(own, found, is_named) || mirrors && alike(own, found, is_other_side);
-            if !fits {
-                let [own, found] = [own, found].map(|names| shortened(&names.join(" ")));
-                differ.push(format!("{what} {found}, not {own}"));
+        let (mut differ, mut is_other_hand) = (Vec::new(), true);
+        for (what, own, found) in [
+            ("joint", &self.joints, &there.joints),
+            ("actuator", &self.actuators, &there.actuators),
+            ("fingertip", &self.fingertips, &there.fingertips),
+        ] {
+            if own.len() != found.len() {
+                differ.push(format!("{} {what}s, not {}", found.len(), own.len()));
+                is_other_hand = false;
+                continue;
+            }
+            for (own, found) in own.iter().zip(found) {
+                let other_side = is_other_side(found, own);
+                let fits = is_named(found, own) || mirrors && other_side;
+                if !fits {
+                    differ.push(format!("the {what} `{found}` for `{own}`"));
+                    is_other_hand &= other_side;
+                }
             }
         }
         if !differ.is_empty() {
             let hint = if is_other_hand { "; --mirror plays the policy of one hand with the other" } else { "" };
-            bail!("the policy is for another hand: {scene} has {}{hint}", differ.join("; "));
+            bail!("the policy is for another hand: {scene} has {}{hint}", shortened(&differ.join(", ")));
         }
-        let apart = |i: usize| (0..2).any(|end| (self.ranges[i][end] - there.ranges[i][end]).abs() > 1e-4);
+        let apart = |i: usize| {
+            let sum =
+                |record: &Self| -> Vec<f64> { record.driven[i].iter().map(|(_, coefficient)| *coefficient).collect() };
+            (0..2).any(|end| (self.ranges[i][end] - there.ranges[i][end]).abs() > 1e-4) || sum(self) != sum(there)
+        };
         let others: Vec<&str> = (0..self.ranges.len()).filter(|&i| apart(i)).map(|i| &*there.actuators[i]).collect();
         Ok((!others.is_empty()).then(|| {
             let names = shortened(&others.join(" "));
-            format!("an action means another angle than in training: the control ranges of {names} differ")
+            format!("an action means another angle than in training: the ranges or the tendons of {names} differ")
         }))
     }
 }

@@ -32,6 +32,8 @@ pub struct Task {
     pub(super) symmetry: Vec<usize>,
     /// What turns observations into those of the policy's hand, if that is on the other side.
     pub(super) mirror: Option<Mirror>,
+    /// Where the policy does not fit well.
+    warnings: Vec<String>,
 }
 
 impl Task {
@@ -69,8 +71,18 @@ impl Task {
         }
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
-        let symmetry = nominal.symmetry(hand.cube.body);
-        Ok(Arc::new(Self { scene, compilation, hand, config, noise, bias, symmetry, mirror: None }))
+        let symmetry = scene.symmetry(hand.cube.body);
+        Ok(Arc::new(Self {
+            scene,
+            compilation,
+            hand,
+            config,
+            noise,
+            bias,
+            symmetry,
+            mirror: None,
+            warnings: Vec::new(),
+        }))
     }
 
     /// Loads the same task in a scene for display.
@@ -158,18 +170,16 @@ impl Task {
         .concat()
     }
 
-    /// Prepares the task for a policy with this record, and prints a warning where it does not fit well.
+    /// Prepares the task for a policy with this record. Its [`Self::warnings`] say where the policy does not fit well.
     ///
     /// # Errors
     /// Fails if the policy is for another hand.
     pub fn for_policy(mut self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
         let (here, place) = (self.record(), self.origin());
-        if let Some(warning) = policy.expect_fits(&here, self.config.mirror, &place)? {
-            os::say(&format!("warning: {warning}"));
-        }
+        let mut warnings = Vec::from_iter(policy.expect_fits(&here, self.config.mirror, &place)?);
         if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
-            os::say(&format!(
-                "warning: the policy takes {} orientations of an object for the same, but `{}` of {place} has only {} that are alike",
+            warnings.push(format!(
+                "the policy takes {} orientations of an object for the same, but `{}` of {place} has only {} that are alike",
                 policy.symmetry.len(),
                 self.hand.parts.object,
                 here.symmetry.len()
@@ -180,7 +190,13 @@ impl Task {
             task.mirror = Some(Mirror::new(&here, policy, &task.hand.layout).context(place)?);
         }
         task.symmetry.clone_from(&policy.symmetry);
+        task.warnings = warnings;
         Ok(self)
+    }
+
+    /// Returns where the policy that it is prepared for does not fit well.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 
     /// Returns the record of its hand and object.

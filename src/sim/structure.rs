@@ -61,6 +61,9 @@ impl Scene {
         if parts.fingertips.is_empty() {
             parts.fingertips = self.last_bodies(&hinges, &of_hand, &mut problems);
         }
+        if parts.fingertips.is_empty() {
+            problems.push("has no fingertips; hand.fingertips names them".into());
+        }
         let mut free = Vec::new();
         let mut goals = Vec::new();
         for body in (1..self.model.nbody() as usize).filter(|&body| !of_hand(body)) {

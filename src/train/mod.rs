@@ -62,6 +62,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
+    session.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.quiet {
         let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();

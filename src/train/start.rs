@@ -177,6 +177,8 @@ impl Plan {
                 Some((_, checkpoint)) => load::record(checkpoint, &net)?,
                 None => task.record().with(net.symmetry),
             };
+            // What is written can be read.
+            Record::parse(&record.to_text())?;
             Ok((task.for_policy(&record)?, record))
         };
         let loaded: Result<_> = load();

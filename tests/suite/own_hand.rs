@@ -83,13 +83,62 @@ fn a_policy_of_another_hand_is_refused_by_the_names_that_differ() {
     let (folder, model) = placed(THREE_FINGERS);
     let folder = folder.path();
     let said = stderr(&program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", &model]));
-    assert!(said.contains("for another hand") && said.contains("α turn") && said.contains("rh_THJ5"), "{said}");
+    assert!(said.contains("for another hand") && said.contains("has 9 joints, not 24, 6 actuators, not 20"), "{said}");
     assert!(!said.contains("--mirror"), "{said}");
     succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
     let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", "env.model=builtin"]));
-    assert!(said.contains("for another hand") && said.contains("has joints rh_THJ5"), "{said}");
+    assert!(said.contains("for another hand") && said.contains("has 24 joints, not 9"), "{said}");
     let said = stderr(&program(folder, &["train", "--init", "builtin", "--run-dir", "other", "--set", &model]));
     assert!(said.contains("for another hand"), "{said}");
+}
+
+#[test]
+fn the_joint_that_another_scene_calls_otherwise_is_named() {
+    let (folder, model) = placed(THREE_FINGERS);
+    let folder = folder.path();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
+    let (_other, model) = placed(&THREE_FINGERS.replace("γ tip", "γ end joint"));
+    let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", &model]));
+    assert!(said.contains("for another hand") && said.contains("has the joint `γ end joint` for `γ tip`\n"), "{said}");
+}
+
+#[test]
+fn names_that_no_scene_can_hold_are_refused() {
+    let output = program(
+        &std::env::temp_dir(),
+        &["play", "--policy", "zero", "--headless", "--set", "hand.joints=[\"a\\u0000b\"]"],
+    );
+    assert!(
+        stderr(&output).contains("hand.joints") && stderr(&output).contains("without control characters"),
+        "{}",
+        stderr(&output)
+    );
+}
+
+#[test]
+fn the_base_as_a_users_file_names_nothing() {
+    let (folder, model) = placed(THREE_FINGERS);
+    let base = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/repose.toml");
+    let small = [
+        "env.num_envs=16",
+        "ppo.horizon=8",
+        "run.eval_episodes=2",
+        "run.total_steps=128",
+        "env.max_episode_seconds=0.2",
+    ];
+    let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
+    let with_base = ["train", "--config", base];
+    succeeded(program(folder.path(), &[&with_base[..], &["--set", &model, "--run-dir", "a"], &small].concat()));
+    succeeded(program(folder.path(), &[&with_base[..], &["--init", "builtin", "--run-dir", "b"], &small].concat()));
+}
+
+#[test]
+fn a_hand_with_a_comma_in_a_name_is_trained_but_not_exported() {
+    let (folder, model) = placed(&THREE_FINGERS.replace('α', "a,b"));
+    let folder = folder.path();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
+    let said = stderr(&program(folder, &["export", "--ckpt", "run", "--set", &model]));
+    assert!(said.contains("`a,b turn`") && said.contains("comma"), "{said}");
 }
 
 #[test]
@@ -97,7 +146,7 @@ fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
     let (folder, model) = placed(&SCENE.replace("ctrlrange=\"0 3.1415\"", "ctrlrange=\"0 3\""));
     let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let said = stderr(&succeeded(program(folder.path(), &[&play[..], &["--set", &model]].concat())));
-    assert!(said.contains("control ranges of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"), "{said}");
+    assert!(said.contains("ranges or the tendons of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"), "{said}");
 }
 
 #[test]
@@ -122,9 +171,15 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
         (
             &THREE_FINGERS.to_owned(),
             &["hand.joints=[\"α turn\",\"δ\"]", "hand.goal=none"],
-            &["has no joint `δ`, body `none`"],
+            &["has no body `none`; has no joint `δ`"],
         ),
         (&THREE_FINGERS.to_owned(), &["hand.start=flat"], &["has no keyframe `flat`"]),
+        (&THREE_FINGERS.to_owned(), &["hand.joints=[\"α turn\",\"α turn\"]"], &["is asked for `α turn` twice"]),
+        (
+            &THREE_FINGERS.replace("joint=\"α turn\" ctrl", "joint=\"α turn\" gear=\"2\" ctrl"),
+            &["hand.fingertips=[\"x\"]"],
+            &["gear of 1", "no body or site `x`"],
+        ),
         (
             &THREE_FINGERS.replace("axis=\"0 0 1\" range=\"-.4 .4\"", "axis=\"0 0 1\""),
             &[],
@@ -181,6 +236,8 @@ fn the_mirror_image_of_the_hand_sees_and_does_in_the_mirror_what_the_hand_does()
         ["play", "--ckpt", "builtin", "--mirror", "--json", "--episodes", "2", "--trace", "t.jsonl", "--set", &model];
     succeeded(program(folder, &trace));
     succeeded(program(folder, &["export", "--ckpt", "builtin", "--mirror", "--set", &model]));
+    let scene = folder.join("scene.xml");
+    crate::export::check_in_python(folder, &["policy.onnx", "--scene", scene.to_str().unwrap(), "--check", "t.jsonl"]);
     let run = ["--init", "builtin", "--mirror", "--total-steps", "128", "--run-dir", "run", "--set", &model];
     let small = ["env.num_envs=16", "ppo.horizon=8", "run.eval_episodes=2", "randomization.share=0"];
     let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
