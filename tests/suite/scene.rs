@@ -172,7 +172,7 @@ fn all_names_that_are_missing_come_in_one_message() {
     let names = ["hand.joints=[\"a\",\"rh_WRJ1\",\"b\"]", "hand.fingertips=[\"c\"]", "hand.object=d", "hand.goal=e"];
     let config = config(&[&[&model[..]], &names[..]].concat());
     let message = format!("{:#}", Task::new(&config.env, &config.hand).err().unwrap());
-    for name in ["own_scene.xml: has no joint `a`, joint `b`", "body or site `c`, body `d`, body `e`"] {
+    for name in ["own_scene.xml: has no body `d`", "body `e`", "body or site `c`", "joint `a`", "joint `b`"] {
         assert!(message.contains(name), "{name}: {message}");
     }
     assert!(!message.contains("rh_WRJ1"), "{message}");
