@@ -99,8 +99,8 @@ fn canonicalize(
 fn rotated(graph: &mut Graph, quaternion: &str, product: &str) -> String {
     let name = |what: &str| format!("{quaternion}_{what}");
     let row = graph.node("Unsqueeze", &[quaternion, "axis"], &name("row"), &[]);
-    let rotated = graph.node("MatMul", &[&row, product], &name("rotated_row"), &[]);
-    let rotated = graph.node("Squeeze", &[&rotated, "axis"], &name("rotated"), &[]);
+    let rotated = graph.node("MatMul", &[&row, product], &name("turned_row"), &[]);
+    let rotated = graph.node("Squeeze", &[&rotated, "axis"], &name("turned"), &[]);
     let w = slice(graph, &rotated, [0, 1], &name("w"));
     let negative = graph.node("Less", &[&w, "zero"], &name("negative"), &[]);
     let sign = graph.node("Where", &[&negative, "minus", "plus"], &name("sign"), &[]);
