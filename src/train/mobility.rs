@@ -19,7 +19,7 @@ const SETTLING: usize = 60;
 const STD: f32 = 0.6;
 
 /// The mobility of the built-in hand, rad in 100 steps.
-const OF_BUILTIN: f64 = 3.4;
+const OF_BUILTIN: f64 = 3.6;
 
 /// Measures the mobility of a task's hand, and returns a sentence about it.
 pub(super) fn mobility(task: &Arc<Task>) -> String {
