@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::env::{End, Env};
 use crate::os::Bar;
-use crate::ppo::{FrozenPolicy, Policy, Workspace};
+use crate::ppo::{FrozenPolicy, GROUP, Policy, Workspace};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Repose, Score, Task};
 use crate::rng::{self, Rng};
@@ -24,7 +24,7 @@ use crate::sim::stepping;
 use crate::spaces::Spaces;
 
 /// The number of episodes that run together.
-const LANES: usize = 64;
+const LANES: usize = GROUP;
 
 /// The period of [`Actor::Wave`] in control steps.
 const SWING: f64 = 300.0;

@@ -13,6 +13,7 @@
 //! | module | what it is | imports |
 //! |---|---|---|
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
+//! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, see, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, repose, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
@@ -29,7 +30,7 @@
 //! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run, sim |
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |
-//! | [`mod@env`] | many environments in blocks that step without a barrier; no hand in it | ranks, rng, schedule, sim, spaces |
+//! | [`mod@env`] | many environments, in blocks that step without a barrier or all at once; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
 //! | [`config`] | all settings, their defaults and rules | os, sim |
 //! | [`sim`] | the only interface to MuJoCo | os, quat, schedule |

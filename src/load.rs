@@ -135,7 +135,7 @@ pub struct Loaded {
     /// The hand and the object that it was trained with.
     pub record: Record,
     /// The policy.
-    pub policy: Policy,
+    pub policy: Arc<Policy>,
     /// The checkpoint that holds it.
     pub checkpoint: Checkpoint,
 }
@@ -158,6 +158,7 @@ impl Loaded {
         let record = record(&checkpoint, &config.net)?;
         let policy = Policy::load(&config.net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
+        let policy = Arc::new(policy);
         let name = match &origin {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
             PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),

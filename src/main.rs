@@ -1,5 +1,8 @@
 //! The program: parses the command line, runs the command, prints errors and sets the exit code.
 
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+mod processor;
+
 use std::io::ErrorKind;
 use std::process::ExitCode;
 

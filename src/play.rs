@@ -206,8 +206,8 @@ fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     Episodes::scored(args.seed, count)
 }
 
-/// Returns one object with all figures; those without a value are null.
-fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
+/// Returns one object with all figures of these scored episodes, as `--json` prints it; those without a value are null.
+pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
     let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
     let mut value = json!({
         "episodes": score.episodes,

@@ -5,7 +5,7 @@
 mod pool;
 mod state;
 
-pub use pool::{EnvBlock, EnvPool};
+pub use pool::{Autoreset, EnvBlock, EnvPool};
 pub use state::{EnvState, SavedEnv};
 
 use anyhow::Result;

@@ -5,7 +5,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
 use rayon::prelude::*;
 
 use super::{End, Env, EnvState, Resumable, Transition};
@@ -15,10 +15,24 @@ use crate::schedule::{block_sizes, panic_message};
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
+/// The most environments that a thread steps before it looks for others to share with.
+const MOST_AT_ONCE: usize = 8;
+
 /// N environments that start their next episode automatically; O is the observation size.
 pub struct EnvPool<E: Env> {
     /// Its blocks, in the order of the environments. None spans two shards.
     pub blocks: Vec<EnvBlock<E>>,
+}
+
+/// When an environment whose episode ended starts the next one, in the words of Gymnasium.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Autoreset {
+    /// In the step that ended the episode, whose observation is then the first one of the next.
+    SameStep,
+    /// In place of the step after it, whose action is ignored and which rewards nothing.
+    NextStep,
+    /// Never by itself: [`EnvPool::restart`] does it.
+    Disabled,
 }
 
 /// The n environments of a pool that are stepped by one thread at a time.
@@ -29,21 +43,36 @@ pub struct EnvBlock<E: Env> {
     pub first: usize,
     /// The ends `[n]` of the last step.
     pub ends: Vec<Option<End>>,
-    /// Final observations `[n, O]` of the episodes that were truncated in the last step, and under goals that were replaced; other
-    /// rows are older.
+    /// Final observations `[n, O]` of the episodes that ended in the last step, and under goals that were replaced; other rows are
+    /// older.
     pub final_observations: Vec<f32>,
     /// The description of observations and actions.
     pub spaces: Spaces,
     slots: Vec<Slot<E>>,
-    seed: u64,
-    /// The number of all environments, by which the episode numbers of one environment increase.
-    stride: u64,
+    draw: Draw,
     finished: Vec<E::Episode>,
 }
 
 struct Slot<E: Env> {
     env: E,
     next_episode: u64,
+}
+
+/// Where episodes are drawn from.
+#[derive(Clone, Copy)]
+struct Draw {
+    seed: u64,
+    /// The number of all environments, by which the episode numbers of one environment increase.
+    stride: u64,
+}
+
+/// What a step of an environment reads and writes.
+struct Cells<'a> {
+    action: &'a [f32],
+    reward: &'a mut f32,
+    end: &'a mut Option<End>,
+    observation: &'a mut [f32],
+    final_observation: &'a mut [f32],
 }
 
 impl<E: Env> EnvPool<E> {
@@ -74,8 +103,7 @@ impl<E: Env> EnvPool<E> {
                 final_observations: vec![0.0; size * spaces.observation_size],
                 slots: slots.by_ref().take(size).collect(),
                 spaces,
-                seed,
-                stride: all as u64,
+                draw: Draw { seed, stride: all as u64 },
                 finished: Vec::new(),
             }
         };
@@ -103,11 +131,65 @@ impl<E: Env> EnvPool<E> {
         let size = self.spaces().observation_size;
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
             for (i, (slot, row)) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)).enumerate() {
-                let age = rng::uniform(&mut rng::stream(block.seed, "age", slot.next_episode), 0.0, 1.0);
-                stepping("environment", block.first + i, || slot.start(block.seed, block.stride, row));
-                slot.env.skip_ahead(age);
+                stepping("environment", block.first + i, || slot.start_aged(block.draw, row));
             }
         });
+    }
+
+    /// Makes the first episodes of `seed` the ones that start next.
+    pub fn reseed(&mut self, seed: u64) {
+        for block in &mut self.blocks {
+            block.draw.seed = seed;
+            (block.first as u64..).zip(&mut block.slots).for_each(|(episode, slot)| slot.next_episode = episode);
+        }
+    }
+
+    /// Starts the next episode of each environment that is `marked`, at a random age if `aged`, and writes its row of the
+    /// `observations` `[N, O]`.
+    pub fn restart(&mut self, marked: &[bool], aged: bool, observations: &mut [f32]) {
+        let size = self.spaces().observation_size;
+        let slots = self.blocks.iter_mut().flat_map(|block| {
+            let numbered = (block.first..).zip(&mut block.slots).zip(&mut block.ends);
+            numbered.map(|((number, slot), end)| (block.draw, number, slot, end))
+        });
+        let rows = slots.zip(observations.chunks_exact_mut(size)).zip(marked).filter(|(_, marked)| **marked);
+        rows.collect::<Vec<_>>().into_par_iter().for_each(|(((draw, number, slot, end), row), _)| {
+            *end = None;
+            stepping("environment", number, || if aged { slot.start_aged(draw, row) } else { slot.start(draw, row) });
+        });
+    }
+
+    /// Steps every environment with its row of `actions` `[N, A]`, and writes `rewards` `[N]`, `observations` `[N, O]`, and in the
+    /// blocks the ends and the final observations. A goal that was replaced is so at once; the observation is then under the new
+    /// one. Returns the episodes that ended, with the places of their environments. Threads share the work in parts smaller than a
+    /// block, because all wait for the last one.
+    ///
+    /// # Errors
+    /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
+    pub fn step(
+        &mut self,
+        actions: &[f32],
+        autoreset: Autoreset,
+        rewards: &mut [f32],
+        observations: &mut [f32],
+    ) -> Result<Vec<(usize, E::Episode)>> {
+        let Spaces { observation_size: size, action_size, .. } = self.spaces();
+        let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());
+        assert_eq!(found, [n * action_size, n, n * size], "lengths of the actions, rewards and observations");
+        let slots = self.blocks.iter_mut().flat_map(|block| {
+            let written = block.ends.iter_mut().zip(block.final_observations.chunks_exact_mut(size));
+            (block.first..).zip(&mut block.slots).zip(written).map(|own| (block.draw, own))
+        });
+        let given = actions.chunks_exact(action_size).zip(rewards).zip(observations.chunks_exact_mut(size));
+        let work = slots.zip(given).enumerate().collect::<Vec<_>>();
+        let ended = work.into_par_iter().with_max_len(MOST_AT_ONCE).map(|(place, (own, given))| {
+            let (draw, ((number, slot), (end, final_observation))) = own;
+            let ((action, reward), observation) = given;
+            let cells = Cells { action, reward, end, observation, final_observation };
+            let episode = slot.step(number, draw, autoreset, cells)?;
+            Ok(episode.map(|episode| (place, episode)))
+        });
+        Ok(ended.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
     }
 
     /// Switches all environments to `lesson` from the next step on.
@@ -144,7 +226,7 @@ impl<E: Resumable> EnvPool<E> {
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
         let (size, first) = (self.spaces().observation_size, self.blocks[0].first);
-        let states = state.rows(self.blocks[0].stride as usize)?.skip(first);
+        let states = state.rows(self.blocks[0].draw.stride as usize)?.skip(first);
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
         for (number, ((slot, row), mut state)) in (first..).zip(slots.zip(rows).zip(states)) {
@@ -185,36 +267,61 @@ impl<E: Env> EnvBlock<E> {
         assert_eq!(found, [n * action_size, n, n * size], "lengths of the block's actions, rewards and observations");
         let rows = observations.chunks_exact_mut(size).zip(self.final_observations.chunks_exact_mut(size));
         let results = rewards.iter_mut().zip(&mut self.ends).zip(rows);
-        let slots = self.slots.iter_mut().zip(actions.chunks_exact(action_size));
-        for (i, ((slot, action), ((reward, end), (row, final_row)))) in slots.zip(results).enumerate() {
-            let step = || {
-                let transition: Transition = slot.env.step(action, row);
-                (*reward, *end) = (transition.reward, transition.end);
-                if let Some(End::Truncated | End::Redirected) = transition.end {
-                    final_row.copy_from_slice(row);
-                }
-                match transition.end {
-                    None => {}
-                    Some(End::Redirected) => slot.env.redirect(row),
-                    Some(End::Truncated | End::Terminated) => {
-                        self.finished.push(slot.env.episode());
-                        slot.start(self.seed, self.stride, row);
-                    }
-                }
-            };
-            // Unwind safe: a state that a panic left inconsistent is not used again.
-            let number = self.first + i;
-            if let Err(panic) = stepping("environment", number, || catch_unwind(AssertUnwindSafe(step))) {
-                bail!("environment {number} panicked: {}", panic_message(&*panic));
-            }
+        let slots = (self.first..).zip(&mut self.slots).zip(actions.chunks_exact(action_size));
+        for (((number, slot), action), ((reward, end), (observation, final_observation))) in slots.zip(results) {
+            let cells = Cells { action, reward, end, observation, final_observation };
+            self.finished.extend(slot.step(number, self.draw, Autoreset::SameStep, cells)?);
         }
         Ok(())
     }
 }
 
 impl<E: Env> Slot<E> {
-    fn start(&mut self, seed: u64, stride: u64, row: &mut [f32]) {
-        self.env.reset(rng::stream(seed, "episode", self.next_episode), row);
-        self.next_episode += stride;
+    /// Steps the environment, or starts its next episode where that takes the place of a step. Returns the episode that ended.
+    ///
+    /// # Errors
+    /// Fails with the environment's number if it panics.
+    fn step(&mut self, number: usize, draw: Draw, autoreset: Autoreset, cells: Cells) -> Result<Option<E::Episode>> {
+        let Cells { action, reward, end, observation, final_observation } = cells;
+        let step = || {
+            if autoreset == Autoreset::NextStep && matches!(end, Some(End::Truncated | End::Terminated)) {
+                (*reward, *end) = (0.0, None);
+                self.start(draw, observation);
+                return None;
+            }
+            let transition: Transition = self.env.step(action, observation);
+            (*reward, *end) = (transition.reward, transition.end);
+            if end.is_some() {
+                final_observation.copy_from_slice(observation);
+            }
+            match transition.end {
+                None => None,
+                Some(End::Redirected) => {
+                    self.env.redirect(observation);
+                    None
+                }
+                Some(End::Truncated | End::Terminated) => {
+                    let episode = self.env.episode();
+                    if autoreset == Autoreset::SameStep {
+                        self.start(draw, observation);
+                    }
+                    Some(episode)
+                }
+            }
+        };
+        // Unwind safe: a state that a panic left inconsistent is not used again.
+        stepping("environment", number, || catch_unwind(AssertUnwindSafe(step)))
+            .map_err(|panic| anyhow!("environment {number} panicked: {}", panic_message(&*panic)))
+    }
+
+    fn start(&mut self, draw: Draw, row: &mut [f32]) {
+        self.env.reset(rng::stream(draw.seed, "episode", self.next_episode), row);
+        self.next_episode += draw.stride;
+    }
+
+    fn start_aged(&mut self, draw: Draw, row: &mut [f32]) {
+        let age = rng::uniform(&mut rng::stream(draw.seed, "age", self.next_episode), 0.0, 1.0);
+        self.start(draw, row);
+        self.env.skip_ahead(age);
     }
 }

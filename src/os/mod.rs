@@ -7,8 +7,6 @@ mod machine;
 mod meshes;
 mod output;
 mod pip;
-#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
-mod processor;
 mod progress;
 mod similar;
 mod terminal;

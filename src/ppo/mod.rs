@@ -41,7 +41,7 @@ pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
 pub use perception::{CLIP, InputTransform, Perception};
-pub use policy::{FrozenPolicy, Policy};
+pub use policy::{FixedPolicy, FrozenPolicy, GROUP, Policy};
 pub use progress::{Evaluation, Fork, Progress};
 pub use rollout::{Rollout, RolloutBlock};
 

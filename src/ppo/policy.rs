@@ -1,7 +1,10 @@
 //! The policy: actor and critic MLPs, one standard deviation for all actions, and observation reading.
 
+use std::sync::Arc;
+
 use anyhow::Result;
 use rand::RngExt;
+use rayon::prelude::*;
 
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
@@ -14,6 +17,9 @@ use crate::spaces::Spaces;
 
 /// The factor on the initial weights of the actor's last layer; it keeps first actions near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
+
+/// The number of rows that are computed together where results must not depend on their number.
+pub const GROUP: usize = 64;
 
 /// A Gaussian policy whose actions are independent and have the same standard deviation, and its value function. It reads raw observations.
 pub struct Policy {
@@ -38,6 +44,14 @@ pub struct FrozenPolicy<'a> {
     actor: Net<'a>,
     critic: Net<'a>,
     transform: InputTransform,
+}
+
+/// A policy that never changes, for calls with any number of rows. What it computes of a row are the same bits whatever the others
+/// are: it always computes [`GROUP`] rows together.
+pub struct FixedPolicy {
+    policy: Arc<Policy>,
+    /// Copies of the weights of actor and critic, as a net reads them.
+    copies: [Vec<Vec<f32>>; 2],
 }
 
 impl Policy {
@@ -155,5 +169,86 @@ impl FrozenPolicy<'_> {
             }
             done += rows;
         }
+    }
+}
+
+impl FixedPolicy {
+    /// Fixes a policy.
+    pub fn new(policy: Arc<Policy>) -> Self {
+        let net = |layers: &Vec<Layer>| Net::new(layers, &policy.parameters, policy.activation).copies();
+        Self { copies: [&policy.layout.actor, &policy.layout.critic].map(net), policy }
+    }
+
+    /// Returns the policy.
+    pub fn policy(&self) -> &Policy {
+        &self.policy
+    }
+
+    /// Returns the mean actions `[B, A]` for raw observations `[B, O]`. More than one group is shared among the threads of rayon's
+    /// current pool.
+    pub fn mean_actions(&self, observations: &[f32]) -> Vec<f32> {
+        let width = self.policy.spaces.action_size;
+        self.in_groups(observations, width, |policy, seen, means, work| policy.mean_actions(seen, means, work))
+    }
+
+    /// Returns the values `[B]` of raw observations `[B, O]`, likewise.
+    pub fn values(&self, observations: &[f32]) -> Vec<f32> {
+        self.in_groups(observations, 1, |policy, seen, values, work| policy.values(seen, values, work))
+    }
+
+    fn frozen(&self) -> FrozenPolicy<'_> {
+        let policy = &self.policy;
+        let net = |layers, copies| Net::new(layers, &policy.parameters, policy.activation).with_copies(copies);
+        let (actor, critic) = (net(&policy.layout.actor, &self.copies[0]), net(&policy.layout.critic, &self.copies[1]));
+        FrozenPolicy { policy, actor, critic, transform: policy.input_transform() }
+    }
+
+    fn in_groups(
+        &self,
+        observations: &[f32],
+        width: usize,
+        compute: impl Fn(&FrozenPolicy, &[f32], &mut [f32], &mut Workspace) + Sync,
+    ) -> Vec<f32> {
+        let (frozen, size) = (self.frozen(), self.policy.spaces.observation_size);
+        let rows = observations.len() / size;
+        let mut results = vec![0.0; rows.next_multiple_of(GROUP) * width];
+        let group = |(seen, results): (&[f32], &mut [f32])| {
+            let mut padded = seen.to_vec();
+            padded.resize(GROUP * size, 0.0);
+            compute(&frozen, &padded, results, &mut frozen.workspace(GROUP));
+        };
+        if rows <= GROUP {
+            observations.chunks(GROUP * size).zip(results.chunks_mut(GROUP * width)).for_each(group);
+        } else {
+            observations.par_chunks(GROUP * size).zip(results.par_chunks_mut(GROUP * width)).for_each(group);
+        }
+        results.truncate(rows * width);
+        results
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
+        let spaces = Spaces { observation_size: 157, action_size: 20, cube_and_goal: None, distance: |_, _| 0.0 };
+        let net =
+            NetConfig { symmetry: crate::config::Symmetry::None, ..Config::resolve(None, &[]).unwrap().ppo.net() };
+        let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7).unwrap()));
+        let observations: Vec<f32> = (0..150 * 157).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
+        let (actions, values) = (policy.mean_actions(&observations), policy.values(&observations));
+        assert_eq!([actions.len(), values.len()], [150 * 20, 150]);
+        for rows in [0, 1, 2, 63, 64, 65, 150] {
+            let first = &observations[..rows * 157];
+            assert_eq!(policy.mean_actions(first), actions[..rows * 20], "{rows} rows");
+            assert_eq!(policy.values(first), values[..rows], "{rows} rows");
+        }
+        let frozen = policy.policy().freeze();
+        let mut means = vec![0.0; 64 * 20];
+        frozen.mean_actions(&observations[..64 * 157], &mut means, &mut frozen.workspace(64));
+        assert_eq!(means, actions[..64 * 20], "as a score computes them");
     }
 }

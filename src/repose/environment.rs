@@ -55,6 +55,8 @@ pub struct StepDetails {
     pub goal_dist: f64,
     /// The reward by term.
     pub reward: TaskReward,
+    /// What training adds to it, by term.
+    pub training: TrainingReward,
     /// Whether the physics diverged.
     pub diverged: bool,
     /// The random force on the cube in the step, N, if there are such forces in the episode.
@@ -95,7 +97,7 @@ impl Repose {
         }
     }
 
-    /// Returns details of the last step.
+    /// Returns details of the last step, which may have ended the episode before this one.
     pub fn last_step(&self) -> &StepDetails {
         &self.last
     }
@@ -315,7 +317,6 @@ impl Env for Repose {
         self.now.action.fill(0.0);
         (self.age, self.held) = (0, 0);
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
-        self.last = StepDetails::default();
         self.recorder.clear();
         self.sim.refresh();
         self.show(observation);
@@ -359,7 +360,7 @@ impl Env for Repose {
             reached = self.hold(self.now.within);
         }
         let Step { rot_dist, goal_dist, .. } = self.now;
-        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, diverged, push };
+        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, training: added, diverged, push };
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)

@@ -9,7 +9,7 @@ use anyhow::Result;
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
-use crate::repose::{Repose, Step, Task, task_reward};
+use crate::repose::{Repose, Step, Task, TaskReward, task_reward};
 use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
 
 /// The minimum time between two frames.
@@ -167,7 +167,8 @@ fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
 
 fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Readout {
     let config = env.config();
-    let (stats, reward) = (env.episode(), env.last_step().reward);
+    let stats = env.episode();
+    let reward = if stats.length == 0 { TaskReward::default() } else { env.last_step().reward };
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
     let extreme = Step { goal_dist: config.fall_dist, action: vec![1.0; env.spaces().action_size], ..Step::default() };

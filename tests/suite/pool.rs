@@ -1,7 +1,7 @@
 //! Pools of many environments.
 
 use rand::RngExt;
-use shadow_repose::env::{End, EnvBlock, EnvPool};
+use shadow_repose::env::{Autoreset, End, EnvBlock, EnvPool};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::Repose;
 use shadow_repose::rng;
@@ -37,12 +37,12 @@ impl Block<'_> {
             let previous_action = &self.observations[rows.clone()][137..];
             // Where an episode ended, a new one has begun: only there is the previous action zero.
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
-            if *end == Some(End::Truncated) {
+            if end.is_some() {
                 // The final observation is that of this environment: it shows its last action.
                 let action = &actions[i * 20..][..20];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
                 assert_eq!(self.envs.final_observations[rows][137..], last);
-                self.truncated += 1;
+                self.truncated += usize::from(*end == Some(End::Truncated));
             }
         }
     }
@@ -160,4 +160,106 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
         let rows = restored.iter_mut().map(|rows| &mut rows[..]).collect();
         assert!(again.restore(&other, rows).is_err(), "the state of fewer environments must be refused");
     });
+}
+
+/// A whole pool that is stepped at once.
+struct AtOnce {
+    pool: EnvPool<Repose>,
+    observations: Vec<f32>,
+    rewards: Vec<f32>,
+    t: usize,
+}
+
+impl AtOnce {
+    fn new(envs: usize, settings: &[&str], aged: bool) -> Self {
+        let task = task(settings);
+        let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect(), &Exchange::alone(1));
+        let (mut observations, rewards) = (vec![0.0; envs * OBSERVATION_SIZE], vec![0.0; envs]);
+        pool.restart(&vec![true; envs], aged, &mut observations);
+        Self { pool, observations, rewards, t: 0 }
+    }
+
+    /// Steps with actions that follow from the number of the step, and returns which episodes ended, by place and length.
+    fn step(&mut self, autoreset: Autoreset) -> Vec<(usize, u32)> {
+        let action = noise();
+        let actions: Vec<f32> = (0..self.rewards.len() * 20).map(|i| action(self.t, i)).collect();
+        self.t += 1;
+        let ended = self.pool.step(&actions, autoreset, &mut self.rewards, &mut self.observations).unwrap();
+        ended.into_iter().map(|(place, episode)| (place, episode.length)).collect()
+    }
+
+    fn row(&self, place: usize) -> &[f32] {
+        &self.observations[place * OBSERVATION_SIZE..][..OBSERVATION_SIZE]
+    }
+
+    fn ends(&self) -> Vec<Option<End>> {
+        self.pool.blocks.iter().flat_map(|block| block.ends.clone()).collect()
+    }
+}
+
+#[test]
+fn a_pool_that_is_stepped_at_once_does_what_its_blocks_do_on_any_number_of_threads() {
+    let settings = ["env.max_episode_seconds=0.3"];
+    let expected = play(2, 48, 60, &settings, noise());
+    for threads in [1, 2, 3, 8] {
+        let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut at_once = threads.install(|| AtOnce::new(48, &settings, true));
+        let (mut observations, mut rewards, mut ended) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..60 {
+            ended.extend(threads.install(|| at_once.step(Autoreset::SameStep)));
+            observations.extend_from_slice(&at_once.observations);
+            rewards.extend_from_slice(&at_once.rewards);
+        }
+        assert!(observations == expected.observations && rewards == expected.rewards);
+        let mut lengths = [ended.iter().map(|(_, length)| *length).collect(), expected.lengths.clone()];
+        lengths.iter_mut().for_each(|lengths| lengths.sort_unstable());
+        assert_eq!(lengths[0], lengths[1]);
+    }
+}
+
+#[test]
+fn an_environment_starts_its_next_episode_in_the_same_step_in_the_next_or_when_it_is_told() {
+    // All episodes end by time in step 5.
+    let settings = ["env.max_episode_seconds=0.05", "env.fall_dist=10"];
+    let mut pools = [Autoreset::SameStep, Autoreset::NextStep, Autoreset::Disabled].map(|when| {
+        let mut pool = AtOnce::new(3, &settings, false);
+        (0..4).for_each(|_| assert!(pool.step(when).is_empty()));
+        assert_eq!(pool.step(when), [(0, 5), (1, 5), (2, 5)]);
+        assert_eq!(pool.ends(), [Some(End::Truncated); 3]);
+        pool
+    });
+    let [same, next, disabled] = &mut pools;
+    let finals: Vec<f32> = same.pool.blocks[0].final_observations.clone();
+    assert!(next.observations == finals && disabled.observations == finals && same.observations != finals);
+    // The action of this step is ignored.
+    assert!(next.step(Autoreset::NextStep).is_empty());
+    assert!(next.ends() == [None; 3] && next.rewards == [0.0; 3] && next.observations == same.observations);
+    let mut shown = disabled.observations.clone();
+    disabled.pool.restart(&[false, true, true], false, &mut shown);
+    assert!(shown[..OBSERVATION_SIZE] == finals[..OBSERVATION_SIZE]);
+    assert!(shown[OBSERVATION_SIZE..] == same.observations[OBSERVATION_SIZE..]);
+    assert_eq!(disabled.ends(), [Some(End::Truncated), None, None]);
+}
+
+#[test]
+fn the_episodes_of_a_seed_start_again_when_it_is_set_again() {
+    let mut pool = AtOnce::new(4, &[], false);
+    let mut restart = |seed: Option<u64>| {
+        seed.into_iter().for_each(|seed| pool.pool.reseed(seed));
+        pool.pool.restart(&[true; 4], false, &mut pool.observations);
+        pool.row(2).to_vec()
+    };
+    let first = restart(Some(11));
+    let second = restart(None);
+    assert!(first != second && first != restart(Some(12)) && first == restart(Some(11)) && second == restart(None));
+}
+
+#[test]
+fn the_rewards_of_a_step_outlive_the_start_of_the_next_episode() {
+    let mut pool = AtOnce::new(1, &["env.max_episode_seconds=0.02", "env.fall_dist=10"], false);
+    for _ in 0..4 {
+        pool.step(Autoreset::SameStep);
+        let last = pool.pool.envs_mut().next().unwrap().last_step().reward.total();
+        assert!(last != 0.0 && (last - f64::from(pool.rewards[0])).abs() < 1e-6, "{last} {:?}", pool.rewards);
+    }
 }

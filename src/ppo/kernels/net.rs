@@ -1,5 +1,7 @@
 //! A network on a block of rows: forward and backward, layer by layer, in the cache of one core.
 
+use std::borrow::Cow;
+
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
 use super::bf16::Packed;
@@ -21,7 +23,7 @@ struct Dense<'a> {
     /// `[outputs, inputs]`
     weight: Matrix<'a>,
     /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
-    weight_t: Option<Vec<f32>>,
+    weight_t: Option<Cow<'a, [f32]>>,
     /// The weight, transposed and as it is, as products in bf16 read it, if it was packed.
     packed: [Option<Packed>; 2],
     /// `[outputs]`
@@ -89,15 +91,22 @@ impl<'a> Net<'a> {
     pub(crate) fn prepared(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
         for layer in &mut self.layers {
             if !learning {
-                let mut weight_t = vec![0.0; layer.inputs * layer.outputs];
-                for (output, row) in layer.weight.data().chunks_exact(layer.inputs).enumerate() {
-                    weight_t[output..].iter_mut().step_by(layer.outputs).zip(row).for_each(|(to, &from)| *to = from);
-                }
-                layer.weight_t = Some(weight_t);
+                layer.weight_t = Some(layer.transposed().into());
             }
             let backward = if learning { arithmetic.packed(layer.weight) } else { None };
             layer.packed = [arithmetic.packed(layer.weight.transposed()), backward];
         }
+        self
+    }
+
+    /// Returns copies of its weights for [`Self::with_copies`].
+    pub(crate) fn copies(&self) -> Vec<Vec<f32>> {
+        self.layers.iter().map(Dense::transposed).collect()
+    }
+
+    /// Returns the net with copies of its weights, as [`Self::prepared`] makes them for acting.
+    pub(crate) fn with_copies(mut self, copies: &'a [Vec<f32>]) -> Self {
+        self.layers.iter_mut().zip(copies).for_each(|(layer, copy)| layer.weight_t = Some(copy.into()));
         self
     }
 
@@ -152,6 +161,15 @@ impl<'a> Net<'a> {
 }
 
 impl Dense<'_> {
+    /// Returns a copy of the weight, transposed.
+    fn transposed(&self) -> Vec<f32> {
+        let mut weight_t = vec![0.0; self.inputs * self.outputs];
+        for (output, row) in self.weight.data().chunks_exact(self.inputs).enumerate() {
+            weight_t[output..].iter_mut().step_by(self.outputs).zip(row).for_each(|(to, &from)| *to = from);
+        }
+        weight_t
+    }
+
     /// Returns the transposed weight, for a product with `rows` rows.
     fn weight_t(&self, rows: usize) -> Matrix<'_> {
         // gemm adds up single rows and small products in an order that depends on how the weight is stored.
