@@ -71,7 +71,7 @@ impl PolicySource {
     }
 
     /// Returns the file, or the name of what is built in.
-    fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         match self {
             Self::BuiltIn(policy) => Path::new(policy.name),
             Self::File(path) => path,

@@ -24,4 +24,4 @@ pub use output::{
 pub use progress::{Bar, Status, StatusLine, progress_bar};
 pub use similar::similar;
 pub use terminal::{called_as, has_display, number, print, quoted, quoted_path, say, shortened, speak_as};
-pub use threads::start_threads;
+pub use threads::{start_threads, thread_pool};

@@ -1,6 +1,7 @@
 //! The worker threads of the program.
 
-use anyhow::{Result, anyhow, ensure};
+use anyhow::{Error, Result, anyhow, ensure};
+use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 /// The most worker threads per core; more would only take turns.
 const MOST_THREADS: usize = 16;
@@ -10,13 +11,25 @@ const MOST_THREADS: usize = 16;
 /// # Errors
 /// Fails if the number is too large, if the system refuses the threads, or on a second call.
 pub fn start_threads(threads: usize) -> Result<()> {
+    // The text of this error already contains that of its source.
+    pool(threads)?.build_global().map_err(|error| cannot_start(threads, error))
+}
+
+/// Returns a pool of its own with this number of worker threads (0: one per core), in which a caller can install work.
+///
+/// # Errors
+/// Fails if the number is too large, or if the system refuses the threads.
+pub fn thread_pool(threads: usize) -> Result<ThreadPool> {
+    pool(threads)?.build().map_err(|error| cannot_start(threads, error))
+}
+
+fn pool(threads: usize) -> Result<ThreadPoolBuilder> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let most = MOST_THREADS * cores;
-    ensure!(
-        threads <= most,
-        "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core; set --threads"
-    );
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-    // The text of this error already contains that of its source.
-    pool.build_global().map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
+    ensure!(threads <= most, "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core");
+    Ok(ThreadPoolBuilder::new().num_threads(threads))
+}
+
+fn cannot_start(threads: usize, error: ThreadPoolBuildError) -> Error {
+    anyhow!("cannot start {threads} worker threads: {error}")
 }

@@ -1,0 +1,78 @@
+"""The hands of shadow-repose as Gymnasium environments, its policies, and its program.
+
+    import shadow_repose
+
+    envs = shadow_repose.VectorEnv(1024, policy="builtin")   # the task that the built-in policy was trained for
+    policy = shadow_repose.Policy.load("builtin")
+    observations, _ = envs.reset(seed=0)                     # [1024, 157]
+    observations, rewards, terminated, truncated, info = envs.step(policy(observations))
+
+NumPy and Gymnasium are only imported where they are used.
+"""
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+TYPE_CHECKING = False  # as in `typing`, which takes longer to import than all of this
+if TYPE_CHECKING:
+    from typing import Any
+
+    from ._policy import Policy, evaluate
+    from ._program import program
+    from .envs import Env, VectorEnv
+
+__all__ = ["Env", "Policy", "VectorEnv", "evaluate", "program"]
+
+
+def _expect_avx() -> None:
+    """Names a processor that MuJoCo cannot run on. Its library would end Python by SIGILL."""
+    if os.uname().machine != "x86_64":
+        return
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as facts:
+            flags = next((line.split() for line in facts if line.startswith("flags")), None)
+    except OSError:
+        return
+    if flags is not None and "avx" not in flags:
+        raise ImportError("this processor has no AVX, which MuJoCo needs (Intel and AMD have it since 2011)")
+
+
+def _load() -> Any:
+    """Loads the extension module. Its MuJoCo uses its own symbols, whatever libraries are loaded already."""
+    flags = sys.getdlopenflags()
+    sys.setdlopenflags(flags | getattr(os, "RTLD_DEEPBIND", 0))
+    try:
+        from . import _native
+    finally:
+        sys.setdlopenflags(flags)
+    return _native
+
+
+_expect_avx()
+_native = _load()
+
+def register() -> None:
+    """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`. An installed package does it by itself."""
+    from gymnasium.envs.registration import register, registry
+
+    if "ShadowRepose-v0" not in registry:
+        register("ShadowRepose-v0", entry_point="shadow_repose.envs:Env", vector_entry_point="shadow_repose.envs:VectorEnv")
+
+
+if "gymnasium" in sys.modules:
+    register()
+
+
+_PLACES = {"Env": "envs", "VectorEnv": "envs", "Policy": "_policy", "evaluate": "_policy", "program": "_program"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PLACES:
+        return getattr(importlib.import_module("." + _PLACES[name], __name__), name)
+    raise AttributeError(f"module 'shadow_repose' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

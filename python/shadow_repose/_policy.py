@@ -1,0 +1,128 @@
+"""Trained policies, and their scores."""
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import _native
+from ._settings import flat, number, pairs
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .envs import VectorEnv
+
+
+BUILT_IN = ("builtin", "robust")
+"""The policies that come with the package."""
+
+
+class Policy:
+    """A trained policy: it maps raw observations to actions. Create one by `Policy.load`.
+
+    A policy belongs to the settings of its task, above all `env.act_moving_average`. On hands with other settings it scores worse:
+    make them by `policy.make_env()` or `VectorEnv(policy=policy)`.
+    """
+
+    def __init__(self, native: Any) -> None:
+        if not isinstance(native, _native.Policy):
+            raise TypeError("create a policy by Policy.load(place)")
+        self._native = native
+
+    @classmethod
+    def load(cls, place: str | os.PathLike[str] = "builtin", *, set: Mapping[str, Any] | None = None) -> Policy:
+        """Loads a policy.
+
+        Args:
+            place: `"builtin"` or `"robust"`, a checkpoint or policy file, or the folder of a run, for its best checkpoint.
+            set: settings of its task that replace the stored ones; a scene of one's own must be named again by `env.model`.
+
+        Raises:
+            FileNotFoundError, PermissionError: there is no such file, or it cannot be read.
+            ValueError: the file is damaged or none of the program, or a setting is invalid.
+        """
+        place = os.fspath(place)
+        if place not in BUILT_IN and not os.path.exists(place):
+            raise FileNotFoundError(f"{place}: no such checkpoint or run folder; built in are {' and '.join(BUILT_IN)}")
+        return cls(_native.Policy(place, pairs(set)))
+
+    def __call__(
+        self, observations: ArrayLike, *, deterministic: bool = True, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        """Returns actions `[B, A]`, float32, for raw observations `[B, O]`, or `[A]` for `[O]`.
+
+        They are the means, or with `deterministic=False` drawn around them with `std`. They are not clipped; an environment does
+        that. A row's actions are the same bits whatever the other rows are.
+        """
+        rows, is_one = self._rows(observations)
+        actions = self._native.actions(rows)
+        if not deterministic:
+            noise = (rng or np.random.default_rng()).standard_normal(actions.shape, np.float32)
+            actions += np.float32(self._native.std) * noise
+        return actions[0] if is_one else actions
+
+    def values(self, observations: ArrayLike) -> np.ndarray:
+        """Returns the critic's values `[B]`, float32, of raw observations `[B, O]`, or a number for `[O]`.
+
+        A value is the discounted sum of the rewards in training, times `ppo.reward_scale`.
+        """
+        rows, is_one = self._rows(observations)
+        values = self._native.values(rows)
+        return values[0] if is_one else values
+
+    def _rows(self, observations: ArrayLike) -> tuple[np.ndarray, bool]:
+        rows = np.asarray(observations, np.float32)
+        if rows.ndim not in (1, 2):
+            raise ValueError(f"observations have the shape {rows.shape}, expected (B, O) or (O,)")
+        return np.atleast_2d(rows), rows.ndim == 1
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of the task that it was trained for, by dotted key: `{"env.act_moving_average": 0.5, ...}`."""
+        return flat(self._native.settings())
+
+    @property
+    def std(self) -> np.ndarray:
+        """The standard deviation `[A]` of its actions in training, float32."""
+        return np.full(self._native.sizes()[1], self._native.std, np.float32)
+
+    def make_env(self, num_envs: int = 64, **options: Any) -> VectorEnv:
+        """Returns `VectorEnv(num_envs, policy=self, **options)`: hands of the task that it was trained for."""
+        from .envs import VectorEnv
+
+        return VectorEnv(num_envs, policy=self, **options)
+
+    def __reduce__(self) -> Any:
+        return Policy.load, (os.fspath(self._native.place),)
+
+    def __repr__(self) -> str:
+        return f"<Policy: {self._native.name}>"
+
+
+def evaluate(
+    policy: Policy | str | os.PathLike[str] = "builtin",
+    *,
+    episodes: int = 256,
+    seed: int = 0,
+    set: Mapping[str, Any] | None = None,
+    threads: int = 0,
+) -> dict[str, Any]:
+    """Returns the score of a policy over whole episodes by mean actions: the object that `shadow-repose play --json` prints.
+
+    Args:
+        policy: a policy, or a place that `Policy.load` takes.
+        episodes: how many episodes are played.
+        seed: what they are drawn from.
+        set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`.
+        threads: worker threads; 0: one per core.
+
+    Ctrl-C interrupts it. Raises ValueError as `Policy.load` does.
+    """
+    if not isinstance(policy, Policy):
+        policy = Policy.load(policy, set=set)
+    text = _native.evaluate(policy._native, pairs(set), number("episodes", episodes), number("seed", seed), number("threads", threads))
+    return json.loads(text)

@@ -1,0 +1,319 @@
+"""The hands as Gymnasium environments: N that step together, or one."""
+from __future__ import annotations
+
+import operator
+import os
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from . import _native
+from ._policy import Policy
+from ._settings import flat, number, pairs
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+# What the extension module says of an end.
+_TERMINATED, _TRUNCATED, _REDIRECTED = 1, 2, 3
+
+_STATE = ("numbers", "counters", "ends", "returns", "times")
+
+
+class VectorEnv(gymnasium.vector.VectorEnv):
+    """N hands that step together. The same seed gives the same bits on any number of threads.
+
+    Args:
+        num_envs: the number N of hands.
+        threads: worker threads; 0: one per core.
+        seed: what the episodes are drawn from until `reset` names another. Those of hand i have the numbers i, i + N, i + 2 N, …
+        config: a settings file of the program. Its `[ppo]` and `[run]` are not used.
+        set: single settings, as `--set`: `{"env.friction_scale": 0.8}`.
+        policy: a policy, or a place that `Policy.load` takes: the task is the one that it was trained for.
+        training: the task as `train` teaches it at `env_steps`: shaped rewards, tolerance, hold, randomisation.
+        goal_change: what a new goal means to a learner. `"continue"`: nothing ends, the next observation shows it. `"truncate"`:
+            `truncated` is set, `final_obs` shows the old goal and `info["redirected"]` tells it from an end by time. `train`
+            learns that way, and so can any learner that adds the value of `final_obs` where `truncated` is set.
+        random_age: the first episodes end early, at different times, as in `train`.
+        autoreset_mode: when a hand starts its next episode; see Gymnasium. `"truncate"` needs SAME_STEP.
+        reward_terms: `info["reward"]` holds the terms of each step's reward.
+
+    Raises:
+        ValueError: a setting is unknown or invalid, or the scene cannot be used; the message lists everything that is wrong.
+        FileNotFoundError, PermissionError: a file is not there, or cannot be read.
+
+    Observations are float32 `[N, O]`, of the built-in hand `[N, 157]`; `observation_layout` names their groups. Actions `[N, A]`, here
+    `[N, 20]`, are moves within the range of each actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z; units are SI.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1024,
+        *,
+        threads: int = 0,
+        seed: int = 0,
+        config: str | os.PathLike[str] | None = None,
+        set: Mapping[str, Any] | None = None,
+        policy: Policy | str | os.PathLike[str] | None = None,
+        training: bool = False,
+        goal_change: Literal["continue", "truncate"] = "continue",
+        random_age: bool = False,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        reward_terms: bool = False,
+        render_mode: None = None,
+    ) -> None:
+        self._hands: Any = None
+        if render_mode is not None:
+            raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; `shadow-repose play --video` films them")
+        if goal_change not in ("continue", "truncate"):
+            raise ValueError(f'goal_change = {goal_change!r}: must be "continue" or "truncate"')
+        modes = {name: mode for mode in AutoresetMode for name in (mode, mode.name, mode.value)}
+        mode = modes.get(autoreset_mode)
+        if mode is None:
+            raise ValueError(f"autoreset_mode = {autoreset_mode!r}: must be one of {', '.join(AutoresetMode.__members__)}")
+        if goal_change == "truncate" and mode is not AutoresetMode.SAME_STEP:
+            raise ValueError('goal_change = "truncate" needs autoreset_mode = SAME_STEP: the hand goes on under the new goal at once')
+        if policy is not None and not isinstance(policy, Policy):
+            named = {key: value for key, value in (set or {}).items() if key == "env.model"}
+            policy = Policy.load(policy, set=named)
+        settings = pairs(set)
+        self._made = {
+            "threads": number("threads", threads), "seed": number("seed", seed), "config": config, "set": dict(set or {}),
+            "policy": policy, "training": bool(training), "goal_change": goal_change, "random_age": bool(random_age),
+            "autoreset_mode": mode, "reward_terms": bool(reward_terms),
+        }  # fmt: skip
+        self._hands = _native.Hands(
+            number("num_envs", num_envs), self._made["threads"], self._made["seed"], None if config is None else os.fspath(config),
+            policy and policy._native, settings, bool(training), mode.value,
+        )  # fmt: skip
+        for warning in self._hands.warnings_and_notes()[0]:
+            warnings.warn(warning, stacklevel=2)
+        self.num_envs = operator.index(num_envs)
+        self.metadata = {**self.metadata, "autoreset_mode": mode}
+        self._mode, self._truncates, self._terms, self._aged = mode, goal_change == "truncate", reward_terms, bool(random_age)
+        layout = self._hands.layout()
+        size = sum(length for _, _, length, _ in layout)
+        self.observation_layout = {name: slice(first, first + length) for name, first, length, _ in layout}
+        self.observation_units = {name: unit for name, _, _, unit in layout}
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._hands.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode of each hand, and returns the observations `[N, O]` and an empty dict.
+
+        Args:
+            seed: the episodes are those of this seed, from the first one on; without it they are the next ones.
+            options: `{"reset_mask": mask}` with a bool array `[N]` restarts only the hands that it marks.
+
+        Raises ValueError for a seed that is negative, or with a mask.
+        """
+        hands = self._open()
+        if seed is not None:
+            seed = number("seed", seed)
+            super().reset(seed=seed)
+        mask = None if options is None else options.get("reset_mask")
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+                raise ValueError(f"reset_mask must be a bool array of the shape ({self.num_envs},), not {mask.dtype} {mask.shape}")
+            if not mask.any():
+                raise ValueError("reset_mask marks no hand")
+        return hands.reset(seed, mask, self._aged), {}
+
+    def step(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps all hands once with `actions` `[N, A]`, which are clipped to [-1, 1].
+
+        Returns observations `[N, O]`, rewards `[N]` (float32), terminated `[N]`, truncated `[N]` and info, all in new memory. Info
+        holds, each with a mask `[N]` under the same name with a `_` before it:
+            final_obs `[N, O]`: the last observations of the hands where `terminated` or `truncated` is set (SAME_STEP only);
+            final_info: of the episodes that ended, `episode`: `r` the sum of rewards, `l` steps, `goals` reached, `dropped`,
+                `diverged`, `randomized`, `rot_dist` mean rotation error (rad), `reward` the sums of the task's terms;
+            redirected `[N]`, without a mask: where the goal was replaced;
+            reward, rot_dist (with `reward_terms`): the terms of this step's reward, and the rotation errors (rad) after it.
+
+        Raises ValueError (shape, NaN) and RuntimeError (not reset, closed, in use by another thread, or a hand failed: reset).
+        """
+        hands = self._open()
+        observations, rewards, ends, episodes = hands.step(np.asarray(actions, np.float32))
+        terminated, truncated = ends == _TERMINATED, ends == _TRUNCATED
+        info: dict[str, Any] = {}
+        if ends.any():
+            over, redirected = terminated | truncated, ends == _REDIRECTED
+            if self._truncates:
+                truncated |= redirected
+            cut = terminated | truncated
+            if self._mode is AutoresetMode.SAME_STEP and cut.any():
+                info["final_obs"], info["_final_obs"] = hands.final_observations(), cut
+                if not self._truncates:
+                    info["final_obs"][~cut] = 0.0
+            if episodes is not None:
+                info["final_info"] = _masked({"episode": episodes}, over)
+                info["_final_info"] = over
+            if redirected.any():
+                info["redirected"] = redirected
+        if self._terms:
+            every = np.ones(self.num_envs, np.bool_)
+            terms, errors = hands.terms()
+            info.update(_masked({"reward": terms, "rot_dist": errors}, every))
+        return observations, rewards, terminated, truncated, info
+
+    def _open(self) -> Any:
+        if self._hands is None:
+            raise RuntimeError("these hands are closed")
+        return self._hands
+
+    @property
+    def env_steps(self) -> int:
+        """Control steps so far, over all hands. With `training=True` they decide the lesson; set them to go on from a later point."""
+        return self._open().env_steps
+
+    @env_steps.setter
+    def env_steps(self, steps: int) -> None:
+        self._open().env_steps = number("env_steps", steps)
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The steps of an episode that no drop ends."""
+        return self._open().max_episode_steps
+
+    @property
+    def step_dt(self) -> float:
+        """The time of a step, s."""
+        return self.settings["env.ctrl_dt"]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of the task and the names of the hand's parts, by dotted key. `hand.actuators` names the actions."""
+        return flat(self._open().settings())
+
+    @property
+    def notes(self) -> list[str]:
+        """What the settings replace in a scene of one's own, and what was found in it."""
+        return self._open().warnings_and_notes()[1]
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Returns everything that the future of the hands depends on, for `set_state` of hands with the same settings."""
+        return dict(zip(_STATE, self._open().state(), strict=True))
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Goes on from what `get_state` returned, bit for bit, and returns the observations `[N, O]` to act on.
+
+        Raises ValueError if it is the state of other hands.
+        """
+        types = (np.float64, np.uint64, np.uint8, np.float64, np.uint64)
+        try:
+            parts = [np.asarray(state[name], kind) for name, kind in zip(_STATE, types, strict=True)]
+        except KeyError as missing:
+            raise ValueError(f"the state lacks {missing}") from None
+        shapes = [part.ndim for part in parts]
+        if shapes != [2, 2, 1, 1, 1]:
+            raise ValueError(f"the parts of the state have {shapes} dimensions, expected [2, 2, 1, 1, 1]")
+        return self._open().set_state(*parts)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the hands and their threads."""
+        hands, self._hands = self._hands, None
+        if hands is not None:
+            hands.close()
+
+    def __len__(self) -> int:
+        return self.num_envs
+
+    def __getstate__(self) -> Any:
+        try:
+            state = self.get_state()
+        except RuntimeError:  # not reset, failed or closed: a fresh start
+            state = None
+        return self.num_envs, self._made, state
+
+    def __setstate__(self, pickled: Any) -> None:
+        num_envs, made, state = pickled
+        self.__init__(num_envs, **made)  # type: ignore[misc]
+        if state is not None:
+            self.set_state(state)
+
+    def __repr__(self) -> str:
+        return f"<shadow_repose.VectorEnv of {self.num_envs} hands>"
+
+
+def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Adds to each value, and to those within it, its mask, as Gymnasium does."""
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        result[name] = _masked(value, mask) if isinstance(value, dict) else value
+        result[f"_{name}"] = mask
+    return result
+
+
+class Env(gymnasium.Env):
+    """One hand, `gymnasium.make("ShadowRepose-v0")`: observations `[O]`, actions `[A]`.
+
+    It takes the options of `VectorEnv` that make sense for one. `info["episode"]` holds what `final_info` holds there, at the end of
+    an episode.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        config: str | os.PathLike[str] | None = None,
+        set: Mapping[str, Any] | None = None,
+        policy: Policy | str | os.PathLike[str] | None = None,
+        training: bool = False,
+        random_age: bool = False,
+        reward_terms: bool = False,
+        render_mode: None = None,
+    ) -> None:
+        self._envs = VectorEnv(
+            1, threads=1, seed=seed, config=config, set=set, policy=policy, training=training, random_age=random_age,
+            reward_terms=reward_terms, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED,
+        )  # fmt: skip
+        self.observation_space, self.action_space = self._envs.single_observation_space, self._envs.single_action_space
+        self._over = True
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode: the first one of `seed`, or the next one. Returns its observation `[O]`."""
+        super().reset(seed=seed)
+        observations, info = self._envs.reset(seed=seed)
+        self._over = False
+        return observations[0], info
+
+    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Steps once with an action `[A]`, which is clipped to [-1, 1]. Raises ResetNeeded after the end of an episode."""
+        if self._over:
+            self._envs._open()
+            raise ResetNeeded("the episode is over: reset the hand before it steps")
+        actions = np.asarray(action, np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"the action has the shape {actions.shape}, expected {self.action_space.shape}")
+        observations, rewards, terminated, truncated, info = self._envs.step(actions[None])
+        self._over = bool(terminated[0] or truncated[0])
+        found = info.pop("final_info", {})
+        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first({**info, **found})
+
+    @property
+    def envs(self) -> VectorEnv:
+        """The hand as a `VectorEnv` of one, with its settings, its layout and its state."""
+        return self._envs
+
+    def close(self) -> None:
+        """Frees the hand."""
+        self._envs.close()
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    """Returns the values of the first hand, without masks."""
+    one = {name: value for name, value in info.items() if not name.startswith("_")}
+    return {name: _first(value) if isinstance(value, dict) else value[0] for name, value in one.items()}

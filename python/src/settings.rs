@@ -1,0 +1,68 @@
+//! The settings of hands: what a user names, and what a policy brings along.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Result, ensure};
+use serde_json::json;
+use shadow_repose::config::{Config, Override, user_file};
+use shadow_repose::load::{self, Loaded};
+use shadow_repose::repose::Task;
+
+/// The most hands, as in a training.
+const MOST_HANDS: usize = 65536;
+
+/// Settings as a user gives them: dotted keys, and values in TOML.
+pub(crate) type Set = Vec<(String, String)>;
+
+/// Returns the settings in the form of the library.
+///
+/// # Errors
+/// Fails if one is not of a task, or of a training where there is none.
+pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
+    for (key, _) in &set {
+        let section = key.split('.').next().unwrap_or(key);
+        ensure!(key != "env.num_envs", "env.num_envs: give num_envs instead");
+        ensure!(!matches!(section, "ppo" | "run"), "{key}: it is a setting of a learner, and these hands have none");
+        let only_training = matches!(section, "training" | "randomization");
+        ensure!(training || !only_training, "{key}: it changes the task for training; give training=True, too");
+    }
+    Ok(set.into_iter().map(|(key, value)| Override { key, value }).collect())
+}
+
+/// Returns the settings and the task of `count` hands.
+///
+/// # Errors
+/// Fails if the settings are invalid, or if the scene cannot be used.
+pub(crate) fn resolve(
+    count: usize,
+    config: Option<&Path>,
+    policy: Option<&Loaded>,
+    overrides: &[Override],
+    training: bool,
+) -> Result<(Config, Arc<Task>)> {
+    ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
+    let Some(loaded) = policy else {
+        let config = Config::resolve(user_file(config)?.as_ref(), overrides)?;
+        let task = Task::new(&config.env, &config.hand)?;
+        return Ok((Config { env: task.config().clone(), ..config }, task));
+    };
+    ensure!(config.is_none(), "give config or policy, not both: a policy brings the settings of its task");
+    let whole = if training {
+        load::for_training(&loaded.checkpoint, loaded.origin.path(), overrides)?
+    } else {
+        Config::resolve(None, &[])?
+    };
+    let task =
+        loaded.task_with(overrides.iter().filter(|set| is_of_task(set)).cloned().collect::<Vec<_>>().as_slice())?;
+    Ok((Config { env: task.config().clone(), ..whole }, task))
+}
+
+fn is_of_task(set: &Override) -> bool {
+    matches!(set.key.split('.').next(), Some("env" | "hand"))
+}
+
+/// Returns the settings of a task as JSON: an object of sections.
+pub(crate) fn text(task: &Task) -> String {
+    json!({ "env": task.config(), "hand": task.hand().parts }).to_string()
+}

@@ -1,0 +1,79 @@
+"""Policies and their scores."""
+import pickle
+
+import numpy as np
+import pytest
+
+import shadow_repose
+from shadow_repose import Policy, VectorEnv, evaluate
+
+
+def observations(rows):
+    envs = VectorEnv(rows, policy="builtin", seed=5)
+    return envs.reset()[0]
+
+
+def test_the_actions_of_a_row_are_the_same_bits_whatever_the_other_rows_are():
+    policy, seen = Policy.load("builtin"), observations(150)
+    actions, values = policy(seen), policy.values(seen)
+    assert (actions.shape, actions.dtype, values.shape) == ((150, 20), np.float32, (150,))
+    for rows in (1, 2, 64, 65):
+        assert np.array_equal(policy(seen[:rows]), actions[:rows]) and np.array_equal(policy.values(seen[:rows]), values[:rows])
+    assert np.array_equal(policy(seen[7]), actions[7]) and policy.values(seen[7]) == values[7]
+    assert policy(seen[:0]).shape == (0, 20) and policy.values(seen[:0]).shape == (0,)
+
+
+def test_drawn_actions_spread_around_the_means_and_follow_the_generator():
+    policy, seen = Policy.load("builtin"), observations(200)
+    means, drawn = policy(seen), policy(seen, deterministic=False, rng=np.random.default_rng(1))
+    assert abs((drawn - means).std() / policy.std[0] - 1) < 0.05 and abs((drawn - means).mean()) < 0.02
+    assert np.array_equal(drawn, policy(seen, deterministic=False, rng=np.random.default_rng(1)))
+    assert policy.std.shape == (20,)
+
+
+def test_a_policy_is_pickled_by_its_place():
+    policy, seen = Policy.load("robust"), observations(3)
+    again = pickle.loads(pickle.dumps(policy))
+    assert np.array_equal(again(seen), policy(seen)) and "robust" in repr(again)
+
+
+def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        Policy.load(tmp_path / "nowhere")
+    file = tmp_path / "x.safetensors"
+    file.write_bytes(b"\0" * 100)
+    with pytest.raises(ValueError, match="x.safetensors"):
+        Policy.load(file)
+    with pytest.raises(TypeError, match="Policy.load"):
+        Policy("builtin")
+    assert Policy.load("builtin", set={"env.friction_scale": 0.5}).settings["env.friction_scale"] == 0.5
+
+
+@pytest.mark.parametrize("given", [np.zeros((3, 156)), np.zeros((2, 3, 157)), "x", None, [[1], [2, 3]], 3.0])
+def test_what_is_no_observation_is_an_exception(given):
+    with pytest.raises((TypeError, ValueError)):
+        Policy.load("builtin")(given)
+
+
+def test_a_row_that_is_not_finite_spoils_no_other_row():
+    policy, seen = Policy.load("builtin"), observations(10)
+    spoilt = seen.copy()
+    spoilt[3] = np.nan
+    assert np.array_equal(np.delete(policy(spoilt), 3, 0), np.delete(policy(seen), 3, 0))
+
+
+def test_a_score_has_the_keys_of_the_program_and_follows_seed_and_settings():
+    score = evaluate("builtin", episodes=4, seed=3, set={"env.max_episode_seconds": 0.2})
+    assert {"episodes", "goals_per_episode", "goals_ci95", "drop_rate", "reward", "checkpoint"} <= set(score)
+    assert (score["episodes"], score["seed"], score["checkpoint"]) == (4, 3, "built into the program")
+    other = evaluate(Policy.load("builtin"), episodes=4, seed=3, set={"env.max_episode_seconds": 0.2}, threads=1)
+    assert score == other != evaluate("builtin", episodes=4, seed=4, set={"env.max_episode_seconds": 0.2})
+    for wrong in ({"episodes": 0}, {"episodes": 2**30}, {"seed": -1}, {"set": {"env.x": 1}}, {"threads": 10**6}):
+        with pytest.raises(ValueError):
+            evaluate("builtin", **wrong)
+
+
+def test_names_are_listed_and_unknown_ones_refused():
+    assert set(shadow_repose.__all__) <= set(dir(shadow_repose))
+    with pytest.raises(AttributeError, match="nonsense"):
+        shadow_repose.nonsense

@@ -1,0 +1,180 @@
+"""What the process around the hands does: forks, threads, signals, panics, memory."""
+import gc
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv
+
+from shadow_repose import Env, Policy, VectorEnv, evaluate
+
+ZEROS = np.zeros((16, 20), np.float32)
+
+
+def started(**options):
+    envs = VectorEnv(16, **{"threads": 2, "seed": 1, **options})
+    envs.reset()
+    return envs
+
+
+def stepped_in_a_child(queue, envs):
+    queue.put(envs.step(ZEROS)[0].tobytes())
+    queue.put(Policy.load("builtin")(np.zeros((200, 157))).tobytes())
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_child_process_goes_on_with_the_same_bits_on_threads_of_its_own(method):
+    envs = started()
+    envs.step(ZEROS)
+    actions = Policy.load("builtin")(np.zeros((200, 157)))
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    child = context.Process(target=stepped_in_a_child, args=(queue, envs))
+    child.start()
+    found = [queue.get(timeout=60), queue.get(timeout=60)]
+    child.join(60)
+    assert child.exitcode == 0
+    assert found == [envs.step(ZEROS)[0].tobytes(), actions.tobytes()]
+
+
+def test_a_child_that_is_forked_in_a_step_gets_an_exception_and_does_not_hang():
+    envs = VectorEnv(1024, threads=1)
+    envs.reset()
+    stepping = threading.Thread(target=lambda: [envs.step(np.zeros((1024, 20))) for _ in range(5)])
+    stepping.start()
+    time.sleep(0.02)
+    child = os.fork()
+    if child == 0:
+        try:
+            envs.step(np.zeros((1024, 20)))
+        except RuntimeError:
+            os._exit(7)
+        os._exit(1)
+    for _ in range(600):
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, signal.SIGKILL)
+    stepping.join()
+    assert done and os.waitstatus_to_exitcode(status) == 7
+
+
+def test_two_threads_that_step_the_same_hands_get_results_or_a_sentence():
+    envs, errors, done = started(), [], []
+
+    def step():
+        for _ in range(50):
+            try:
+                done.append(envs.step(ZEROS))
+            except RuntimeError as error:
+                errors.append(str(error))
+
+    threads = [threading.Thread(target=step) for _ in range(3)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert len(done) + len(errors) == 150 and envs.env_steps == 16 * len(done)
+    assert set(errors) <= {"another thread is using these hands"}
+
+
+def test_two_threads_step_hands_of_their_own_with_the_bits_that_each_has_alone():
+    expected = started().step(ZEROS)[0]
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(started().step(ZEROS)[0])) for _ in range(4)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert len(found) == 4 and all(np.array_equal(one, expected) for one in found)
+
+
+def test_python_runs_while_the_hands_step():
+    envs = VectorEnv(1024, threads=1)
+    envs.reset()
+    counted, stop = [0], threading.Event()
+
+    def count():
+        while not stop.is_set():
+            counted[0] += 1
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    before = counted[0]
+    for _ in range(3):
+        envs.step(np.zeros((1024, 20)))
+    stop.set()
+    thread.join()
+    assert counted[0] - before > 10_000
+
+
+def test_ctrl_c_interrupts_a_long_evaluation_soon_and_python_keeps_its_handler():
+    handler = signal.getsignal(signal.SIGINT)
+    timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+    began = time.monotonic()
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        evaluate("builtin", episodes=100_000)
+    assert time.monotonic() - began < 20 and signal.getsignal(signal.SIGINT) is handler
+
+
+def test_a_panic_is_an_exception_and_the_hands_go_on(capfd):
+    envs = started()
+    with pytest.raises(RuntimeError, match="internal error"):
+        envs._hands._panic_for_a_test()
+    assert envs.step(ZEROS)[0].shape == (16, 157)
+
+
+def test_hands_that_are_made_and_closed_a_thousand_times_leave_nothing():
+    def resident():
+        gc.collect()
+        with open("/proc/self/statm", encoding="ascii") as statm:
+            return int(statm.read().split()[1]) * 4096 / 2**20
+
+    def turn(times):
+        for _ in range(times):
+            envs = VectorEnv(2, threads=2)
+            envs.reset()
+            envs.step(np.zeros((2, 20)))
+            envs.close()
+
+    turn(100)
+    before, threads = resident(), threading.active_count()
+    turn(900)
+    assert resident() - before < 40, "MiB"
+    assert len(os.listdir("/proc/self/task")) < 20 and threading.active_count() == threads
+
+
+def test_hands_that_are_forgotten_are_freed():
+    tasks = len(os.listdir("/proc/self/task"))
+    for _ in range(5):
+        started()
+    gc.collect()
+    time.sleep(0.2)
+    assert len(os.listdir("/proc/self/task")) <= tasks + 2
+
+
+def test_one_hand_steps_in_processes_of_gymnasium():
+    envs = AsyncVectorEnv([Env] * 2)
+    observations, _ = envs.reset(seed=3)
+    assert observations.shape == (2, 157) and envs.step(np.zeros((2, 20)))[0].shape == (2, 157)
+    envs.close()
+
+
+def test_a_pickle_of_hands_that_cannot_step_is_a_fresh_start():
+    envs = VectorEnv(3, seed=9)
+    again = pickle.loads(pickle.dumps(envs))
+    assert np.array_equal(again.reset()[0], envs.reset()[0])
+    envs.close()
+    assert np.array_equal(pickle.loads(pickle.dumps(envs)).reset()[0], VectorEnv(3, seed=9).reset()[0])
+
+
+def test_the_module_is_imported_without_gymnasium_and_numpy():
+    code = "import sys, shadow_repose; print([name for name in ('gymnasium', 'numpy', 'torch') if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "[]\n"
