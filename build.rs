@@ -1,7 +1,8 @@
 //! Makes MuJoCo available to the linker and, at run time, to the binary, with no manual step.
 //!
 //! `.cargo/config.toml` points mujoco-rs at `third_party/mujoco/link`, where a linker script named `libmujoco.so` refers to
-//! `libmujoco.so.3.17.0`. This script fetches that file into `third_party/mujoco/lib` with pip, by package name and hash.
+//! `libmuj-sr.so.3.17.0`. This script makes that file in `third_party/mujoco/lib`: it fetches MuJoCo's library with pip, by package
+//! name and hash, and gives it a name of its own.
 //! It fetches nothing if the user sets `MUJOCO_DYNAMIC_LINK_DIR` or `MUJOCO_STATIC_LINK_DIR`.
 
 use std::path::{Path, PathBuf};
@@ -12,6 +13,11 @@ use std::{env, fs};
 mod pip;
 
 const VERSION: &str = "3.17.0";
+
+/// The library's own name (SONAME), and ours. In one process the dynamic linker takes libraries of the same name for the same one: a
+/// user's `import mujoco` in Python would then share its callbacks and its log with our extension module. Both are equally long, so
+/// nothing else in the file changes.
+const NAMES: [&str; 2] = ["libmujoco.so.3.17.0", "libmuj-sr.so.3.17.0"];
 
 /// Wheels of `mujoco` 3.17.0: (target architecture, pip platform tag, sha256). The Python tag only selects the wheel; the
 /// library in it does not depend on Python.
@@ -34,7 +40,7 @@ fn main() {
     let linked = PathBuf::from(variable("MUJOCO_DYNAMIC_LINK_DIR"));
     let library_folder = if linked.starts_with(root.join("third_party")) {
         let folder = root.join("third_party/mujoco/lib");
-        let library = folder.join(format!("libmujoco.so.{VERSION}"));
+        let library = folder.join(NAMES[1]);
         println!("cargo::rerun-if-changed={}", library.display());
         if !library.is_file()
             && let Err(reason) = fetch(&library)
@@ -73,7 +79,7 @@ fn version_facts() {
     println!("cargo::rustc-env=SHADOW_REPOSE_TARGET={}", variable("TARGET"));
 }
 
-/// Fetches the wheel and moves the library out of it to `library`.
+/// Fetches the wheel and makes `library` of the one in it.
 fn fetch(library: &Path) -> Result<(), String> {
     let (os, arch) = (variable("CARGO_CFG_TARGET_OS"), variable("CARGO_CFG_TARGET_ARCH"));
     let (_, platform, hash) = WHEELS
@@ -84,12 +90,20 @@ fn fetch(library: &Path) -> Result<(), String> {
     let selection = ["--python-version", "311", "--implementation", "cp", "--abi", "cp311", "--platform", platform];
     pip::unpack_wheel(&format!("mujoco=={VERSION}"), hash, &selection, &work)?;
     let told = |error: std::io::Error| error.to_string();
-    let unpacked = work.join(format!("mujoco/libmujoco.so.{VERSION}"));
+    let unpacked = work.join("mujoco").join(NAMES[0]);
+    let mut content = fs::read(&unpacked).map_err(|e| format!("{}: {e}", unpacked.display()))?;
+    let [name, own] = NAMES.map(|name| format!("\0{name}\0").into_bytes());
+    let places: Vec<usize> =
+        content.windows(name.len()).enumerate().filter(|(_, part)| *part == name).map(|(at, _)| at).collect();
+    let [place] = places[..] else {
+        return Err(format!("{} holds its name {} times", unpacked.display(), places.len()));
+    };
+    content[place..place + own.len()].copy_from_slice(&own);
     let folder = library.parent().expect("the library path has a parent folder");
     fs::create_dir_all(folder).map_err(told)?;
-    // Copies under another name, then renames: an interrupted build leaves no incomplete library behind.
+    // Writes under another name, then renames: an interrupted build leaves no incomplete library behind.
     let partial = folder.join(format!("libmujoco.partial.{}", std::process::id()));
-    fs::copy(&unpacked, &partial).map_err(|e| format!("{}: {e}", unpacked.display()))?;
+    fs::write(&partial, content).map_err(told)?;
     fs::rename(&partial, library).map_err(told)?;
     // As old as this script, so that the next build does not take it for something that has changed since this one.
     let written = fs::metadata("build.rs").and_then(|facts| facts.modified()).map_err(told)?;
@@ -100,7 +114,7 @@ fn fetch(library: &Path) -> Result<(), String> {
 
 fn fail(reason: &str) -> ! {
     eprintln!(
-        "\nMuJoCo {VERSION} (libmujoco.so.{VERSION}) is missing and could not be fetched: {reason}\n\
+        "\nMuJoCo {VERSION} is missing and could not be fetched: {reason}\n\
          Two ways to fix this:\n  \
          1. make `python3 -I -m pip download mujoco=={VERSION}` work (python3, pip, a reachable package index) and rebuild;\n  \
          2. unpack a MuJoCo {VERSION} release yourself and build with MUJOCO_DYNAMIC_LINK_DIR=/absolute/path/to/its/lib\n"

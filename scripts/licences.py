@@ -16,8 +16,8 @@ RULE = "=" * 100
 
 
 def crates(target):
-    """Returns (name, version, licence, repository, folder) of each crate in the binary."""
-    tree = ["cargo", "tree", "--locked", "--edges=normal", "--prefix=none", "--no-dedupe", f"--target={target}", "--format={p}"]
+    """Returns (name, version, licence, repository, folder) of each crate in the binary and the extension module."""
+    tree = ["cargo", "tree", "--locked", "--edges=normal", "--prefix=none", "--no-dedupe", "--workspace", f"--target={target}", "--format={p}"]
     lines = subprocess.run(tree, check=True, capture_output=True, text=True).stdout.splitlines()
     inside = {tuple(line.split()[:2]) for line in lines if line}
     facts = subprocess.run(["cargo", "metadata", "--locked", "--format-version=1", f"--filter-platform={target}"],
@@ -62,7 +62,7 @@ def main():
             without.append(f"{name} {version} ({licence})")
     print("Rust's standard library: MIT OR Apache-2.0 https://github.com/rust-lang/rust")
     print("LLVM's libc++, libc++abi and libunwind: Apache-2.0 WITH LLVM-exception https://llvm.org")
-    print("MuJoCo, lib/libmujoco.so.*: Apache-2.0 https://github.com/google-deepmind/mujoco\n")
+    print("MuJoCo, lib/libmuj-sr.so.*, its library under a name of our own: Apache-2.0 https://github.com/google-deepmind/mujoco\n")
     print("No licence text comes with the source of these; the texts of their licences are among those below:")
     print("  " + ", ".join(without))
     for title, text in of_mujoco().items():

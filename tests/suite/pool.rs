@@ -1,13 +1,16 @@
 //! Pools of many environments.
 
+use std::sync::atomic::AtomicBool;
+
 use rand::RngExt;
 use shadow_repose::env::{Autoreset, End, EnvBlock, EnvPool};
+use shadow_repose::ppo::RolloutBlock;
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::Repose;
+use shadow_repose::repose::{Lesson, Repose, Task};
 use shadow_repose::rng;
 use shadow_repose::schedule::in_rounds;
 
-use crate::support::{OBSERVATION_SIZE, task};
+use crate::support::{OBSERVATION_SIZE, config, started_agent, task};
 
 struct Played {
     /// Observations of all environments after each step.
@@ -262,4 +265,38 @@ fn the_rewards_of_a_step_outlive_the_start_of_the_next_episode() {
         let last = pool.pool.envs_mut().next().unwrap().last_step().reward.total();
         assert!(last != 0.0 && (last - f64::from(pool.rewards[0])).abs() < 1e-6, "{last} {:?}", pool.rewards);
     }
+}
+
+#[test]
+fn a_pool_that_is_stepped_at_once_with_the_actions_of_a_rollout_sees_what_the_rollout_saw() {
+    let config = config(&["env.num_envs=32", "env.max_episode_seconds=0.1", "training.goal_lifetime=5"]);
+    let task = Task::new(&config.env, &config.hand).unwrap();
+    let mut agent = started_agent(&task, &config);
+    agent.collect(&AtomicBool::new(false)).unwrap();
+    let envs = (0..32).map(|_| Repose::new(&task)).collect();
+    let mut pool = EnvPool::new(config.run.seed, envs, &Exchange::alone(1));
+    let (mut observations, mut rewards) = (vec![0.0; 32 * OBSERVATION_SIZE], vec![0.0; 32]);
+    pool.set_lesson(Lesson::at(0, &config));
+    pool.restart(&[true; 32], true, &mut observations);
+    let rollout = &agent.rollout;
+    let all = |of: fn(&RolloutBlock) -> &Vec<f32>, t: usize, width: usize| -> Vec<f32> {
+        rollout.blocks.iter().flat_map(|block| &of(block)[block.step(t, width)]).copied().collect()
+    };
+    let (mut ends, mut redirected) = (0, 0);
+    for t in 0..rollout.horizon() {
+        assert!(observations == all(|block| &block.observations, t, OBSERVATION_SIZE), "step {t}");
+        let actions = all(|block| &block.actions, t, 20);
+        let scaled = all(|block| &block.rewards, t, 1);
+        pool.step(&actions, Autoreset::SameStep, &mut rewards, &mut observations).unwrap();
+        let found: Vec<Option<End>> = pool.blocks.iter().flat_map(|block| block.ends.clone()).collect();
+        for ((end, reward), scaled) in found.iter().zip(&rewards).zip(scaled) {
+            // Elsewhere the rollout has added the value of the final observation.
+            if !matches!(end, Some(End::Truncated | End::Redirected)) {
+                assert_eq!(reward * config.ppo.reward_scale as f32, scaled);
+            }
+        }
+        ends += found.iter().flatten().count();
+        redirected += found.iter().filter(|end| **end == Some(End::Redirected)).count();
+    }
+    assert!(redirected > 20 && ends > redirected + 20, "{redirected} of {ends}");
 }

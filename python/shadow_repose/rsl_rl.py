@@ -1,0 +1,75 @@
+"""The hands for rsl_rl, the learner of Isaac Lab and mjlab.
+
+    from rsl_rl.runners import OnPolicyRunner
+    from shadow_repose import VectorEnv
+    from shadow_repose.rsl_rl import RslRlVecEnv
+
+    envs = RslRlVecEnv(VectorEnv(1024, training=True, goal_change="truncate", random_age=True), device="cuda")
+    OnPolicyRunner(envs, train_cfg, log_dir="logs", device="cuda").learn(1000)
+
+The observations are the group `policy`: `"obs_groups": {"actor": ["policy"], "critic": ["policy"]}`.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from .envs import VectorEnv
+
+
+class RslRlVecEnv(VecEnv):
+    """A `VectorEnv` as a `VecEnv` of rsl_rl, whose tensors lie on `device`. The hands themselves step on the CPU.
+
+    Give it hands with `goal_change="truncate"`: where a goal is replaced, rsl_rl then adds the value of the state before. Raises
+    ValueError for hands that do not reset in the same step.
+    """
+
+    def __init__(self, envs: VectorEnv, *, device: torch.device | str = "cpu") -> None:
+        if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
+            raise ValueError("rsl_rl needs hands with autoreset_mode = SAME_STEP")
+        self.envs, self.device, self.cfg = envs, device, envs.settings
+        self.num_envs, self.num_actions = envs.num_envs, envs.single_action_space.shape[0]
+        self.max_episode_length = envs.max_episode_steps
+        self._start(envs.reset()[0])
+
+    def _start(self, observations: np.ndarray) -> None:
+        self._observations = observations
+        self._lengths = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """The steps since the last end of each hand."""
+        return self._lengths
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, lengths: torch.Tensor) -> None:
+        """Starts all episodes again at random ages of the hands' own choice: the runner writes random lengths for just that."""
+        self._start(self.envs._open().reset(None, None, True))
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+    def get_observations(self) -> TensorDict:
+        """Returns the observations `[N, O]` to act on."""
+        return TensorDict({"policy": self._tensor(self._observations)}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Steps all hands once with `actions` `[N, A]`. Returns observations, rewards `[N]`, ends `[N]`, and what to log."""
+        self._observations, rewards, terminated, truncated, info = self.envs.step(actions.detach().cpu().numpy())
+        dones = self._tensor(terminated | truncated).long()
+        self._lengths = torch.where(dones.bool(), 0, self._lengths + 1)
+        extras: dict[str, Any] = {"time_outs": self._tensor(truncated)}
+        if "final_info" in info:
+            episode, over = info["final_info"]["episode"], info["_final_info"]
+            names = ("goals", "dropped", "rot_dist", "l", "r")
+            extras["log"] = {f"/episode/{name}": float(np.mean(episode[name][over])) for name in names}
+        return self.get_observations(), self._tensor(rewards), dones, extras
+
+    def close(self) -> None:
+        """Frees the hands."""
+        self.envs.close()

@@ -1,0 +1,87 @@
+"""The hands for Stable-Baselines3.
+
+    from stable_baselines3 import PPO
+    from shadow_repose import VectorEnv
+    from shadow_repose.sb3 import Sb3VecEnv
+
+    envs = Sb3VecEnv(VectorEnv(256, training=True, goal_change="truncate", random_age=True))
+    PPO("MlpPolicy", envs, n_steps=16, batch_size=1024).learn(1_000_000)
+"""
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from .envs import VectorEnv
+
+
+class Sb3VecEnv(VecEnv):
+    """A `VectorEnv` as a `VecEnv` of Stable-Baselines3.
+
+    Give it hands with `goal_change="truncate"`: where a goal is replaced, SB3 then adds the value of the last observation under the old
+    one. `info["episode"]` stands only at the end of an episode; besides `r`, `l` and `t` it holds `goals`, `dropped` and the rest of
+    `final_info`. Raises ValueError for hands that do not reset in the same step.
+    """
+
+    def __init__(self, envs: VectorEnv) -> None:
+        if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
+            raise ValueError("Stable-Baselines3 needs hands with autoreset_mode = SAME_STEP")
+        self.envs, self.render_mode, self._began = envs, None, time.time()
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Starts an episode of each hand, of the seed that `seed` has set, if any. Returns the observations `[N, O]`."""
+        seed = self._seeds[0]
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return self.envs.reset(seed=seed)[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Takes the actions `[N, A]` of the step that `step_wait` makes."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps all hands once."""
+        observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
+        dones = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(dones):
+            infos[i] = {"terminal_observation": info["final_obs"][i], "TimeLimit.truncated": bool(truncated[i])}
+            if "final_info" in info and info["_final_info"][i]:
+                episode = info["final_info"]["episode"]
+                known = {name: column[i].item() for name, column in episode.items() if name[0] != "_" and name != "reward"}
+                infos[i]["episode"] = {**known, "t": round(time.time() - self._began, 6)}
+        return observations, rewards, dones, infos
+
+    def close(self) -> None:
+        """Frees the hands."""
+        self.envs.close()
+
+    def _count(self, indices: None | int | Iterable[int]) -> int:
+        return len(list(self._get_indices(indices)))
+
+    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+        """Returns an attribute of the `VectorEnv` for each index: all hands share it."""
+        return [getattr(self.envs, attr_name)] * self._count(indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+        """Sets an attribute of the `VectorEnv`, e.g. `env_steps`, for all hands."""
+        setattr(self.envs, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: None | int | Iterable[int] = None, **kwargs: Any) -> list[Any]:
+        """Calls a method of the `VectorEnv` once, and returns its result for each index."""
+        return [getattr(self.envs, method_name)(*args, **kwargs)] * self._count(indices)
+
+    def env_is_wrapped(self, wrapper_class: type, indices: None | int | Iterable[int] = None) -> list[bool]:
+        """Returns False for each index."""
+        return [False] * self._count(indices)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Returns no pictures."""
+        return [None] * self.num_envs

@@ -1,0 +1,54 @@
+"""Learners of others, unchanged. Each test runs where its learner is installed."""
+import numpy as np
+import pytest
+
+from shadow_repose import Env, VectorEnv
+
+LEARNING = {"training": True, "goal_change": "truncate", "random_age": True, "seed": 1}
+
+
+def test_stable_baselines3_finds_one_hand_in_order():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(Env(set={"env.max_episode_seconds": 0.2}), warn=False)
+
+
+def test_stable_baselines3_learns_and_hears_of_every_end():
+    sb3 = pytest.importorskip("stable_baselines3")
+    from shadow_repose.sb3 import Sb3VecEnv
+
+    short = {"env.max_episode_seconds": 0.3, "training.goal_lifetime": 10}
+    envs = Sb3VecEnv(VectorEnv(64, set=short, **LEARNING))
+    observations = envs.reset()
+    ends = {"episode": 0, "goal": 0}
+    for _ in range(60):
+        before = observations
+        observations, rewards, dones, infos = envs.step(np.random.default_rng(0).uniform(-1, 1, (64, 20)))
+        for done, info in zip(dones, infos, strict=True):
+            assert done == ("terminal_observation" in info)
+            if done:
+                ends["episode" if "episode" in info else "goal"] += 1
+    assert min(ends.values()) > 50 and before.shape == observations.shape
+    assert envs.get_attr("env_steps", [0, 1]) == [60 * 64] * 2
+    learner = sb3.PPO("MlpPolicy", envs, n_steps=16, batch_size=256, n_epochs=1, device="cpu")
+    learner.learn(4096)
+    assert learner.num_timesteps == 4096 and len(learner.ep_info_buffer) > 0 and "goals" in learner.ep_info_buffer[0]
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        Sb3VecEnv(VectorEnv(2, autoreset_mode="NextStep"))
+
+
+def test_rsl_rl_learns():
+    runners = pytest.importorskip("rsl_rl.runners")
+    from shadow_repose.rsl_rl import RslRlVecEnv
+
+    envs = RslRlVecEnv(VectorEnv(64, set={"env.max_episode_seconds": 0.3}, **LEARNING))
+    network = {"class_name": "MLPModel", "hidden_dims": [32], "activation": "elu", "obs_normalization": True}
+    noise = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": "log"}
+    config = {
+        "num_steps_per_env": 8, "save_interval": 1000, "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "algorithm": {"class_name": "PPO", "num_learning_epochs": 1, "num_mini_batches": 2, "learning_rate": 1e-3},
+        "actor": {**network, "distribution_cfg": noise}, "critic": network,
+    }  # fmt: skip
+    runner = runners.OnPolicyRunner(envs, config, log_dir=None, device="cpu")
+    runner.learn(20, init_at_random_ep_len=True)
+    assert envs.envs.env_steps == 20 * 8 * 64 and envs.episode_length_buf.max() < 31
+    envs.close()
