@@ -82,9 +82,8 @@ impl Hand {
         let target = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
         let keyframe = scene.start(&parts.start).map_err(|error| problems.push(error.to_string()));
         let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
-        for (joint, _) in driven.iter().flatten() {
-            problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
-        }
+        let refused = driven.iter().flatten().filter_map(|(joint, _)| scene.hinge(joint).err());
+        problems.extend(refused.map(|error| error.to_string()));
         problems.sort();
         problems.dedup();
         let (Ok(cube), Ok(target), Ok(keyframe), []) = (cube, target, keyframe, &problems[..]) else {
