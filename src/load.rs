@@ -14,7 +14,6 @@ use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy, expect_safetensors};
 use crate::repose::{Record, Task};
 use crate::run;
-use crate::sim::Parts;
 
 /// The key of the only setting that is a path.
 pub const MODEL: &str = "env.model";
@@ -122,16 +121,12 @@ impl fmt::Display for PolicySource {
     }
 }
 
-/// A policy, and the task that it was trained for, overlaid with `--set`.
+/// A policy, and what its file tells of the task that it was trained for.
 pub struct Loaded {
     /// Where it comes from.
     pub origin: PolicySource,
     /// What a user is told that it is.
     pub name: String,
-    /// The settings of the task.
-    pub config: EnvConfig,
-    /// The parts of its hand that are named.
-    pub hand: Parts,
     /// The hand and the object that it was trained with.
     pub record: Record,
     /// The policy.
@@ -154,31 +149,23 @@ impl Loaded {
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
-        let (checkpoint, config) = origin.load(overrides)?;
-        let record = record(&checkpoint, &config.net)?;
-        let policy = Policy::load(&config.net, record.spaces(), &checkpoint)
+        let (checkpoint, PolicyConfig { net, .. }) = origin.load(overrides)?;
+        let record = record(&checkpoint, &net)?;
+        let policy = Policy::load(&net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let policy = Arc::new(policy);
         let name = match &origin {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
             PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
         };
-        Ok(Self { origin, name, config: config.env, hand: config.hand, record, policy, checkpoint })
+        Ok(Self { origin, name, record, policy, checkpoint })
     }
 
-    /// Loads its task.
+    /// Loads its task, with settings overlaid with `overrides`.
     ///
     /// # Errors
-    /// Fails if the scene cannot be used, or has another hand.
-    pub fn task(&self) -> Result<Arc<Task>> {
-        Task::new(&self.config, &self.hand)?.for_policy(&self.record)
-    }
-
-    /// Loads its task, with settings overlaid with other `overrides` than those with which it was loaded.
-    ///
-    /// # Errors
-    /// Fails as [`for_playing`] and [`Self::task`] do.
-    pub fn task_with(&self, overrides: &[Override]) -> Result<Arc<Task>> {
+    /// Fails as [`for_playing`] does, or if the scene cannot be used, or has another hand.
+    pub fn task(&self, overrides: &[Override]) -> Result<Arc<Task>> {
         let config = for_playing(&self.checkpoint, self.origin.path(), overrides)?;
         Task::new(&config.env, &config.hand)?.for_policy(&self.record)
     }

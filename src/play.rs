@@ -40,7 +40,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
     };
     let task = match &loaded {
-        Some(loaded) => loaded.task()?,
+        Some(loaded) => loaded.task(&args.set)?,
         None => Config::resolve(None, &args.set).and_then(|config| Task::new(&config.env, &config.hand))?,
     };
     let config = task.config();

@@ -69,7 +69,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
     output.as_ref().map(draw::picture_format).transpose()?;
     let task = |condition: &Condition| {
         let sets = [&args.set[..], &condition.sets].concat();
-        loaded.task_with(&sets).with_context(|| format!("row `{}`", condition.name))
+        loaded.task(&sets).with_context(|| format!("row `{}`", condition.name))
     };
     let conditions = conditions();
     // Found out now rather than after minutes.

@@ -15,13 +15,6 @@ pub struct Spaces {
     pub distance: fn(&Self, &[f32]) -> f32,
 }
 
-impl Spaces {
-    /// Returns the distance of an observation from its goal.
-    pub fn distance_of(&self, observation: &[f32]) -> f32 {
-        (self.distance)(self, observation)
-    }
-}
-
 /// The offsets of orientations (w, x, y, z) in an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct CubeAndGoal {
@@ -31,6 +24,6 @@ pub struct CubeAndGoal {
     pub goal: usize,
     /// The offset of the orientation of the cube relative to its goal.
     pub relative: usize,
-    /// The rotations that map the object onto itself: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
+    /// The rotations that a policy takes for the same: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
     pub symmetry: u32,
 }

@@ -17,9 +17,6 @@ use crate::sim::Parts;
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
 
-/// The keys of `[env]` whose values a scene gives unless the user names them.
-const OF_SCENE: [&str; 3] = ["goal_position", "num_hand_dofs", "num_actuators"];
-
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Override {
@@ -146,7 +143,7 @@ impl PolicyConfig {
             let is_used = |key: &str, value: &Value| match section.as_str() {
                 // The sizes of its hand are part of the policy.
                 "env" if ["num_envs", "num_hand_dofs", "num_actuators"].contains(&key) => false,
-                "env" if OF_SCENE.contains(&key) => !of_builtin || *value != DEFAULTS["env"][key],
+                "env" if key == "goal_position" => !of_builtin || *value != DEFAULTS["env"][key],
                 "env" | "hand" => true,
                 _ => OF_NETS.contains(&key),
             };
@@ -187,7 +184,7 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     let (file, given) = user.unzip();
     let mut named = BTreeSet::new();
     let mut lay = |table: &Table, merged: &mut Table| {
-        named.extend(OF_SCENE.into_iter().filter(|key| lookup(table, &format!("env.{key}")).is_some()));
+        named.extend(settings(table).map(|(key, _)| key));
         overlay(merged, table, &DEFAULTS, "", &mut problems);
     };
     [Some(under), given].iter().flatten().for_each(|table| lay(table, &mut merged));
@@ -209,9 +206,9 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     }
     let mut config = Config::deserialize(Value::Table(merged))?;
     let env = &mut config.env;
-    env.goal_position.named = named.contains("goal_position");
-    env.num_hand_dofs.named = named.contains("num_hand_dofs");
-    env.num_actuators.named = named.contains("num_actuators");
+    env.goal_position.named = named.contains("env.goal_position");
+    env.num_hand_dofs.named = named.contains("env.num_hand_dofs");
+    env.num_actuators.named = named.contains("env.num_actuators");
     problems.extend(violations(&config));
     if problems.is_empty() {
         return Ok(config);

@@ -12,20 +12,9 @@ use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os;
-use crate::repose::Hand;
+use crate::repose::Task;
 use crate::run;
 use graph::policy_graph;
-
-/// Returns what the hand is, for programs that refuse another.
-fn description(hand: &Hand) -> String {
-    let (joints, actuators) = (hand.joints.len(), hand.actuators.len());
-    let name = match hand.side() {
-        Some("rh_") => "right Shadow Hand",
-        Some("lh_") => "left Shadow Hand",
-        _ => "own hand",
-    };
-    format!("{name}, {joints} joints, {actuators} actuators")
-}
 
 /// Writes a policy as an ONNX file. The same policy gives the same bytes.
 ///
@@ -33,19 +22,18 @@ fn description(hand: &Hand) -> String {
 /// Fails if the policy, a setting or the scene cannot be used, or if the file cannot be written.
 pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
-    let mut loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
-    let task = loaded.task().context("the ranges of the actuators are those of the scene")?;
-    loaded.config = task.config().clone();
+    let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
+    let task = loaded.task(&args.set).context("the ranges of the actuators are those of the scene")?;
     task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
-    run::expect_output(&args.out, loaded.origin.file(), loaded.config.model_file())?;
+    run::expect_output(&args.out, loaded.origin.file(), task.config().model_file())?;
     let parts = &task.hand().parts;
     let mut names = [&parts.joints, &parts.actuators, &parts.fingertips].into_iter().flatten();
     if let Some(name) = names.find(|name| name.contains(',')) {
         bail!("`{name}`: lists in an exported file are comma-separated, so no name may hold a comma");
     }
     let output = os::OutputFile::create(&args.out)?;
-    let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, task.hand()));
+    let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, &task));
     output.finish(&bytes)?;
     os::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
     Ok(())
@@ -55,25 +43,28 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 ///
 /// The names are those that mjlab's runners expect, where they have one for it: `joint_names` are what an action drives, here the
 /// actuators, and their target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
-fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
-    let EnvConfig { act_moving_average, vel_obs_scale, .. } = loaded.config;
+fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
+    let (config, hand) = (task.config(), task.hand());
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
     let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
-    let parts = &hand.parts;
-    let groups = &hand.layout.groups;
-    let progress = &loaded.checkpoint.progress;
+    let (parts, groups, progress) = (&hand.parts, &hand.layout.groups, &loaded.checkpoint.progress);
+    let kind = match hand.side() {
+        Some("rh_") => "right Shadow Hand",
+        Some("lh_") => "left Shadow Hand",
+        _ => "own hand",
+    };
     let mut facts = vec![
         ("action_offset", offsets.clone()),
         ("action_scale", list(ranges().map(|[low, high]| (high - low) / 2.0))),
         ("actions_clipped", "true".into()),
         ("commit", env!("SHADOW_REPOSE_COMMIT").into()),
-        ("config", settings(loaded)),
-        ("ctrl_dt", loaded.config.ctrl_dt.to_string()),
+        ("config", settings(loaded, config)),
+        ("ctrl_dt", config.ctrl_dt.to_string()),
         ("default_joint_pos", offsets),
-        ("ema_alpha", act_moving_average.to_string()),
+        ("ema_alpha", config.act_moving_average.to_string()),
         ("fingertip_names", list(&parts.fingertips)),
         ("goal_name", parts.goal.clone()),
-        ("hand", description(hand)),
+        ("hand", format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())),
         ("hinge_names", list(&parts.joints)),
         ("joint_names", list(&parts.actuators)),
         ("object_name", parts.object.clone()),
@@ -82,7 +73,7 @@ fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
         ("program", concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into()),
         ("quaternion_order", "wxyz, w >= 0 but for the fingertips".into()),
         ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
-        ("vel_obs_scale", vel_obs_scale.to_string()),
+        ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
     if progress.env_steps > 0 {
         facts.push(("env_steps", progress.env_steps.to_string()));
@@ -93,9 +84,9 @@ fn metadata(loaded: &Loaded, hand: &Hand) -> Vec<(&'static str, String)> {
 }
 
 /// Returns all settings of the training as TOML, with the task as it is exported.
-fn settings(loaded: &Loaded) -> String {
+fn settings(loaded: &Loaded, config: &EnvConfig) -> String {
     let mut table: Table = loaded.checkpoint.config.parse().expect("it was read when the policy was loaded");
-    table.insert("env".into(), Value::try_from(&loaded.config).expect("settings are a table"));
+    table.insert("env".into(), Value::try_from(config).expect("settings are a table"));
     table.to_string()
 }
 

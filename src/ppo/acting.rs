@@ -53,7 +53,8 @@ impl Acting<'_> {
             return 1.0;
         }
         let [near, far] = self.config.away_range.map(|distance| distance as f32);
-        let fraction = ((self.policy.spaces().distance_of(observation) - near) / (far - near)).clamp(0.0, 1.0);
+        let spaces = self.policy.spaces();
+        let fraction = (((spaces.distance)(spaces, observation) - near) / (far - near)).clamp(0.0, 1.0);
         1.0 + (self.away_scale - 1.0) * fraction
     }
 

@@ -5,7 +5,7 @@
 //! same actions, and the remaining rotation to the goal is the same. So if each observation is first mapped to one of
 //! the 24 equivalent ones, a policy has to learn only that one.
 
-use anyhow::{Context, Result};
+use anyhow::{Result, ensure};
 
 use super::normalizer::Normalizer;
 use super::widest::widest;
@@ -34,12 +34,12 @@ impl Perception {
     /// # Errors
     /// Fails if the setting is the symmetry of a cube but the observations contain no cube.
     pub fn new(symmetry: Symmetry, spaces: &Spaces) -> Result<Self> {
-        let place = || spaces.cube_and_goal.context("ppo.symmetry = \"cube\": this task has no cube");
-        let (cube_and_goal, mask) = match symmetry {
-            Symmetry::None => (None, 1),
-            Symmetry::Cube => (Some(place()?), u32::MAX),
-            Symmetry::Object => (spaces.cube_and_goal, spaces.cube_and_goal.map_or(1, |places| places.symmetry)),
-        };
+        let cube_and_goal = spaces.cube_and_goal.filter(|_| symmetry != Symmetry::None);
+        ensure!(
+            symmetry != Symmetry::Cube || cube_and_goal.is_some(),
+            "ppo.symmetry = \"cube\": this task has no cube"
+        );
+        let mask = cube_and_goal.map_or(1, |places| places.symmetry);
         let mut rotations = [CUBE_ROTATIONS[0]; CUBE_ROTATIONS.len()];
         let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
         rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
@@ -117,7 +117,7 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 20,
         action_size: 1,
-        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11, relative: 0, symmetry: 1 }),
+        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11, relative: 0, symmetry: u32::MAX }),
         distance: |_, _| 0.0,
     };
 

@@ -19,7 +19,7 @@ use crate::config::{EnvConfig, SuccessHold};
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Physics, Pose, Simulation, Velocity};
+use crate::sim::{Actuator, Physics, Pose, Simulation, Velocity};
 use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
@@ -152,13 +152,6 @@ impl Repose {
         quat::uniform([draw(), draw(), draw()])
     }
 
-    fn set_goal(&mut self) {
-        self.goal = self.draw_rotation();
-        let [x, y, z] = self.task.config.goal_position.value;
-        let position = [x, y, z + self.task.config.target_height];
-        self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
-    }
-
     /// Returns the pose of the object.
     pub fn cube(&self) -> Pose {
         let at = self.task.hand.cube.qpos;
@@ -224,7 +217,10 @@ impl Repose {
 
     /// Draws a new goal and resets the hold counter.
     fn replace_goal(&mut self) {
-        self.set_goal();
+        self.goal = self.draw_rotation();
+        let [x, y, z] = self.task.config.goal_position.value;
+        let position = [x, y, z + self.task.config.target_height];
+        self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
@@ -309,16 +305,14 @@ impl Env for Repose {
         }
         let orientation = self.draw_rotation();
         self.sim.qpos_mut()[hand.cube.qpos + 3..hand.cube.qpos + 7].copy_from_slice(&orientation);
-        self.set_goal();
-        let lengths = self.sim.lengths(&hand.actuators).zip(&hand.actuators);
-        let targets = lengths.map(|(length, actuator)| length.clamp(actuator.range[0], actuator.range[1]));
-        self.servos.reset(targets, self.conditions.delay(&self.task));
+        self.replace_goal();
+        let target = |actuator: &Actuator| self.sim.length(*actuator).clamp(actuator.range[0], actuator.range[1]);
+        self.servos.reset(hand.actuators.iter().map(target), self.conditions.delay(&self.task));
         self.send();
         self.now.action.fill(0.0);
-        (self.age, self.held) = (0, 0);
+        self.age = 0;
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
         self.recorder.clear();
-        self.sim.refresh();
         self.show(observation);
     }
 

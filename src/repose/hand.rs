@@ -82,9 +82,8 @@ impl Hand {
         let target = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
         let keyframe = scene.start(&parts.start).map_err(|error| problems.push(error.to_string()));
         let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
-        for (joint, _) in driven.iter().flatten() {
-            problems.extend(scene.hinge(joint).err().map(|error| error.to_string()));
-        }
+        let refused = driven.iter().flatten().filter_map(|(joint, _)| scene.hinge(joint).err());
+        problems.extend(refused.map(|error| error.to_string()));
         problems.sort();
         problems.dedup();
         let (Ok(cube), Ok(target), Ok(keyframe), []) = (cube, target, keyframe, &problems[..]) else {
@@ -96,12 +95,9 @@ impl Hand {
             "has {controls} controls, but it must have exactly the {} of the hand",
             actuators.len()
         );
-        let mut roots: Vec<Body> = Vec::new();
-        for root in fingertips.iter().map(|&tip| scene.root(scene.body_of(tip))) {
-            if !roots.contains(&root) {
-                roots.push(root);
-            }
-        }
+        let mut roots: Vec<Body> = fingertips.iter().map(|&tip| scene.root(tip)).collect();
+        roots.sort();
+        roots.dedup();
         let start = scene.pose_of(keyframe);
         let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
         let hand = Self { parts, joints, actuators, driven, fingertips, roots, cube, target, keyframe, start, layout };
@@ -130,13 +126,8 @@ impl Hand {
                 Some(finger) => vec![format!("{prefix}{finger}J1"), format!("{prefix}{finger}J2")],
                 None => vec![format!("{prefix}{actuator}")],
             };
-            let mut found: Vec<(String, f64)> = driven.clone();
-            found.sort_by(|a, b| a.0.cmp(&b.0));
-            let is_right = found
-                .iter()
-                .map(|(name, coefficient)| (name, *coefficient))
-                .eq(expected.iter().map(|name| (name, 1.0)));
-            ensure!(is_right, "actuator `{name}` must drive {}", expected.join(" + "));
+            let all = expected.iter().all(|joint| driven.contains(&(joint.clone(), 1.0)));
+            ensure!(all && driven.len() == expected.len(), "actuator `{name}` must drive {}", expected.join(" + "));
         }
         Ok(())
     }
@@ -144,20 +135,18 @@ impl Hand {
 
 /// Returns the parts of a Shadow Hand, if all of its names are there with one prefix.
 fn shadow_hand(scene: &Scene) -> Option<Parts> {
-    let firsts = scene.joints();
-    let mut prefixes = firsts.iter().filter_map(|name| name.strip_suffix(JOINTS[0]));
+    let (joints, actuators) = (scene.joints(), scene.actuators());
     let with = |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
-    prefixes.find_map(|prefix| {
-        let parts = Parts {
-            joints: with(&JOINTS, prefix),
-            actuators: with(&ACTUATORS, &format!("{prefix}A_")),
-            fingertips: with(&FINGERTIPS, prefix),
-            ..Parts::default()
-        };
-        let all = |kind: &str, names: &[String]| names.iter().all(|name| scene.has(kind, name));
-        let is_there =
-            all("joint", &parts.joints) && all("actuator", &parts.actuators) && all("body", &parts.fingertips);
-        is_there.then_some(parts)
+    let mut hands = joints.iter().filter_map(|name| name.strip_suffix(JOINTS[0])).map(|prefix| Parts {
+        joints: with(&JOINTS, prefix),
+        actuators: with(&ACTUATORS, &format!("{prefix}A_")),
+        fingertips: with(&FINGERTIPS, prefix),
+        ..Parts::default()
+    });
+    hands.find(|hand| {
+        hand.joints.iter().all(|name| joints.contains(name))
+            && hand.actuators.iter().all(|name| actuators.contains(name))
+            && hand.fingertips.iter().all(|name| scene.body(name).is_ok())
     })
 }
 

@@ -29,22 +29,18 @@ impl Mirror {
     /// # Errors
     /// Fails if the fingertips of one are not where those of the other are in the mirror, in any of the recorded poses.
     pub(super) fn new(here: &Record, policy: &Record, layout: &Layout) -> Result<Self> {
-        let count = here.fingertips.len();
-        let tip = |record: &Record, i: usize| -> ([f64; 3], Quat) {
-            let [x, y, z, qw, qx, qy, qz] = record.tips[i];
-            ([x, y, z], [qw, qx, qy, qz])
+        // Returns how far a fingertip is from that of the other hand in a recorded pose, and the rotation between the two.
+        let compare = |at: usize| {
+            let ([x, y, z, own @ ..], [a, b, c, other @ ..]) = (here.tips[at], policy.tips[at]);
+            let apart = [x - a, -y - b, z - c].into_iter().map(f64::abs).fold(0.0, f64::max);
+            (apart, quat::mul(quat::conj(mirrored(own)), other))
         };
         let mut tips = Vec::new();
         for (i, start) in layout.tips().enumerate() {
-            let between = |at: usize| {
-                let ((_, own), (_, other)) = (tip(here, at), tip(policy, at));
-                quat::mul(quat::conj(mirrored(own)), other)
-            };
-            let turn = between(i);
-            for at in [i, i + count] {
-                let (([x, y, z], _), (other, _)) = (tip(here, at), tip(policy, at));
-                let apart = [x, -y, z].iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                let turned = between(at).iter().zip(turn).map(|(a, b)| a * b).sum::<f64>();
+            let poses = [i, i + here.fingertips.len()].map(compare);
+            let (_, turn) = poses[0];
+            for (apart, between) in poses {
+                let turned = between.iter().zip(turn).map(|(a, b)| a * b).sum::<f64>();
                 ensure!(
                     apart <= TOLERANCE && turned >= 1.0 - TOLERANCE,
                     "the hand is not the mirror image of the policy's in the plane y = 0: the fingertip `{}` is {:.1} mm off",

@@ -81,12 +81,12 @@ impl Layout {
 
     /// Returns the indices of the values that change their sign in the mirror, the plane y = 0 of the world.
     pub(super) fn mirrored(&self) -> Vec<usize> {
-        let of_group = |group: &Group| {
-            let (Group { start, length, mirrored, .. }, own) = (*group, group.length.min(TIP_SIZE));
-            let parts = (start..start + length).step_by(own.max(1));
-            parts.flat_map(|part| mirrored.iter().map(move |i| part + i)).collect::<Vec<_>>()
+        // No other group in which something changes is longer than one fingertip.
+        let of_group = |Group { start, length, mirrored, .. }: Group| {
+            let parts = (start..start + length).step_by(TIP_SIZE);
+            parts.flat_map(move |part| mirrored.iter().map(move |i| part + i))
         };
-        self.groups.iter().flat_map(of_group).collect()
+        self.groups.into_iter().flat_map(of_group).collect()
     }
 
     /// Returns the description of observations and actions for a learner, for an object with these rotations.

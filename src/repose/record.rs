@@ -8,7 +8,7 @@ use super::observation::Layout;
 use crate::config::Symmetry;
 use crate::os::shortened;
 use crate::quat::CUBE_ROTATIONS;
-use crate::sim::{Parts, Scene, Simulation};
+use crate::sim::{Frame, Parts, Pose, Scene, Simulation};
 use crate::spaces::Spaces;
 
 /// The most bytes of a record that are read; that of the Shadow Hand has three thousand.
@@ -53,9 +53,9 @@ impl Record {
         ensure!(text.len() <= LONGEST, "its metadata `hand` has {} bytes; at most {LONGEST} are read", text.len());
         let record = serde_json::from_str::<Self>(text);
         let record = record.map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
-        let [joints, actuators, tips] = [&record.joints, &record.actuators, &record.fingertips].map(Vec::len);
-        let lists = [record.ranges.len(), record.driven.len(), record.tips.len(), record.symmetry.len()];
-        let fits = lists[..2] == [actuators; 2] && lists[2] == POSES.len() * tips && joints > 0 && actuators > 0;
+        let (actuators, tips) = (record.actuators.len(), POSES.len() * record.fingertips.len());
+        let sizes = [record.ranges.len(), record.driven.len(), record.tips.len()];
+        let fits = sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
         let symmetry = record.symmetry.first() == Some(&0) && record.symmetry.iter().all(|&rotation| rotation < 24);
         ensure!(fits && symmetry, "its metadata `hand` has lists of other lengths than its hand needs");
         Ok(record)
@@ -115,8 +115,7 @@ impl Record {
             bail!("the policy is for another hand: {scene} has {}{hint}", shortened(&differ.join(", ")));
         }
         let apart = |i: usize| {
-            let sum =
-                |record: &Self| -> Vec<f64> { record.driven[i].iter().map(|(_, coefficient)| *coefficient).collect() };
+            let sum = |of: &Self| of.driven[i].iter().map(|(_, coefficient)| *coefficient).collect::<Vec<_>>();
             (0..2).any(|end| (self.ranges[i][end] - there.ranges[i][end]).abs() > 1e-4) || sum(self) != sum(there)
         };
         let others: Vec<&str> = (0..self.ranges.len()).filter(|&i| apart(i)).map(|i| &*there.actuators[i]).collect();
@@ -146,10 +145,9 @@ fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
         sim.qpos_mut()[joint.qpos] = joint.range[0] + fraction * (joint.range[1] - joint.range[0]);
     }
     sim.refresh();
-    let pose = |tip| {
-        let pose = sim.pose(tip);
-        let ([x, y, z], [qw, qx, qy, qz]) = (pose.position, pose.orientation);
+    let pose = |tip: &Frame| {
+        let Pose { position: [x, y, z], orientation: [qw, qx, qy, qz] } = sim.pose(*tip);
         [x, y, z, qw, qx, qy, qz]
     };
-    hand.fingertips.iter().map(|&tip| pose(tip)).collect()
+    hand.fingertips.iter().map(pose).collect()
 }

@@ -121,10 +121,8 @@ impl Task {
         if timestep != sim_dt {
             notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
         }
-        let (mut used, mut unused) = (Vec::new(), Vec::new());
-        for (i, key) in self.scene.keyframes().into_iter().enumerate() {
-            if Some(i) == self.hand.keyframe { &mut used } else { &mut unused }.push(format!("`{key}`"));
-        }
+        let mut unused: Vec<String> = self.scene.keyframes().iter().map(|key| format!("`{key}`")).collect();
+        let used = Vec::from_iter(self.hand.keyframe.map(|keyframe| unused.remove(keyframe)));
         for (keys, what) in [(used, "episodes start in the keyframe"), (unused, "not used are the keyframes")] {
             if !keys.is_empty() {
                 notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
@@ -136,7 +134,7 @@ impl Task {
                 "{alike} of the 24 rotations of a cube map `{object}` onto itself (ppo.symmetry = \"object\")"
             ));
         }
-        let round: String = self.scene.round_axes(self.hand.cube.body).into_iter().collect();
+        let round = self.scene.round_axes(self.hand.cube.body);
         if !round.is_empty() {
             notes.push(format!(
                 "no turn of `{object}` about its axes {round} can be seen or felt, but goals differ by such turns, and scores count them"
@@ -175,7 +173,7 @@ impl Task {
     /// # Errors
     /// Fails if the policy is for another hand.
     pub fn for_policy(mut self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
-        let (here, place) = (self.record(), self.origin());
+        let (here, place) = (self.record(), origin(self.config.model_file()));
         let mut warnings = Vec::from_iter(policy.expect_fits(&here, self.config.mirror, &place)?);
         if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
             warnings.push(format!(
@@ -212,11 +210,6 @@ impl Task {
     /// Returns the description of observations and actions for a learner.
     pub fn spaces(&self) -> Spaces {
         self.hand.layout.spaces(&self.symmetry)
-    }
-
-    /// Returns the name of the scene, for messages.
-    pub fn origin(&self) -> String {
-        origin(self.config.model_file())
     }
 
     /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's), and with a centre

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail, ensure};
 use mujoco_rs::prelude::{
     MjModel, MjtBias, MjtDisableBit, MjtDyn, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn,
-    MjtWrap,
 };
 
 use super::Look;
@@ -55,7 +54,7 @@ pub struct FreeJoint {
 }
 
 /// A body.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Body(pub(super) usize);
 
 /// A body or a site, whose pose and velocity can be read.
@@ -184,11 +183,16 @@ impl Scene {
     /// Fails if there is no such body or its first joint is not a free joint.
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
         let body = self.body(name)?;
-        let joint = usize::try_from(self.model.body_jntadr()[body.0]).ok();
-        let free = joint.filter(|&j| self.model.jnt_type()[j] == MjtJoint::mjJNT_FREE);
-        let joint = free.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
+        let joint = self.free_joint(body.0);
+        let joint = joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
         let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
         Ok(FreeJoint { body, qpos, dof })
+    }
+
+    /// Returns the number of the first joint of a body if it is a free joint.
+    pub(super) fn free_joint(&self, body: usize) -> Option<usize> {
+        let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
+        joint.filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE)
     }
 
     /// Returns the timestep in its file, s, in whose place another is used.
@@ -221,14 +225,6 @@ impl Scene {
         Ok(Frame::Site(self.find(MjtObjBase::mjOBJ_SITE, "body or site", name)?))
     }
 
-    /// Returns the body that carries a frame.
-    pub fn body_of(&self, frame: Frame) -> Body {
-        match frame {
-            Frame::Body(body) => body,
-            Frame::Site(site) => Body(self.model.site_bodyid()[site] as usize),
-        }
-    }
-
     /// Returns the number of the keyframe in which an episode starts: `name`, else `start` or `home`, else the only one, if any.
     ///
     /// # Errors
@@ -247,8 +243,12 @@ impl Scene {
         keyframe.map_or(self.model.qpos0(), |key| &self.model.key_qpos()[key * size..][..size]).to_vec()
     }
 
-    /// Returns the first body of the kinematic tree to which `body` belongs.
-    pub fn root(&self, Body(body): Body) -> Body {
+    /// Returns the first body of the kinematic tree to which a frame belongs.
+    pub fn root(&self, frame: Frame) -> Body {
+        let body = match frame {
+            Frame::Body(Body(body)) => body,
+            Frame::Site(site) => self.model.site_bodyid()[site] as usize,
+        };
         Body(self.model.body_rootid()[body] as usize)
     }
 
@@ -284,33 +284,6 @@ impl Scene {
         let one_limited = self.model.actuator_ctrlnum()[id] == 1 && self.model.actuator_ctrllimited()[ctrl];
         ensure!(one_limited, "actuator `{name}` must have one control with a ctrlrange");
         Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
-    }
-
-    /// Returns the joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
-    /// in space drives no sum.
-    pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
-        let target = self.model.actuator_trnid()[actuator.id][0] as usize;
-        let name = |joint: usize| self.model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
-        if self.model.actuator_trntype()[actuator.id] == MjtTrn::mjTRN_JOINT {
-            return vec![(name(target), 1.0)];
-        }
-        let first = self.model.tendon_adr()[target] as usize;
-        let path = first..first + self.model.tendon_num()[target] as usize;
-        path.filter(|&wrap| self.model.wrap_type()[wrap] == MjtWrap::mjWRAP_JOINT)
-            .map(|wrap| (name(self.model.wrap_objid()[wrap] as usize), self.model.wrap_prm()[wrap]))
-            .collect()
-    }
-
-    /// Returns whether the scene has a joint, an actuator, a site, a keyframe or a body of this name.
-    pub fn has(&self, kind: &str, name: &str) -> bool {
-        let kind = match kind {
-            "joint" => MjtObjBase::mjOBJ_JOINT,
-            "actuator" => MjtObjBase::mjOBJ_ACTUATOR,
-            "site" => MjtObjBase::mjOBJ_SITE,
-            "keyframe" => MjtObjBase::mjOBJ_KEY,
-            _ => MjtObjBase::mjOBJ_BODY,
-        };
-        self.model.name_to_id(kind, name).is_some()
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {

@@ -167,13 +167,9 @@ impl Simulation {
         Ok(())
     }
 
-    /// Returns the lengths of actuators at `qpos`: angles, sums of angles, or lengths of tendons in m.
-    pub fn lengths<'a>(&'a mut self, actuators: &'a [Actuator]) -> impl Iterator<Item = f64> + 'a {
-        self.data.kinematics();
-        self.data.com_pos();
-        self.data.tendon_comp();
-        self.data.transmission();
-        actuators.iter().map(|actuator| self.data.actuator_length()[actuator.id])
+    /// Returns the length of an actuator: an angle, a sum of angles, or the length of a tendon in m.
+    pub fn length(&self, actuator: Actuator) -> f64 {
+        self.data.actuator_length()[actuator.id]
     }
 
     /// Returns the pose of a frame.

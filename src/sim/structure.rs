@@ -6,7 +6,7 @@ use anyhow::{Result, bail};
 use mujoco_rs::prelude::{MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
 use serde::{Deserialize, Serialize};
 
-use super::Scene;
+use super::{Actuator, Scene};
 use crate::os::shortened;
 
 /// The names of what a task uses in a scene. What is empty is found by structure.
@@ -40,7 +40,7 @@ impl Scene {
     pub fn find_parts(&self, named: &Parts) -> Result<Parts> {
         let (mut parts, mut problems) = (named.clone(), Vec::new());
         if parts.actuators.is_empty() {
-            parts.actuators = self.names(MjtObjBase::mjOBJ_ACTUATOR, &mut problems);
+            parts.actuators = self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut problems);
         }
         let actuators: Vec<usize> =
             parts.actuators.iter().filter_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, name)).collect();
@@ -51,30 +51,24 @@ impl Scene {
             .filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_HINGE && self.model.jnt_limited()[joint])
             .collect();
         if parts.joints.is_empty() {
-            let names = hinges.iter().map(|&joint| self.name(MjtObjBase::mjOBJ_JOINT, joint));
-            parts.joints = names.filter_map(|name| name.map_err(|problem| problems.push(problem)).ok()).collect();
+            parts.joints = self.names(MjtObjBase::mjOBJ_JOINT, hinges.iter().copied(), &mut problems);
         }
         if parts.joints.is_empty() || parts.actuators.is_empty() {
             let found = "position servos that move limited hinges are needed";
             problems.push(format!("has no hand: {found}; hand.joints and hand.actuators name them"));
         }
         if parts.fingertips.is_empty() {
-            parts.fingertips = self.last_bodies(&hinges, &of_hand, &mut problems);
+            parts.fingertips = self.names(MjtObjBase::mjOBJ_BODY, self.last_bodies(&hinges), &mut problems);
         }
         if parts.fingertips.is_empty() {
             problems.push("has no fingertips; hand.fingertips names them".into());
         }
-        let mut free = Vec::new();
-        let mut goals = Vec::new();
-        for body in (1..self.model.nbody() as usize).filter(|&body| !of_hand(body)) {
-            let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
-            if joint.is_some_and(|joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE) {
-                free.push(self.name(MjtObjBase::mjOBJ_BODY, body));
-            }
-            if self.model.body_mocapid()[body] >= 0 {
-                goals.push(self.name(MjtObjBase::mjOBJ_BODY, body));
-            }
-        }
+        let others = |is_sought: &dyn Fn(usize) -> bool| -> Vec<Result<String, String>> {
+            let found = (1..self.model.nbody() as usize).filter(|&body| !of_hand(body) && is_sought(body));
+            found.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
+        };
+        let free = others(&|body| self.free_joint(body).is_some());
+        let goals = others(&|body| self.model.body_mocapid()[body] >= 0);
         for (found, part, none, what, setting) in [
             (free, &mut parts.object, Some(NO_OBJECT), "bodies with a free joint", "hand.object"),
             (goals, &mut parts.goal, None, "mocap bodies", "hand.goal"),
@@ -97,13 +91,8 @@ impl Scene {
         Ok(parts)
     }
 
-    /// Returns the bodies of the hand, below a hinge, that carry no other body.
-    fn last_bodies(
-        &self,
-        hinges: &[usize],
-        of_hand: &dyn Fn(usize) -> bool,
-        problems: &mut Vec<String>,
-    ) -> Vec<String> {
+    /// Returns the bodies that one of these hinges moves and that carry no other body.
+    fn last_bodies(&self, hinges: &[usize]) -> Vec<usize> {
         let count = self.model.nbody() as usize;
         let (mut moved, mut carries) = (vec![false; count], vec![false; count]);
         hinges.iter().for_each(|&joint| moved[self.model.jnt_bodyid()[joint] as usize] = true);
@@ -113,33 +102,40 @@ impl Scene {
             moved[body] |= moved[parent];
             carries[parent] = true;
         }
-        let last = (1..count).filter(|&body| moved[body] && !carries[body] && of_hand(body));
-        let names = last.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body));
-        names.filter_map(|name| name.map_err(|problem| problems.push(problem)).ok()).collect()
+        (1..count).filter(|&body| moved[body] && !carries[body]).collect()
     }
 
     /// Returns the first bodies of the trees that an actuator moves.
-    fn trees_of(&self, actuator: usize) -> Vec<usize> {
+    fn trees_of(&self, actuator: usize) -> impl Iterator<Item = usize> {
+        let bodies = self.wraps(actuator).into_iter().filter_map(|(kind, id, _)| match kind {
+            MjtWrap::mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
+            MjtWrap::mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
+            _ => None,
+        });
+        bodies.map(|body| self.model.body_rootid()[body as usize] as usize).filter(|&root| root != 0)
+    }
+
+    /// Returns the joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
+    /// in space drives no sum.
+    pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
+        let name = |joint: usize| self.model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
+        let joints = self.wraps(actuator.id).into_iter().filter(|(kind, ..)| *kind == MjtWrap::mjWRAP_JOINT);
+        joints.map(|(_, joint, coefficient)| (name(joint), coefficient)).collect()
+    }
+
+    /// Returns what an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
+    fn wraps(&self, actuator: usize) -> Vec<(MjtWrap, usize, f64)> {
         let target = self.model.actuator_trnid()[actuator][0] as usize;
-        let bodies: Vec<i32> = match self.model.actuator_trntype()[actuator] {
-            MjtTrn::mjTRN_JOINT => vec![self.model.jnt_bodyid()[target]],
+        let wrap =
+            |at: usize| (self.model.wrap_type()[at], self.model.wrap_objid()[at] as usize, self.model.wrap_prm()[at]);
+        match self.model.actuator_trntype()[actuator] {
+            MjtTrn::mjTRN_JOINT => vec![(MjtWrap::mjWRAP_JOINT, target, 1.0)],
             MjtTrn::mjTRN_TENDON => {
                 let first = self.model.tendon_adr()[target] as usize;
-                let path = first..first + self.model.tendon_num()[target] as usize;
-                path.filter_map(|wrap| {
-                    let id = self.model.wrap_objid()[wrap] as usize;
-                    match self.model.wrap_type()[wrap] {
-                        MjtWrap::mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
-                        MjtWrap::mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
-                        _ => None,
-                    }
-                })
-                .collect()
+                (first..first + self.model.tendon_num()[target] as usize).map(wrap).collect()
             }
             _ => Vec::new(),
-        };
-        let roots = bodies.into_iter().map(|body| self.model.body_rootid()[body as usize] as usize);
-        roots.filter(|&root| root != 0).collect()
+        }
     }
 
     /// Returns the name of an object, or a sentence if it has none.
@@ -153,14 +149,19 @@ impl Scene {
         name.map(str::to_owned).ok_or_else(|| format!("{what} {id} of the compiled scene needs a name"))
     }
 
-    fn names(&self, kind: MjtObjBase, problems: &mut Vec<String>) -> Vec<String> {
-        let count = if kind == MjtObjBase::mjOBJ_ACTUATOR { self.model.nactuator() } else { self.model.njnt() };
-        let names = (0..count as usize).map(|id| self.name(kind, id));
+    /// Returns the names of those objects that have one, and lists the others.
+    fn names(&self, kind: MjtObjBase, ids: impl IntoIterator<Item = usize>, problems: &mut Vec<String>) -> Vec<String> {
+        let names = ids.into_iter().map(|id| self.name(kind, id));
         names.filter_map(|name| name.map_err(|problem| problems.push(problem)).ok()).collect()
     }
 
     /// Returns the names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
-        self.names(MjtObjBase::mjOBJ_JOINT, &mut Vec::new())
+        self.names(MjtObjBase::mjOBJ_JOINT, 0..self.model.njnt() as usize, &mut Vec::new())
+    }
+
+    /// Returns the names of all actuators that have one.
+    pub fn actuators(&self) -> Vec<String> {
+        self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut Vec::new())
     }
 }

@@ -45,15 +45,10 @@ impl Scene {
     }
 
     /// Returns the axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
-    pub fn round_axes(&self, body: Body) -> Vec<char> {
-        let form = self.form(body);
-        let about = |axis: usize| {
-            let (sin, cos) = 0.5_f64.sin_cos();
-            let mut turn = [cos, 0.0, 0.0, 0.0];
-            turn[1 + axis] = sin;
-            form.holds(turn)
-        };
-        "xyz".chars().enumerate().filter(|&(axis, _)| about(axis)).map(|(_, name)| name).collect()
+    pub fn round_axes(&self, body: Body) -> String {
+        let (form, (sin, cos)) = (self.form(body), 0.5_f64.sin_cos());
+        let turns = [('x', [cos, sin, 0.0, 0.0]), ('y', [cos, 0.0, sin, 0.0]), ('z', [cos, 0.0, 0.0, sin])];
+        turns.into_iter().filter(|&(_, turn)| form.holds(turn)).map(|(axis, _)| axis).collect()
     }
 
     fn form(&self, Body(top): Body) -> Form {
@@ -231,7 +226,7 @@ mod tests {
             ("", "<geom type='cylinder' size='.025 .025'/><geom type='box' size='.01 .01 .01' pos='.02 0 0'/>"),
         ] {
             let (scene, body) = scene_with(object);
-            assert_eq!(scene.round_axes(body).iter().collect::<String>(), axes, "{object}");
+            assert_eq!(scene.round_axes(body), axes, "{object}");
         }
     }
 

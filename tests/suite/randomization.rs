@@ -385,7 +385,7 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
         let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
         let loaded = Loaded::find(Some(&place), &sets).unwrap();
         let episodes = Episodes { seed: 0, purpose: "evaluation", first: 0, count };
-        let (task, actor) = (loaded.task().unwrap(), Actor::Mean(loaded.policy.freeze()));
+        let (task, actor) = (loaded.task(&sets).unwrap(), Actor::Mean(loaded.policy.freeze()));
         let trial = Trial { task: &task, actor: &actor, episodes, stop: &AtomicBool::new(false) };
         let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
         Score::of(&played).rot_dist
