@@ -32,6 +32,7 @@ class Policy:
         if not isinstance(native, _native.Policy):
             raise TypeError("create a policy by Policy.load(place)")
         self._native = native
+        self._set: dict[str, Any] = {}
 
     @classmethod
     def load(cls, place: str | os.PathLike[str] = "builtin", *, set: Mapping[str, Any] | None = None) -> Policy:
@@ -48,7 +49,9 @@ class Policy:
         place = os.fspath(place)
         if place not in BUILT_IN and not os.path.exists(place):
             raise FileNotFoundError(f"{place}: no such checkpoint or run folder; built in are {' and '.join(BUILT_IN)}")
-        return cls(_native.Policy(place, pairs(set)))
+        policy = cls(_native.Policy(place, pairs(set)))
+        policy._set.update(set or {})
+        return policy
 
     def __call__(
         self, observations: ArrayLike, *, deterministic: bool = True, rng: np.random.Generator | None = None
@@ -97,10 +100,14 @@ class Policy:
         return VectorEnv(num_envs, policy=self, **options)
 
     def __reduce__(self) -> Any:
-        return Policy.load, (os.fspath(self._native.place),)
+        return _reload, (os.fspath(self._native.place), self._set)
 
     def __repr__(self) -> str:
         return f"<Policy: {self._native.name}>"
+
+
+def _reload(place: str, set: Mapping[str, Any]) -> Policy:
+    return Policy.load(place, set=set)
 
 
 def evaluate(

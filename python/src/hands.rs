@@ -136,7 +136,7 @@ impl Hands {
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
             let overrides = overrides(set, training)?;
-            let policy = policy.as_ref().map(|policy| policy.get().loaded());
+            let policy = policy.as_ref().map(|policy| policy.get());
             let (config, task) = resolve(count, config.as_deref(), policy, &overrides, training)?;
             let randomization = if training { Randomization::new(&task, &config.randomization)? } else { None };
             let hand = |_| {

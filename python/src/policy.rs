@@ -25,6 +25,8 @@ static WORKERS: Mutex<Option<Workers>> = Mutex::new(None);
 #[pyclass(frozen, module = "shadow_repose._native")]
 pub(crate) struct Policy {
     loaded: Loaded,
+    /// The settings with which it was loaded.
+    set: Vec<Override>,
     fixed: FixedPolicy,
     settings: String,
 }
@@ -32,6 +34,11 @@ pub(crate) struct Policy {
 impl Policy {
     pub(crate) fn loaded(&self) -> &Loaded {
         &self.loaded
+    }
+
+    /// Returns the settings with which it was loaded, and then these.
+    pub(crate) fn with(&self, overrides: &[Override]) -> Vec<Override> {
+        [&self.set, overrides].concat()
     }
 
     /// Computes rows of `width` values for the observations.
@@ -69,10 +76,11 @@ impl Policy {
     #[new]
     fn new(py: Python, place: PathBuf, set: Set) -> PyResult<Self> {
         let load = || {
-            let loaded = Loaded::find(Some(&place), &overrides(set, false)?)?;
-            let settings = text(&*loaded.task()?);
+            let set = overrides(set, false)?;
+            let loaded = Loaded::find(Some(&place), &set)?;
+            let settings = text(&*loaded.task(&set)?);
             let fixed = FixedPolicy::new(loaded.policy.clone());
-            anyhow::Ok(Self { loaded, fixed, settings })
+            anyhow::Ok(Self { loaded, set, fixed, settings })
         };
         py.detach(|| guarded(load))?.map_err(refused)
     }
@@ -144,8 +152,7 @@ pub(crate) fn evaluate(
     }
     let played = Workers::new(threads).long(py, |stop| {
         let loaded = policy.get().loaded();
-        let overrides: Vec<Override> = overrides(set, false)?;
-        let task = if overrides.is_empty() { loaded.task()? } else { loaded.task_with(&overrides)? };
+        let task = loaded.task(&policy.get().with(&overrides(set, false)?))?;
         let (actor, mut goal_times) = (Actor::Mean(loaded.policy.freeze()), GoalTimes::new(task.config()));
         let trial = Trial { task: &task, actor: &actor, episodes: Episodes::scored(seed, episodes), stop };
         let played = trial.play(&mut |moment| {

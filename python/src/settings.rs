@@ -6,8 +6,10 @@ use std::sync::Arc;
 use anyhow::{Result, ensure};
 use serde_json::json;
 use shadow_repose::config::{Config, Override, user_file};
-use shadow_repose::load::{self, Loaded};
+use shadow_repose::load;
 use shadow_repose::repose::Task;
+
+use crate::policy::Policy;
 
 /// The most hands, as in a training.
 const MOST_HANDS: usize = 65536;
@@ -37,24 +39,25 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 pub(crate) fn resolve(
     count: usize,
     config: Option<&Path>,
-    policy: Option<&Loaded>,
+    policy: Option<&Policy>,
     overrides: &[Override],
     training: bool,
 ) -> Result<(Config, Arc<Task>)> {
     ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
-    let Some(loaded) = policy else {
+    let Some(policy) = policy else {
         let config = Config::resolve(user_file(config)?.as_ref(), overrides)?;
         let task = Task::new(&config.env, &config.hand)?;
         return Ok((Config { env: task.config().clone(), ..config }, task));
     };
     ensure!(config.is_none(), "give config or policy, not both: a policy brings the settings of its task");
+    let (loaded, overrides) = (policy.loaded(), policy.with(overrides));
     let whole = if training {
-        load::for_training(&loaded.checkpoint, loaded.origin.path(), overrides)?
+        load::for_training(&loaded.checkpoint, loaded.origin.path(), &overrides)?
     } else {
         Config::resolve(None, &[])?
     };
-    let task =
-        loaded.task_with(overrides.iter().filter(|set| is_of_task(set)).cloned().collect::<Vec<_>>().as_slice())?;
+    let of_task: Vec<Override> = overrides.into_iter().filter(is_of_task).collect();
+    let task = loaded.task(&of_task)?;
     Ok((Config { env: task.config().clone(), ..whole }, task))
 }
 

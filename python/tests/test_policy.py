@@ -46,7 +46,12 @@ def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
         Policy.load(file)
     with pytest.raises(TypeError, match="Policy.load"):
         Policy("builtin")
-    assert Policy.load("builtin", set={"env.friction_scale": 0.5}).settings["env.friction_scale"] == 0.5
+    slippery = Policy.load("builtin", set={"env.friction_scale": 0.5})
+    both = slippery.make_env(2, set={"env.gains_scale": 0.9}).settings
+    assert (both["env.friction_scale"], both["env.gains_scale"]) == (0.5, 0.9)
+    assert pickle.loads(pickle.dumps(slippery)).settings == slippery.settings != Policy.load("builtin").settings
+    short = {"episodes": 2, "set": {"env.max_episode_seconds": 0.1}}
+    assert evaluate(slippery, **short) != evaluate("builtin", **short)
 
 
 @pytest.mark.parametrize("given", [np.zeros((3, 156)), np.zeros((2, 3, 157)), "x", None, [[1], [2, 3]], 3.0])
