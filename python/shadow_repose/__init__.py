@@ -19,6 +19,7 @@ TYPE_CHECKING = False  # as in `typing`, which takes longer to import than all o
 if TYPE_CHECKING:
     from typing import Any
 
+    from . import _native
     from ._policy import Policy, evaluate
     from ._program import program
     from .envs import Env, VectorEnv
@@ -51,7 +52,8 @@ def _load() -> Any:
 
 
 _expect_avx()
-_native = _load()
+if not TYPE_CHECKING:
+    _native = _load()
 
 def register() -> None:
     """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`. An installed package does it by itself."""

@@ -28,7 +28,7 @@ class Policy:
     make them by `policy.make_env()` or `VectorEnv(policy=policy)`.
     """
 
-    def __init__(self, native: Any) -> None:
+    def __init__(self, native: _native.Policy) -> None:
         if not isinstance(native, _native.Policy):
             raise TypeError("create a policy by Policy.load(place)")
         self._native = native
@@ -66,7 +66,7 @@ class Policy:
         if not deterministic:
             noise = (rng or np.random.default_rng()).standard_normal(actions.shape, np.float32)
             actions += np.float32(self._native.std) * noise
-        return actions[0] if is_one else actions
+        return np.asarray(actions[0] if is_one else actions)
 
     def values(self, observations: ArrayLike) -> np.ndarray:
         """Returns the critic's values `[B]`, float32, of raw observations `[B, O]`, or a number for `[O]`.
@@ -75,7 +75,7 @@ class Policy:
         """
         rows, is_one = self._rows(observations)
         values = self._native.values(rows)
-        return values[0] if is_one else values
+        return np.asarray(values[0] if is_one else values)
 
     def _rows(self, observations: ArrayLike) -> tuple[np.ndarray, bool]:
         rows = np.asarray(observations, np.float32)
@@ -132,4 +132,4 @@ def evaluate(
     if not isinstance(policy, Policy):
         policy = Policy.load(policy, set=set)
     text = _native.evaluate(policy._native, pairs(set), number("episodes", episodes), number("seed", seed), number("threads", threads))
-    return json.loads(text)
+    return dict(json.loads(text))

@@ -70,7 +70,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         reward_terms: bool = False,
         render_mode: None = None,
     ) -> None:
-        self._hands: Any = None
+        self._hands: _native.Hands | None = None
         if render_mode is not None:
             raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; `shadow-repose play --video` films them")
         if goal_change not in ("continue", "truncate"):
@@ -85,26 +85,27 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             named = {key: value for key, value in (set or {}).items() if key == "env.model"}
             policy = Policy.load(policy, set=named)
         settings = pairs(set)
-        self._made = {
+        self._made: dict[str, Any] = {
             "threads": number("threads", threads), "seed": number("seed", seed), "config": config, "set": dict(set or {}),
             "policy": policy, "training": bool(training), "goal_change": goal_change, "random_age": bool(random_age),
             "autoreset_mode": mode, "reward_terms": bool(reward_terms),
         }  # fmt: skip
         self._hands = _native.Hands(
             number("num_envs", num_envs), self._made["threads"], self._made["seed"], None if config is None else os.fspath(config),
-            policy and policy._native, settings, bool(training), mode.value,
+            None if policy is None else policy._native, settings, bool(training), mode.value,
         )  # fmt: skip
-        for warning in self._hands.warnings_and_notes()[0]:
+        hands = self._open()
+        for warning in hands.warnings_and_notes()[0]:
             warnings.warn(warning, stacklevel=2)
         self.num_envs = operator.index(num_envs)
         self.metadata = {**self.metadata, "autoreset_mode": mode}
         self._mode, self._truncates, self._terms, self._aged = mode, goal_change == "truncate", reward_terms, bool(random_age)
-        layout = self._hands.layout()
+        layout = hands.layout()
         size = sum(length for _, _, length, _ in layout)
         self.observation_layout = {name: slice(first, first + length) for name, first, length, _ in layout}
         self.observation_units = {name: unit for name, _, _, unit in layout}
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._hands.action_size,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (hands.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -144,7 +145,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises ValueError (shape, NaN) and RuntimeError (not reset, closed, in use by another thread, or a hand failed: reset).
         """
         hands = self._open()
-        observations, rewards, ends, episodes = hands.step(np.asarray(actions, np.float32))
+        observations, rewards, ends, episodes = hands.step(_numbers(actions, self.action_space.shape))
         terminated, truncated = ends == _TERMINATED, ends == _TRUNCATED
         info: dict[str, Any] = {}
         if ends.any():
@@ -167,7 +168,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             info.update(_masked({"reward": terms, "rot_dist": errors}, every))
         return observations, rewards, terminated, truncated, info
 
-    def _open(self) -> Any:
+    def _open(self) -> _native.Hands:
         if self._hands is None:
             raise RuntimeError("these hands are closed")
         return self._hands
@@ -189,7 +190,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     @property
     def step_dt(self) -> float:
         """The time of a step, s."""
-        return self.settings["env.ctrl_dt"]
+        return float(self.settings["env.ctrl_dt"])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -222,9 +223,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the hands and their threads."""
-        hands, self._hands = self._hands, None
-        if hands is not None:
-            hands.close()
+        if self._hands is not None:
+            self._hands.close()
+        self._hands = None
 
     def __len__(self) -> int:
         return self.num_envs
@@ -244,6 +245,16 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def __repr__(self) -> str:
         return f"<shadow_repose.VectorEnv of {self.num_envs} hands>"
+
+
+def _numbers(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
+    """Returns the actions as float32."""
+    found = np.asarray(actions)
+    if found.dtype.kind not in "fiub":
+        raise TypeError(f"actions must be numbers, not {found.dtype}")
+    if found.shape != shape:
+        raise ValueError(f"actions have the shape {found.shape}, expected {shape}")
+    return found.astype(np.float32, copy=False)
 
 
 def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
@@ -295,10 +306,7 @@ class Env(gymnasium.Env):
         if self._over:
             self._envs._open()
             raise ResetNeeded("the episode is over: reset the hand before it steps")
-        actions = np.asarray(action, np.float32)
-        if actions.shape != self.action_space.shape:
-            raise ValueError(f"the action has the shape {actions.shape}, expected {self.action_space.shape}")
-        observations, rewards, terminated, truncated, info = self._envs.step(actions[None])
+        observations, rewards, terminated, truncated, info = self._envs.step(_numbers(action, self.action_space.shape)[None])
         self._over = bool(terminated[0] or truncated[0])
         found = info.pop("final_info", {})
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first({**info, **found})

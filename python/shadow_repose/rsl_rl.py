@@ -33,7 +33,7 @@ class RslRlVecEnv(VecEnv):
         if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
             raise ValueError("rsl_rl needs hands with autoreset_mode = SAME_STEP")
         self.envs, self.device, self.cfg = envs, device, envs.settings
-        self.num_envs, self.num_actions = envs.num_envs, envs.single_action_space.shape[0]
+        self.num_envs, self.num_actions = envs.num_envs, len(envs.settings["hand.actuators"])
         self.max_episode_length = envs.max_episode_steps
         self._start(envs.reset()[0])
 

@@ -304,7 +304,7 @@ def test_actions_that_are_no_actions_are_refused_and_the_hands_go_on(given, part
     assert equal(envs.step(np.zeros((4, 20))), untouched.step(np.zeros((4, 20))))
 
 
-@pytest.mark.parametrize("given", [None, "left", 3, np.zeros(20), np.zeros((4, 20, 1)), {}, [[1]], np.zeros((4, 20), "U3"), object()])
+@pytest.mark.parametrize("given", [None, "left", 3, np.zeros((4, 20), complex), np.zeros((4, 20), "M8[s]"), np.zeros(20), np.zeros((4, 20, 1)), {}, [[1]], np.zeros((4, 20), "U3"), object()])
 def test_what_is_no_array_of_actions_is_an_exception(given):
     envs = VectorEnv(4)
     envs.reset()
