@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 __all__ = ["Env", "Policy", "VectorEnv", "evaluate", "program"]
 
 
-def _expect_avx() -> None:
+def _expect_avx(facts: str = "/proc/cpuinfo") -> None:
     """Names a processor that MuJoCo cannot run on. Its library would end Python by SIGILL."""
     if os.uname().machine != "x86_64":
         return
     try:
-        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as facts:
-            flags = next((line.split() for line in facts if line.startswith("flags")), None)
+        with open(facts, encoding="ascii", errors="replace") as lines:
+            flags = next((line.split() for line in lines if line.startswith("flags")), None)
     except OSError:
         return
     if flags is not None and "avx" not in flags:

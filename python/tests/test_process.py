@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 
+import shadow_repose
 from shadow_repose import Env, Policy, VectorEnv, evaluate
 
 ZEROS = np.zeros((16, 20), np.float32)
@@ -178,3 +179,13 @@ def test_the_module_is_imported_without_gymnasium_and_numpy():
     code = "import sys, shadow_repose; print([name for name in ('gymnasium', 'numpy', 'torch') if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "[]\n"
+
+
+def test_a_processor_without_avx_is_named_in_a_sentence(tmp_path):
+    facts = tmp_path / "cpuinfo"
+    facts.write_text("processor : 0\nflags : fpu sse2 ssse3\n")
+    with pytest.raises(ImportError, match="no AVX"):
+        shadow_repose._expect_avx(str(facts))
+    facts.write_text("processor : 0\nflags : fpu sse2 avx avx2\n")
+    shadow_repose._expect_avx(str(facts))
+    shadow_repose._expect_avx(str(tmp_path / "nowhere"))
