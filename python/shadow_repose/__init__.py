@@ -56,7 +56,10 @@ if not TYPE_CHECKING:
     _native = _load()
 
 def register() -> None:
-    """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`. An installed package does it by itself."""
+    """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`.
+
+    This happens by itself where Gymnasium is imported before this package, and where `shadow_repose.envs` is.
+    """
     from gymnasium.envs.registration import register, registry
 
     if "ShadowRepose-v0" not in registry:

@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from . import _native
+from . import _native, register
 from ._policy import Policy
 from ._settings import flat, number, pairs
 
@@ -325,3 +325,6 @@ def _first(info: dict[str, Any]) -> dict[str, Any]:
     """Returns the values of the first hand, without masks."""
     one = {name: value for name, value in info.items() if not name.startswith("_")}
     return {name: _first(value) if isinstance(value, dict) else value[0] for name, value in one.items()}
+
+
+register()

@@ -1,4 +1,7 @@
 """Gymnasium's own checks and wrappers."""
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -6,10 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 
-import shadow_repose
 from shadow_repose import VectorEnv
-
-shadow_repose.register()
 
 SHORT = {"env.max_episode_seconds": 0.2}
 
@@ -22,7 +22,7 @@ def test_one_hand_passes_the_check_of_environments():
 def test_many_hands_are_made_by_name():
     envs = gymnasium.make_vec("ShadowRepose-v0", num_envs=4, policy="builtin")
     assert isinstance(envs, VectorEnv) and envs.num_envs == 4 and envs.settings["env.act_moving_average"] == 0.5
-    env = gymnasium.make("shadow_repose:ShadowRepose-v0", seed=3)
+    env = gymnasium.make("ShadowRepose-v0", seed=3)
     assert np.array_equal(env.reset(seed=1)[0], VectorEnv(1).reset(seed=1)[0][0])
 
 
@@ -41,6 +41,15 @@ OTHERS = [
     lambda envs: wrappers.ClipReward(envs, -1, 1),
     lambda envs: wrappers.RescaleAction(envs, np.float32(-0.5), np.float32(0.5)),
 ]
+
+
+@pytest.mark.parametrize(
+    "imports", ["import gymnasium, shadow_repose", "import shadow_repose.envs, gymnasium", "import gymnasium; name = 'shadow_repose:' + name"]
+)
+def test_the_name_is_known_after_an_import(imports):
+    code = f"name = 'ShadowRepose-v0'; {imports}; print(gymnasium.make(name).reset()[0].shape, gymnasium.make_vec(name, 2))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "(157,) <shadow_repose.VectorEnv of 2 hands>\n"
 
 
 @pytest.mark.parametrize(
