@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 
-STEPS = 8
+STEPS = 16
 
 
 def ours(hands, threads):
@@ -74,6 +74,7 @@ def main():
     both = [subprocess.Popen([*command, name], **pipes) for name in ("ours", "peer")]
 
     def turn(one):
+        time.sleep(0.5)  # until the threads of the other side sleep
         one.stdin.write("\n")
         one.stdin.flush()
         return STEPS * args.hands / float(one.stdout.readline())
