@@ -141,6 +141,23 @@ def test_a_hand_restarts_in_place_of_the_next_step_or_only_when_it_is_told():
         disabled.step(np.ones((3, 20)))
 
 
+def test_a_restart_that_is_due_is_part_of_the_state():
+    envs = VectorEnv(3, set=SHORT, autoreset_mode="NextStep")
+    envs.reset()
+    for _ in range(5):
+        envs.step(np.ones((3, 20)))
+    again = pickle.loads(pickle.dumps(envs))
+    for _ in range(3):
+        expected, found = envs.step(np.ones((3, 20))), again.step(np.ones((3, 20)))
+        assert equal(found, expected)
+    disabled = VectorEnv(3, set=SHORT, autoreset_mode="DISABLED")
+    disabled.reset()
+    for _ in range(5):
+        disabled.step(np.ones((3, 20)))
+    with pytest.raises(RuntimeError, match="is over"):
+        copy.deepcopy(disabled).step(np.ones((3, 20)))
+
+
 def test_a_mask_restarts_some_hands_and_leaves_the_others():
     envs, untouched = VectorEnv(4, seed=1), VectorEnv(4, seed=1)
     for one in (envs, untouched):
