@@ -148,7 +148,7 @@ def main():
                     old.lerp_(new, TAU)
         if step % 800 == 0 or step == steps:
             scores = evaluate(lambda rows: actor(normal(rows)), device)
-            facts = (rewards.mean().item(), *scores, float(np.mean(said[-100:])))
+            facts = (rewards.mean().item() / REWARD_SCALE, *scores, float(np.mean(said[-100:])))
             print(step * n, f"{time.time() - began:.0f}", *(f"{fact:.4f}" for fact in facts), sep=",", flush=True)
 
 

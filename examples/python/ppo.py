@@ -98,6 +98,7 @@ def main():
     began, iterations = time.time(), args.total_steps // (n * steps)
     print("steps,seconds,reward,goals,rot_dist,drops,std,kl", flush=True)
     for iteration in range(1, iterations + 1):
+        paid = 0.0
         for t in range(steps):
             with torch.no_grad():
                 distribution = agent.policy(row)
@@ -105,6 +106,7 @@ def main():
                 seen[t], acted[t], values[t] = row, action, agent.value(row)
                 logged[t] = distribution.log_prob(action).sum(1)
             row, reward, terminated, truncated, info = envs.step(action.cpu().numpy())
+            paid += reward.mean() / steps
             row, reward = torch.from_numpy(row).to(device), REWARD_SCALE * torch.from_numpy(reward).to(device)
             # Where time is up or the goal is replaced, the value of the last observation stands for the future.
             if truncated.any():
@@ -141,7 +143,7 @@ def main():
         optimizer.param_groups[0]["lr"] = min(max(rate, 1e-5), 2e-3)
         if iteration % 50 == 0 or iteration == iterations:
             goals, error, drops = evaluate(agent, device)
-            facts = (rewards.mean().item(), goals, error, drops, agent.log_std.exp().mean().item(), divergence)
+            facts = (paid, goals, error, drops, agent.log_std.exp().mean().item(), divergence)
             print(iteration * n * steps, f"{time.time() - began:.0f}", *(f"{fact:.4f}" for fact in facts), sep=",", flush=True)
     if args.save:
         torch.save(agent.state_dict(), args.save)

@@ -60,10 +60,10 @@ def register() -> None:
 
     This happens by itself where Gymnasium is imported before this package, and where `shadow_repose.envs` is.
     """
-    from gymnasium.envs.registration import register, registry
+    from gymnasium.envs import registration
 
-    if "ShadowRepose-v0" not in registry:
-        register("ShadowRepose-v0", entry_point="shadow_repose.envs:Env", vector_entry_point="shadow_repose.envs:VectorEnv")
+    if "ShadowRepose-v0" not in registration.registry:
+        registration.register("ShadowRepose-v0", entry_point="shadow_repose.envs:Env", vector_entry_point="shadow_repose.envs:VectorEnv")
 
 
 if "gymnasium" in sys.modules:

@@ -3,13 +3,14 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from . import _native
-from ._settings import flat, number, pairs
+from ._settings import absolute, flat, number, pairs
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -33,6 +34,7 @@ class Policy:
             raise TypeError("create a policy by Policy.load(place)")
         self._native = native
         self._set: dict[str, Any] = {}
+        self._checksum = 0
 
     @classmethod
     def load(cls, place: str | os.PathLike[str] = "builtin", *, set: Mapping[str, Any] | None = None) -> Policy:
@@ -50,7 +52,7 @@ class Policy:
         if place not in BUILT_IN and not os.path.exists(place):
             raise FileNotFoundError(f"{place}: no such checkpoint or run folder; built in are {' and '.join(BUILT_IN)}")
         policy = cls(_native.Policy(place, pairs(set)))
-        policy._set.update(set or {})
+        policy._set, policy._checksum = absolute(set), _checksum(policy._native.place)
         return policy
 
     def __call__(
@@ -69,7 +71,7 @@ class Policy:
         return np.asarray(actions[0] if is_one else actions)
 
     def values(self, observations: ArrayLike) -> np.ndarray:
-        """Returns the critic's values `[B]`, float32, of raw observations `[B, O]`, or a number for `[O]`.
+        """Returns the critic's values `[B]`, float32, of raw observations `[B, O]`, or one without dimensions for `[O]`.
 
         A value is the discounted sum of the rewards in training, times `ppo.reward_scale`.
         """
@@ -100,14 +102,31 @@ class Policy:
         return VectorEnv(num_envs, policy=self, **options)
 
     def __reduce__(self) -> Any:
-        return _reload, (os.fspath(self._native.place), self._set)
+        return _reload, (os.fspath(self._native.place), self._set, self._checksum)
+
+    def __copy__(self) -> Policy:
+        return self  # it never changes
+
+    def __deepcopy__(self, memo: Any) -> Policy:
+        return self
 
     def __repr__(self) -> str:
         return f"<Policy: {self._native.name}>"
 
 
-def _reload(place: str, set: Mapping[str, Any]) -> Policy:
-    return Policy.load(place, set=set)
+def _checksum(place: str | os.PathLike[str]) -> int:
+    if os.fspath(place) in BUILT_IN:
+        return 0
+    with open(place, "rb") as file:
+        return zlib.crc32(file.read())
+
+
+def _reload(place: str, set: Mapping[str, Any], checksum: int) -> Policy:
+    """Loads a policy that was pickled."""
+    policy = Policy.load(place, set=set)
+    if policy._checksum != checksum:
+        raise ValueError(f"{place} holds another policy than the one that was pickled")
+    return policy
 
 
 def evaluate(
@@ -130,6 +149,7 @@ def evaluate(
     Ctrl-C interrupts it. Raises ValueError as `Policy.load` does.
     """
     if not isinstance(policy, Policy):
-        policy = Policy.load(policy, set=set)
-    text = _native.evaluate(policy._native, pairs(set), number("episodes", episodes), number("seed", seed), number("threads", threads))
+        policy, set = Policy.load(policy, set=set), None
+    counts = number("episodes", episodes, 1, 2**20), number("seed", seed), number("threads", threads, most=65536)
+    text = _native.evaluate(policy._native, pairs(set), *counts)
     return dict(json.loads(text))

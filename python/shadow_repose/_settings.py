@@ -3,18 +3,19 @@ from __future__ import annotations
 
 import json
 import operator
+import os
 from collections.abc import Mapping
 from typing import Any
 
 
-def number(name: str, value: Any, most: int = 2**64 - 1) -> int:
-    """Returns `value` as a whole number from 0 to `most`."""
+def number(name: str, value: Any, least: int = 0, most: int = 2**64 - 1) -> int:
+    """Returns `value` as a whole number from `least` to `most`."""
     try:
         found = operator.index(value)
     except TypeError:
         raise TypeError(f"{name} must be a whole number, not {value!r}") from None
-    if not 0 <= found <= most:
-        raise ValueError(f"{name} = {found}: must lie in [0, {most}]")
+    if not least <= found <= most:
+        raise ValueError(f"{name} = {found}: must lie in [{least}, {most}]")
     return found
 
 
@@ -46,6 +47,15 @@ def pairs(settings: Mapping[str, Any] | None) -> list[tuple[str, str]]:
         if not isinstance(key, str):
             raise TypeError(f"the name of a setting must be a string, not {key!r}")
     return [(key, _toml(value, False)) for key, value in settings.items()]
+
+
+def absolute(settings: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Returns the settings with the scene's path as it is from any folder, for pickles."""
+    known = dict(settings or {})
+    model = known.get("env.model")
+    if model is not None and model != "builtin":
+        known["env.model"] = os.path.abspath(model)
+    return known
 
 
 def flat(text: str) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The hands as Gymnasium environments: N that step together, or one."""
 from __future__ import annotations
 
-import operator
 import os
 import warnings
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from . import _native, register
 from ._policy import Policy
-from ._settings import flat, number, pairs
+from ._settings import absolute, flat, number, pairs
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -40,13 +39,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         goal_change: what a new goal means to a learner. `"continue"`: nothing ends, the next observation shows it. `"truncate"`:
             `truncated` is set, `final_obs` shows the old goal and `info["redirected"]` tells it from an end by time. `train`
             learns that way, and so can any learner that adds the value of `final_obs` where `truncated` is set.
-        random_age: the first episodes end early, at different times, as in `train`.
+        random_age: the first episodes after a reset of all hands end early, at different times, as in `train`.
         autoreset_mode: when a hand starts its next episode; see Gymnasium. `"truncate"` needs SAME_STEP.
-        reward_terms: `info["reward"]` holds the terms of each step's reward.
+        reward_terms: `info["reward"]` holds the terms of each step's reward, which add up to it.
 
     Raises:
         ValueError: a setting is unknown or invalid, or the scene cannot be used; the message lists everything that is wrong.
-        FileNotFoundError, PermissionError: a file is not there, or cannot be read.
+        FileNotFoundError, PermissionError: the settings file or the policy is not there, or cannot be read.
 
     Observations are float32 `[N, O]`, of the built-in hand `[N, 157]`; `observation_layout` names their groups. Actions `[N, A]`, here
     `[N, 20]`, are moves within the range of each actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z; units are SI.
@@ -75,31 +74,27 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; `shadow-repose play --video` films them")
         if goal_change not in ("continue", "truncate"):
             raise ValueError(f'goal_change = {goal_change!r}: must be "continue" or "truncate"')
-        modes = {name: mode for mode in AutoresetMode for name in (mode, mode.name, mode.value)}
-        mode = modes.get(autoreset_mode)
-        if mode is None:
+        modes = {name: mode for mode in AutoresetMode for name in (mode.name, mode.value)}
+        mode = modes.get(autoreset_mode) if isinstance(autoreset_mode, str) else autoreset_mode
+        if not isinstance(mode, AutoresetMode):
             raise ValueError(f"autoreset_mode = {autoreset_mode!r}: must be one of {', '.join(AutoresetMode.__members__)}")
         if goal_change == "truncate" and mode is not AutoresetMode.SAME_STEP:
             raise ValueError('goal_change = "truncate" needs autoreset_mode = SAME_STEP: the hand goes on under the new goal at once')
+        pairs(set)  # says what is no setting before anything is loaded
         if policy is not None and not isinstance(policy, Policy):
-            named = {key: value for key, value in (set or {}).items() if key == "env.model"}
-            policy = Policy.load(policy, set=named)
-        settings = pairs(set)
+            of_task = {key: value for key, value in (set or {}).items() if key.split(".")[0] in ("env", "hand")}
+            policy = Policy.load(policy, set=of_task)
         self._made: dict[str, Any] = {
-            "threads": number("threads", threads), "seed": number("seed", seed), "config": config, "set": dict(set or {}),
-            "policy": policy, "training": bool(training), "goal_change": goal_change, "random_age": bool(random_age),
-            "autoreset_mode": mode, "reward_terms": bool(reward_terms),
+            "threads": number("threads", threads, most=65536), "seed": number("seed", seed), "set": absolute(set), "policy": policy,
+            "config": None if config is None else os.path.abspath(os.fspath(config)), "training": bool(training),
+            "mode": mode.value, "truncates": goal_change == "truncate", "terms": bool(reward_terms),
         }  # fmt: skip
-        self._hands = _native.Hands(
-            number("num_envs", num_envs), self._made["threads"], self._made["seed"], None if config is None else os.fspath(config),
-            None if policy is None else policy._native, settings, bool(training), mode.value,
-        )  # fmt: skip
-        hands = self._open()
-        for warning in hands.warnings_and_notes()[0]:
+        self.num_envs = number("num_envs", num_envs, 1, 65536)
+        hands = self._create()
+        for warning in hands.warnings:
             warnings.warn(warning, stacklevel=2)
-        self.num_envs = operator.index(num_envs)
         self.metadata = {**self.metadata, "autoreset_mode": mode}
-        self._mode, self._truncates, self._terms, self._aged = mode, goal_change == "truncate", reward_terms, bool(random_age)
+        self._aged, self.step_dt = bool(random_age), float(self.settings["env.ctrl_dt"])
         layout = hands.layout()
         size = sum(length for _, _, length, _ in layout)
         self.observation_layout = {name: slice(first, first + length) for name, first, length, _ in layout}
@@ -109,6 +104,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
+    def _create(self) -> _native.Hands:
+        """Makes the hands anew."""
+        made = self._made
+        policy = None if made["policy"] is None else made["policy"]._native
+        settings = made["config"], policy, pairs(made["set"])
+        how = made["training"], made["mode"], made["truncates"], made["terms"]
+        self._hands = _native.Hands(self.num_envs, made["threads"], made["seed"], *settings, *how)
+        return self._hands
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode of each hand, and returns the observations `[N, O]` and an empty dict.
 
@@ -116,17 +120,21 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             seed: the episodes are those of this seed, from the first one on; without it they are the next ones.
             options: `{"reset_mask": mask}` with a bool array `[N]` restarts only the hands that it marks.
 
-        Raises ValueError for a seed that is negative, or with a mask.
+        Raises ValueError for a seed that is negative or comes with a mask, and for a mask of another shape.
         """
         hands = self._open()
+        if options is not None and not isinstance(options, Mapping):
+            raise TypeError(f"options must be a dict, not {options!r}")
         if seed is not None:
             seed = number("seed", seed)
             super().reset(seed=seed)
         mask = None if options is None else options.get("reset_mask")
         if mask is not None:
             mask = np.asarray(mask)
-            if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
-                raise ValueError(f"reset_mask must be a bool array of the shape ({self.num_envs},), not {mask.dtype} {mask.shape}")
+            if mask.dtype != np.bool_:
+                raise TypeError(f"reset_mask must be an array of bool, not of {mask.dtype}")
+            if mask.shape != (self.num_envs,):
+                raise ValueError(f"reset_mask has the shape {mask.shape}, expected ({self.num_envs},)")
             if not mask.any():
                 raise ValueError("reset_mask marks no hand")
         return hands.reset(seed, mask, self._aged), {}
@@ -140,32 +148,27 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             final_info: of the episodes that ended, `episode`: `r` the sum of rewards, `l` steps, `goals` reached, `dropped`,
                 `diverged`, `randomized`, `rot_dist` mean rotation error (rad), `reward` the sums of the task's terms;
             redirected `[N]`, without a mask: where the goal was replaced;
-            reward, rot_dist (with `reward_terms`): the terms of this step's reward, and the rotation errors (rad) after it.
+            reward, rot_dist (with `reward_terms`): the terms of this step's reward, weighted as in it, and the rotation errors (rad)
+                after it.
 
         Raises ValueError (shape, NaN) and RuntimeError (not reset, closed, in use by another thread, or a hand failed: reset).
         """
-        hands = self._open()
-        observations, rewards, ends, episodes = hands.step(_numbers(actions, self.action_space.shape))
+        hands, given = self._open(), _numbers(actions, self.action_space.shape)
+        observations, rewards, ends, episodes, finals, terms = hands.step(given)
         terminated, truncated = ends == _TERMINATED, ends == _TRUNCATED
         info: dict[str, Any] = {}
         if ends.any():
             over, redirected = terminated | truncated, ends == _REDIRECTED
-            if self._truncates:
+            if self._made["truncates"]:
                 truncated |= redirected
-            cut = terminated | truncated
-            if self._mode is AutoresetMode.SAME_STEP and cut.any():
-                info["final_obs"], info["_final_obs"] = hands.final_observations(), cut
-                if not self._truncates:
-                    info["final_obs"][~cut] = 0.0
+            if finals is not None:
+                info.update(_masked({"final_obs": finals}, terminated | truncated))
             if episodes is not None:
-                info["final_info"] = _masked({"episode": episodes}, over)
-                info["_final_info"] = over
+                info.update(_masked({"final_info": {"episode": episodes}}, over))
             if redirected.any():
                 info["redirected"] = redirected
-        if self._terms:
-            every = np.ones(self.num_envs, np.bool_)
-            terms, errors = hands.terms()
-            info.update(_masked({"reward": terms, "rot_dist": errors}, every))
+        if terms is not None:
+            info.update(_masked({"reward": terms[0], "rot_dist": terms[1]}, np.ones(self.num_envs, np.bool_)))
         return observations, rewards, terminated, truncated, info
 
     def _open(self) -> _native.Hands:
@@ -175,22 +178,19 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def env_steps(self) -> int:
-        """Control steps so far, over all hands. With `training=True` they decide the lesson; set them to go on from a later point."""
+        """Control steps so far, over all hands. With `training=True` they decide the lesson, which holds for 16 steps of all hands, as in
+        `train`; set them to go on from a later point.
+        """
         return self._open().env_steps
 
     @env_steps.setter
     def env_steps(self, steps: int) -> None:
-        self._open().env_steps = number("env_steps", steps)
+        self._open().env_steps = number("env_steps", steps, most=2**60)
 
     @property
     def max_episode_steps(self) -> int:
         """The steps of an episode that no drop ends."""
         return self._open().max_episode_steps
-
-    @property
-    def step_dt(self) -> float:
-        """The time of a step, s."""
-        return float(self.settings["env.ctrl_dt"])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -200,7 +200,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     @property
     def notes(self) -> list[str]:
         """What the settings replace in a scene of one's own, and what was found in it."""
-        return self._open().warnings_and_notes()[1]
+        return self._open().notes
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Returns everything that the future of the hands depends on, for `set_state` of hands with the same settings."""
@@ -230,16 +230,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def __len__(self) -> int:
         return self.num_envs
 
-    def __getstate__(self) -> Any:
-        try:
-            state = self.get_state()
-        except RuntimeError:  # not reset, failed or closed: a fresh start
-            state = None
-        return self.num_envs, self._made, state
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the threads. Hands that are not reset are as new in the copy."""
+        state = self.get_state() if self._open().can_step else None
+        return {**self.__dict__, "_hands": state}
 
-    def __setstate__(self, pickled: Any) -> None:
-        num_envs, made, state = pickled
-        self.__init__(num_envs, **made)  # type: ignore[misc]
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        self.__dict__.update(pickled)
+        state = pickled["_hands"]
+        self._create()
         if state is not None:
             self.set_state(state)
 
@@ -254,7 +253,8 @@ def _numbers(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
         raise TypeError(f"actions must be numbers, not {found.dtype}")
     if found.shape != shape:
         raise ValueError(f"actions have the shape {found.shape}, expected {shape}")
-    return found.astype(np.float32, copy=False)
+    with np.errstate(over="ignore"):  # they are clipped anyway
+        return found.astype(np.float32, copy=False)
 
 
 def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
@@ -262,15 +262,15 @@ def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name, value in values.items():
         result[name] = _masked(value, mask) if isinstance(value, dict) else value
-        result[f"_{name}"] = mask
+        result[f"_{name}"] = mask.copy()
     return result
 
 
 class Env(gymnasium.Env):
     """One hand, `gymnasium.make("ShadowRepose-v0")`: observations `[O]`, actions `[A]`.
 
-    It takes the options of `VectorEnv` that make sense for one. `info["episode"]` holds what `final_info` holds there, at the end of
-    an episode.
+    It takes the options of `VectorEnv` that make sense for one. At the end of an episode, `info["final_info"]` holds what it holds
+    there. `vector` has its settings, its layout and its state.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
@@ -283,42 +283,36 @@ class Env(gymnasium.Env):
         set: Mapping[str, Any] | None = None,
         policy: Policy | str | os.PathLike[str] | None = None,
         training: bool = False,
-        random_age: bool = False,
         reward_terms: bool = False,
         render_mode: None = None,
     ) -> None:
-        self._envs = VectorEnv(
-            1, threads=1, seed=seed, config=config, set=set, policy=policy, training=training, random_age=random_age,
+        self.vector = VectorEnv(
+            1, threads=1, seed=seed, config=config, set=set, policy=policy, training=training,
             reward_terms=reward_terms, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED,
         )  # fmt: skip
-        self.observation_space, self.action_space = self._envs.single_observation_space, self._envs.single_action_space
+        """The hand as a `VectorEnv` of one."""
+        self.observation_space, self.action_space = self.vector.single_observation_space, self.vector.single_action_space
         self._over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode: the first one of `seed`, or the next one. Returns its observation `[O]`."""
         super().reset(seed=seed)
-        observations, info = self._envs.reset(seed=seed)
+        observations, info = self.vector.reset(seed=seed)
         self._over = False
         return observations[0], info
 
     def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Steps once with an action `[A]`, which is clipped to [-1, 1]. Raises ResetNeeded after the end of an episode."""
         if self._over:
-            self._envs._open()
+            self.vector._open()
             raise ResetNeeded("the episode is over: reset the hand before it steps")
-        observations, rewards, terminated, truncated, info = self._envs.step(_numbers(action, self.action_space.shape)[None])
+        observations, rewards, terminated, truncated, info = self.vector.step(_numbers(action, self.action_space.shape)[None])
         self._over = bool(terminated[0] or truncated[0])
-        found = info.pop("final_info", {})
-        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first({**info, **found})
-
-    @property
-    def envs(self) -> VectorEnv:
-        """The hand as a `VectorEnv` of one, with its settings, its layout and its state."""
-        return self._envs
+        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
     def close(self) -> None:
         """Frees the hand."""
-        self._envs.close()
+        self.vector.close()
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:

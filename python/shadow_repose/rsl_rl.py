@@ -22,17 +22,25 @@ from tensordict import TensorDict
 from .envs import VectorEnv
 
 
+class _Settings(dict[str, Any]):
+    """The settings of the task, as rsl_rl's loggers read them."""
+
+    def to_dict(self) -> dict[str, Any]:
+        return dict(self)
+
+
 class RslRlVecEnv(VecEnv):
     """A `VectorEnv` as a `VecEnv` of rsl_rl, whose tensors lie on `device`. The hands themselves step on the CPU.
 
-    Give it hands with `goal_change="truncate"`: where a goal is replaced, rsl_rl then adds the value of the state before. Raises
+    Give it hands with `goal_change="truncate"`: where a goal is replaced, rsl_rl then adds the value of the state before. The runner's
+    `init_at_random_ep_len` assigns to `episode_length_buf`: all hands then start again at random ages of their own choice. Raises
     ValueError for hands that do not reset in the same step.
     """
 
     def __init__(self, envs: VectorEnv, *, device: torch.device | str = "cpu") -> None:
         if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
             raise ValueError("rsl_rl needs hands with autoreset_mode = SAME_STEP")
-        self.envs, self.device, self.cfg = envs, device, envs.settings
+        self.envs, self.device, self.cfg = envs, device, _Settings(envs.settings)
         self.num_envs, self.num_actions = envs.num_envs, len(envs.settings["hand.actuators"])
         self.max_episode_length = envs.max_episode_steps
         self._start(envs.reset()[0])
@@ -48,7 +56,7 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, lengths: torch.Tensor) -> None:
-        """Starts all episodes again at random ages of the hands' own choice: the runner writes random lengths for just that."""
+        """Starts all hands again at random ages of their own choice, whatever the lengths say."""
         self._start(self.envs._open().reset(None, None, True))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:

@@ -14,7 +14,9 @@ use rayon::prelude::*;
 use shadow_repose::config::Config;
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{EpisodeStats, Lesson, Randomization, Repose, Task};
+use shadow_repose::repose::{
+    EpisodeStats, Lesson, Randomization, Repose, StepDetails, Task, TaskReward, TrainingReward,
+};
 
 use crate::policy::Policy;
 use crate::settings::{Set, overrides, resolve, text};
@@ -28,6 +30,10 @@ pub(crate) struct Hands {
     config: Config,
     training: bool,
     autoreset: Autoreset,
+    /// Whether a new goal cuts off the return.
+    truncates: bool,
+    /// Whether a step returns the terms of its reward.
+    terms: bool,
     count: usize,
     /// None after `close`.
     state: Mutex<Option<State>>,
@@ -39,8 +45,8 @@ struct State {
     seed: u64,
     /// Control steps, over all hands; in a training they decide the lesson.
     env_steps: u64,
-    /// The number of steps from which on the next lesson holds.
-    next_lesson: u64,
+    /// The number of steps at which the lesson began, if one has.
+    lesson_from: Option<u64>,
     /// `[N, O]`: what to act on next.
     observations: Vec<f32>,
     /// `[N]`: the rewards of each running episode.
@@ -53,10 +59,21 @@ const ENDS: [Option<End>; 4] = [None, Some(End::Terminated), Some(End::Truncated
 
 const NOT_RESET: &str = "reset the hands before they step";
 const FAILED: &str = "an earlier step failed: reset the hands before they step again";
+const NOT_SET: &str = "the state could not be set: reset the hands before they step";
 
-/// What a step returns: observations `[N, O]`, rewards `[N]`, ends `[N]`, and the episodes that ended as columns.
-type Stepped<'py> =
-    (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<u8>>, Option<Bound<'py, PyDict>>);
+/// The terms `[N]` of a step's reward by name, and the rotation errors `[N]` after it.
+type Terms<'py> = (Bound<'py, PyDict>, Bound<'py, PyArray1<f32>>);
+
+/// What a step returns: observations `[N, O]`, rewards `[N]`, ends `[N]`, the episodes that ended as columns, the final observations
+/// `[N, O]` if there are any, and the terms if they were asked for.
+type Stepped<'py> = (
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<u8>>,
+    Option<Bound<'py, PyDict>>,
+    Option<Bound<'py, PyArray2<f32>>>,
+    Option<Terms<'py>>,
+);
 
 impl Hands {
     /// Returns the state, unless it is in use or gone.
@@ -91,12 +108,48 @@ impl Hands {
 
     /// Starts the lesson that holds now. As in a training, it holds for the steps of an iteration.
     fn begin_lesson(&self, state: &mut State) {
-        if state.env_steps < state.next_lesson {
-            return;
+        let steps = |from| (self.config.ppo.horizon_at(from) * self.count) as u64;
+        if state.lesson_from.is_none_or(|from| state.env_steps >= from.saturating_add(steps(from))) {
+            state.lesson_from = Some(state.env_steps);
+            state.pool.set_lesson(self.lesson(state.env_steps));
         }
-        state.pool.set_lesson(self.lesson(state.env_steps));
-        let steps = self.config.ppo.horizon_at(state.env_steps) * self.count;
-        state.next_lesson = state.env_steps.saturating_add(steps as u64);
+    }
+
+    /// Returns the last observations `[N, O]` of the hands that the last step cut off or ended; zeros for others.
+    fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
+        let size = self.observation_size();
+        let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
+        let blocks = state.pool.blocks.iter();
+        let rows = blocks.flat_map(|block| block.ends.iter().zip(block.final_observations.chunks_exact(size)));
+        let mut finals = vec![0.0; self.count * size];
+        let mut any = false;
+        for (to, (_, row)) in finals.chunks_exact_mut(size).zip(rows).filter(|(_, (end, _))| is_cut(end)) {
+            to.copy_from_slice(row);
+            any = true;
+        }
+        (any && self.autoreset == Autoreset::SameStep).then(|| self.rows(py, finals)).transpose()
+    }
+
+    /// Returns the terms of the last step; zeros where a new episode took the place of the step.
+    fn step_terms<'py>(&self, py: Python<'py>, state: &mut State, restarted: &[bool]) -> PyResult<Terms<'py>> {
+        let weight = state.lesson_from.map_or(1.0, |from| self.lesson(from).task_reward);
+        let details = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
+            true => StepDetails { rot_dist: hand.rot_dist(), ..StepDetails::default() },
+            false => *hand.last_step(),
+        });
+        let details: Vec<StepDetails> = details.collect();
+        let terms = PyDict::new(py);
+        let put = |name: &str, of: &dyn Fn(&StepDetails) -> f64| {
+            terms.set_item(name, details.iter().map(|step| of(step) as f32).collect::<Vec<_>>().into_pyarray(py))
+        };
+        for (i, (name, _)) in TaskReward::default().named().enumerate() {
+            put(name, &|step| weight * step.reward.values()[i])?;
+        }
+        for (i, (name, _)) in TrainingReward::default().named().enumerate().filter(|_| self.training) {
+            put(name, &|step| step.training.values()[i])?;
+        }
+        let errors: Vec<f32> = details.iter().map(|step| step.rot_dist as f32).collect();
+        Ok((terms, errors.into_pyarray(py)))
     }
 }
 
@@ -107,6 +160,12 @@ impl State {
         self.pool.blocks.iter().flat_map(|block| &block.ends).map(number).collect()
     }
 
+    /// Returns the hands whose episode is over and whose next one has not begun.
+    fn waiting(&self) -> Vec<bool> {
+        let ends = self.pool.blocks.iter().flat_map(|block| &block.ends);
+        ends.map(|end| matches!(end, Some(End::Terminated | End::Truncated))).collect()
+    }
+
     fn started(&mut self, marked: &[bool]) {
         self.returns.iter_mut().zip(marked).filter(|(_, marked)| **marked).for_each(|(sum, _)| *sum = 0.0);
     }
@@ -115,7 +174,7 @@ impl State {
 #[pymethods]
 impl Hands {
     #[new]
-    #[pyo3(signature = (count, threads, seed, config, policy, set, training, autoreset))]
+    #[pyo3(signature = (count, threads, seed, config, policy, set, training, autoreset, truncates, terms))]
     #[expect(clippy::too_many_arguments, reason = "Python names each of them")]
     fn new(
         py: Python,
@@ -127,11 +186,14 @@ impl Hands {
         set: Set,
         training: bool,
         autoreset: &str,
+        truncates: bool,
+        terms: bool,
     ) -> PyResult<Self> {
         let autoreset = match autoreset {
             "SameStep" => Autoreset::SameStep,
             "NextStep" => Autoreset::NextStep,
-            _ => Autoreset::Disabled,
+            "Disabled" => Autoreset::Disabled,
+            other => return Err(PyValueError::new_err(format!("autoreset_mode = {other}: unknown"))),
         };
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
@@ -153,12 +215,12 @@ impl Hands {
             workers,
             seed,
             env_steps: 0,
-            next_lesson: 0,
+            lesson_from: None,
             observations: vec![0.0; count * task.spaces().observation_size],
             returns: vec![0.0; count],
             can_step: Err(NOT_RESET),
         };
-        Ok(Self { task, config, training, autoreset, count, state: Mutex::new(Some(state)) })
+        Ok(Self { task, config, training, autoreset, truncates, terms, count, state: Mutex::new(Some(state)) })
     }
 
     /// The groups of an observation: (name, first index, length, unit).
@@ -183,9 +245,22 @@ impl Hands {
         text(&self.task)
     }
 
-    /// What a user should know of how the policy fits, and of what the settings replace in a scene.
-    fn warnings_and_notes(&self) -> (Vec<String>, Vec<String>) {
-        (self.task.warnings().to_vec(), self.task.notes())
+    /// Where the policy does not fit well.
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.task.warnings().to_vec()
+    }
+
+    /// What the settings replace in a scene of the user's, and what was found in it.
+    #[getter]
+    fn notes(&self) -> Vec<String> {
+        self.task.notes()
+    }
+
+    /// Whether the hands have been reset and no step has failed since.
+    #[getter]
+    fn can_step(&self) -> PyResult<bool> {
+        Ok(self.locked()?.as_ref().is_some_and(|state| state.can_step.is_ok()))
     }
 
     #[getter]
@@ -196,12 +271,12 @@ impl Hands {
     #[setter]
     fn set_env_steps(&self, env_steps: u64) -> PyResult<()> {
         if let Some(state) = self.locked()?.as_mut() {
-            (state.env_steps, state.next_lesson) = (env_steps, env_steps);
+            (state.env_steps, state.lesson_from) = (env_steps, None);
         }
         Ok(())
     }
 
-    /// Starts an episode of each hand, or of those that are marked, and returns all observations.
+    /// Starts an episode of each hand, at random ages if `aged`, or one of those that are marked. Returns all observations.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -229,7 +304,7 @@ impl Hands {
         self.begin_lesson(state);
         let State { pool, workers, observations, .. } = &mut *state;
         let workers = workers.pool()?;
-        let started = py.detach(|| guarded(|| workers.install(|| pool.restart(&marked, aged, observations))));
+        let started = py.detach(|| guarded(|| workers.install(|| pool.restart(&marked, aged && all, observations))));
         if let Err(error) = started {
             state.can_step = Err(FAILED);
             return Err(error);
@@ -243,8 +318,7 @@ impl Hands {
     fn step<'py>(&self, py: Python<'py>, actions: PyReadonlyArray2<'py, f32>) -> PyResult<Stepped<'py>> {
         let (n, size) = (self.count, self.action_size());
         if actions.shape() != [n, size] {
-            let text = format!("actions have the shape {:?}, expected ({n}, {size})", actions.shape());
-            return Err(PyValueError::new_err(text.replace('[', "(").replace(']', ")")));
+            return Err(PyValueError::new_err(format!("actions must have the shape ({n}, {size})")));
         }
         // A copy, because another Python thread may write to the array meanwhile.
         let actions: Vec<f32> = actions.as_array().iter().copied().collect();
@@ -254,14 +328,12 @@ impl Hands {
         let mut guard = self.locked()?;
         let state = guard.as_mut().expect("not closed");
         state.can_step.map_err(PyRuntimeError::new_err)?;
-        let over = state.pool.blocks.iter().flat_map(|block| &block.ends);
-        let over = over.map(|end| matches!(end, Some(End::Terminated | End::Truncated)));
-        if let Some(hand) =
-            (self.autoreset == Autoreset::Disabled).then(|| over.enumerate().find(|(_, over)| *over)).flatten()
-        {
-            let text = format!("the episode of hand {} is over: reset it with a reset_mask", hand.0);
+        let waiting = state.waiting();
+        if let (Autoreset::Disabled, Some(hand)) = (self.autoreset, waiting.iter().position(|waits| *waits)) {
+            let text = format!("the episode of hand {hand} is over: reset it with a reset_mask");
             return Err(PyRuntimeError::new_err(text));
         }
+        let restarted = if self.autoreset == Autoreset::NextStep { waiting } else { vec![false; n] };
         self.begin_lesson(state);
         let mut rewards = vec![0.0; n];
         let State { pool, workers, observations, .. } = &mut *state;
@@ -277,46 +349,18 @@ impl Hands {
                 return Err(error);
             }
         };
-        state.env_steps += n as u64;
+        let stepped = restarted.iter().filter(|restarted| !**restarted).count() as u64;
+        state.env_steps = state.env_steps.saturating_add(stepped);
         state.returns.iter_mut().zip(&rewards).for_each(|(sum, reward)| *sum += f64::from(*reward));
         let ended = if episodes.is_empty() { None } else { Some(columns(py, n, &episodes, &mut state.returns)?) };
         let observations = self.rows(py, state.observations.clone())?;
-        Ok((observations, rewards.into_pyarray(py), state.ends().into_pyarray(py), ended))
-    }
-
-    /// The observations `[N, O]` at the ends of the last step, each under its old goal; zeros elsewhere.
-    fn final_observations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let (guard, size) = (self.locked()?, self.observation_size());
-        let blocks = guard.as_ref().into_iter().flat_map(|state| &state.pool.blocks);
-        let rows = blocks.flat_map(|block| block.ends.iter().zip(block.final_observations.chunks_exact(size)));
-        let mut finals = vec![0.0; self.count * size];
-        for (to, (end, row)) in finals.chunks_exact_mut(size).zip(rows) {
-            if end.is_some() {
-                to.copy_from_slice(row);
-            }
-        }
-        self.rows(py, finals)
-    }
-
-    /// The rewards of the last step by term, the task's and those of training, and the rotation errors after it.
-    fn terms<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyDict>, Bound<'py, PyArray1<f32>>)> {
-        let mut guard = self.locked()?;
-        let details = guard.as_mut().into_iter().flat_map(|state| state.pool.envs_mut());
-        let details: Vec<_> = details.map(|hand| *hand.last_step()).collect();
-        let terms = PyDict::new(py);
-        let put = |name: &str, values: Vec<f32>| terms.set_item(name, values.into_pyarray(py));
-        for (i, (name, _)) in details[0].reward.named().enumerate() {
-            put(name, details.iter().map(|step| step.reward.values()[i] as f32).collect())?;
-        }
-        for (i, (name, _)) in details[0].training.named().enumerate().filter(|_| self.training) {
-            put(name, details.iter().map(|step| step.training.values()[i] as f32).collect())?;
-        }
-        let errors: Vec<f32> = details.iter().map(|step| step.rot_dist as f32).collect();
-        Ok((terms, errors.into_pyarray(py)))
+        let (ends, finals) = (state.ends().into_pyarray(py), self.finals(py, state)?);
+        let terms = self.terms.then(|| self.step_terms(py, state, &restarted)).transpose()?;
+        Ok((observations, rewards.into_pyarray(py), ends, ended, finals, terms))
     }
 
     /// Everything that the future of the hands depends on: (numbers `[N, k]`, counters `[N, m]`, ends `[N]`, returns `[N]`, and the
-    /// seed, the steps and the steps at which the next lesson begins).
+    /// seed, the steps, and the steps at which the lesson began).
     #[expect(clippy::type_complexity, reason = "Python takes it apart")]
     fn state<'py>(
         &self,
@@ -332,13 +376,15 @@ impl Hands {
         let state = guard.as_ref().expect("not closed");
         state.can_step.map_err(PyRuntimeError::new_err)?;
         let EnvState { numbers, counters } = guarded(|| state.pool.save())?;
+        // Where a new episode began at once, an end says nothing about the future.
+        let ends = if self.autoreset == Autoreset::SameStep { vec![0; self.count] } else { state.ends() };
         let (wide, long) = (numbers.len() / self.count, counters.len() / self.count);
         Ok((
             numbers.into_pyarray(py).reshape([self.count, wide])?,
             counters.into_pyarray(py).reshape([self.count, long])?,
-            state.ends().into_pyarray(py),
+            ends.into_pyarray(py),
             state.returns.clone().into_pyarray(py),
-            vec![state.seed, state.env_steps, state.next_lesson].into_pyarray(py),
+            vec![state.seed, state.env_steps, state.lesson_from.unwrap_or(state.env_steps)].into_pyarray(py),
         ))
     }
 
@@ -366,11 +412,15 @@ impl Hands {
         let restore = || {
             let ends = ends.context("an end is none of 0, 1, 2, 3")?;
             ensure!(rows == [n; 3] && ends.len() == n, "it is the state of {} hands, these are {n}", ends.len());
-            let &[seed, env_steps, next_lesson] = times.as_slice() else { anyhow::bail!("three numbers are missing") };
-            state.can_step = Err(FAILED);
-            state.pool.set_lesson(self.lesson(env_steps));
+            let waits = |end: &Option<End>| matches!(end, Some(End::Terminated | End::Truncated));
+            let due = self.autoreset == Autoreset::SameStep && ends.iter().any(waits);
+            ensure!(!due, "there, hands wait for their next episode; here they never do (autoreset_mode)");
+            let &[seed, env_steps, lesson_from] = times.as_slice() else { anyhow::bail!("three numbers are missing") };
+            state.can_step = Err(NOT_SET);
+            state.pool.set_lesson(self.lesson(lesson_from));
             state.pool.reseed(seed);
-            (state.seed, state.env_steps, state.next_lesson, state.returns) = (seed, env_steps, next_lesson, returns);
+            (state.seed, state.env_steps, state.returns) = (seed, env_steps, returns);
+            state.lesson_from = Some(lesson_from);
             let size = self.observation_size();
             let mut rest = &mut state.observations[..];
             let sizes = state.pool.block_sizes().into_iter();

@@ -37,7 +37,9 @@ mod _native {
 fn refused(error: Error) -> PyErr {
     let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     let kind = kinds.map(std::io::Error::kind).next();
-    let text = format!("{error:#}");
+    // The library speaks of its command line.
+    let text =
+        format!("{error:#}").replace("--mirror plays", "set={\"env.mirror\": True} plays").replace("--set ", "set ");
     match kind {
         Some(ErrorKind::NotFound) => PyFileNotFoundError::new_err(text),
         Some(ErrorKind::PermissionDenied) => PyPermissionError::new_err(text),

@@ -55,16 +55,17 @@ impl Policy {
             return Err(PyValueError::new_err(format!("observations of {found} values, this policy reads {size}")));
         }
         let seen: Vec<f32> = observations.as_array().iter().copied().collect();
-        let mut workers = WORKERS.try_lock();
-        let computed = if rows > GROUP
-            && let Ok(workers) = &mut workers
-        {
-            let pool = workers.get_or_insert_with(|| Workers::new(0)).pool()?;
-            py.detach(|| guarded(|| pool.install(|| compute(&self.fixed, &seen))))?
+        // Another call may be using the threads; a fork of it will use them for ever.
+        let (mut shared, mut own) = (WORKERS.try_lock(), Workers::new(1));
+        let computed = if rows <= GROUP {
+            py.detach(|| guarded(|| compute(&self.fixed, &seen)))?
         } else {
-            // Few rows, or the threads are busy with those of another call.
-            let groups = || seen.chunks(GROUP * size).flat_map(|group| compute(&self.fixed, group)).collect();
-            py.detach(|| guarded(groups))?
+            let workers = match &mut shared {
+                Ok(shared) => shared.get_or_insert_with(|| Workers::new(0)),
+                Err(_) => &mut own,
+            };
+            let pool = workers.pool()?;
+            py.detach(|| guarded(|| pool.install(|| compute(&self.fixed, &seen))))?
         };
         computed.into_pyarray(py).reshape([rows, width])
     }

@@ -24,10 +24,10 @@ pub(crate) type Set = Vec<(String, String)>;
 pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
     for (key, _) in &set {
         let section = key.split('.').next().unwrap_or(key);
-        ensure!(key != "env.num_envs", "env.num_envs: give num_envs instead");
-        ensure!(!matches!(section, "ppo" | "run"), "{key}: it is a setting of a learner, and these hands have none");
+        ensure!(key != "env.num_envs", "env.num_envs: the number of hands is num_envs, not a setting");
+        ensure!(!matches!(section, "ppo" | "run"), "{key}: it is a setting of a learner, and here is none");
         let only_training = matches!(section, "training" | "randomization");
-        ensure!(training || !only_training, "{key}: it changes the task for training; give training=True, too");
+        ensure!(training || !only_training, "{key}: it holds only for VectorEnv(training=True)");
     }
     Ok(set.into_iter().map(|(key, value)| Override { key, value }).collect())
 }
@@ -45,7 +45,7 @@ pub(crate) fn resolve(
 ) -> Result<(Config, Arc<Task>)> {
     ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
     let Some(policy) = policy else {
-        let config = Config::resolve(user_file(config)?.as_ref(), overrides)?;
+        let config = Config::resolve_task(user_file(config)?.as_ref(), overrides)?;
         let task = Task::new(&config.env, &config.hand)?;
         return Ok((Config { env: task.config().clone(), ..config }, task));
     };

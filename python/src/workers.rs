@@ -33,16 +33,21 @@ impl Workers {
     /// # Errors
     /// Fails if there are too many threads, or if the system refuses them.
     pub(crate) fn pool(&mut self) -> PyResult<&ThreadPool> {
-        let own = process::id();
-        if let Some((_, lost)) = self.pool.take_if(|(of, _)| *of != own) {
-            // To drop it would wait for threads that are not there.
-            std::mem::forget(lost);
-        }
+        let forked = self.forget_of_parent();
         let pool = match self.pool.take() {
             Some((_, pool)) => pool,
+            None if forked => {
+                os::thread_pool(self.threads).map_err(|error| PyRuntimeError::new_err(error.to_string()))?
+            }
             None => os::thread_pool(self.threads).map_err(crate::refused)?,
         };
-        Ok(&self.pool.insert((own, pool)).1)
+        Ok(&self.pool.insert((process::id(), pool)).1)
+    }
+
+    /// Forgets the threads of a parent process, and returns whether there were any. To drop them would take locks that a thread of the
+    /// parent may have held at the fork.
+    fn forget_of_parent(&mut self) -> bool {
+        self.pool.take_if(|(of, _)| *of != process::id()).map(std::mem::forget).is_some()
     }
 
     /// Does long work in the pool, without Python's lock. Ctrl-C sets the flag that the work gets, waits for its end, and is raised.
@@ -76,5 +81,11 @@ impl Workers {
             let done = py.detach(|| running.join()).map_err(|panic| panicked(&*panic));
             raised.and(done)
         })
+    }
+}
+
+impl Drop for Workers {
+    fn drop(&mut self) {
+        self.forget_of_parent();
     }
 }

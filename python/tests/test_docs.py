@@ -1,4 +1,4 @@
-"""The code in docs/PYTHON.md and README.md runs as it stands there."""
+"""The code in docs/PYTHON.md runs as it stands there, block after block."""
 import doctest
 import importlib.util
 import pathlib
@@ -18,7 +18,7 @@ def missing(code):
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_the_code_of_the_document_runs(number, monkeypatch):
+def test_the_code_of_the_document_runs(number):
     code = BLOCKS[number]
     if missing(code):
         pytest.skip(f"not installed: {missing(code)}")

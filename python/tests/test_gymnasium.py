@@ -43,6 +43,19 @@ OTHERS = [
 ]
 
 
+def test_wrappers_of_one_hand_work_unchanged():
+    one = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make("ShadowRepose-v0", set=SHORT))
+    one.reset()
+    for _ in range(20):
+        *_, info = one.step(np.zeros(20))
+    assert info["episode"]["l"] == info["final_info"]["episode"]["l"] == 20
+    made = gymnasium.make_vec("ShadowRepose-v0", num_envs=2, vectorization_mode="sync", set=SHORT)
+    several = wrappers.RecordEpisodeStatistics(made)
+    several.reset()
+    for _ in range(45):
+        *_, info = several.step(np.zeros((2, 20)))
+
+
 @pytest.mark.parametrize(
     "imports", ["import gymnasium, shadow_repose", "import shadow_repose.envs, gymnasium", "import gymnasium; name = 'shadow_repose:' + name"]
 )

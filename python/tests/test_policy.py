@@ -1,5 +1,8 @@
 """Policies and their scores."""
+import copy
+import pathlib
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -31,10 +34,18 @@ def test_drawn_actions_spread_around_the_means_and_follow_the_generator():
     assert policy.std.shape == (20,)
 
 
-def test_a_policy_is_pickled_by_its_place():
+def test_a_policy_is_pickled_by_its_place_and_recognised(tmp_path):
     policy, seen = Policy.load("robust"), observations(3)
     again = pickle.loads(pickle.dumps(policy))
     assert np.array_equal(again(seen), policy(seen)) and "robust" in repr(again)
+    assert copy.deepcopy(policy) is policy
+    assets, file = pathlib.Path(__file__).parent.parent.parent / "assets/policies", tmp_path / "policy.safetensors"
+    shutil.copy(assets / "robust.safetensors", file)
+    pickled = pickle.dumps(Policy.load(file))
+    assert np.array_equal(pickle.loads(pickled)(seen), policy(seen))
+    shutil.copy(assets / "repose.safetensors", file)
+    with pytest.raises(ValueError, match="another policy"):
+        pickle.loads(pickled)
 
 
 def test_a_policy_file_is_loaded_with_its_settings(tmp_path):

@@ -70,20 +70,22 @@ def test_a_child_that_is_forked_in_a_step_gets_an_exception_and_does_not_hang():
 
 
 def test_two_threads_that_step_the_same_hands_get_results_or_a_sentence():
-    envs, errors, done = started(), [], []
+    envs, errors, done = started(set={"env.max_episode_seconds": 0.05}, reward_terms=True), [], []
 
-    def step():
-        for _ in range(50):
+    def step(value):
+        for _ in range(100):
             try:
-                done.append(envs.step(ZEROS))
+                done.append((value, envs.step(np.full((16, 20), value))))
             except RuntimeError as error:
                 errors.append(str(error))
 
-    threads = [threading.Thread(target=step) for _ in range(3)]
+    threads = [threading.Thread(target=step, args=(0.2 * i,)) for i in range(1, 4)]
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
-    assert len(done) + len(errors) == 150 and envs.env_steps == 16 * len(done)
-    assert set(errors) <= {"another thread is using these hands"}
+    assert len(done) + len(errors) == 300 and envs.env_steps == 16 * len(done)
+    assert set(errors) == {"another thread is using these hands"}
+    finals = [(value, info["final_obs"][info["_final_obs"]]) for value, (*_, info) in done if "final_obs" in info]
+    assert len(finals) > 5 and all((rows[:, envs.observation_layout["previous_action"]] == np.float32(value)).all() for value, rows in finals)
 
 
 def test_two_threads_step_hands_of_their_own_with_the_bits_that_each_has_alone():
@@ -167,12 +169,18 @@ def test_one_hand_steps_in_processes_of_gymnasium():
     envs.close()
 
 
-def test_a_pickle_of_hands_that_cannot_step_is_a_fresh_start():
+def test_hands_that_are_not_reset_are_as_new_in_a_copy_and_busy_ones_are_not_copied():
     envs = VectorEnv(3, seed=9)
     again = pickle.loads(pickle.dumps(envs))
     assert np.array_equal(again.reset()[0], envs.reset()[0])
-    envs.close()
-    assert np.array_equal(pickle.loads(pickle.dumps(envs)).reset()[0], VectorEnv(3, seed=9).reset()[0])
+    busy = VectorEnv(1024, threads=1)
+    busy.reset()
+    stepping = threading.Thread(target=lambda: [busy.step(np.zeros((1024, 20))) for _ in range(3)])
+    stepping.start()
+    time.sleep(0.02)
+    with pytest.raises(RuntimeError, match="another thread"):
+        pickle.dumps(busy)
+    stepping.join()
 
 
 def test_the_module_is_imported_without_gymnasium_and_numpy():

@@ -66,6 +66,19 @@ impl Config {
         layered(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
+    /// Returns the settings of a task and of its lesson: as [`Config::resolve`] does, but of the user's file nothing else is used.
+    ///
+    /// # Errors
+    /// Fails as [`Config::resolve`] does.
+    pub fn resolve_task(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        let mut user = user.map(Source::table).transpose()?;
+        if let Some((_, table)) = &mut user {
+            table.retain(|section, _| !matches!(section, "ppo" | "run"));
+            table.get_mut("env").and_then(Value::as_table_mut).map(|env| env.remove("num_envs"));
+        }
+        layered(Table::new(), user, overrides)
+    }
+
     /// Returns the settings of a training that begins with a policy of this net: as [`Config::resolve`] does, but the base has this
     /// net.
     ///
