@@ -6,12 +6,14 @@
 mod display;
 #[cfg(feature = "video")]
 mod film;
+mod replay;
 #[cfg(feature = "viewer")]
 mod window;
 
 pub use display::task_for_display;
 #[cfg(feature = "video")]
 pub use film::{EpisodeFilms, Film, screenshot};
+pub use replay::{About, MOST_EPISODES, replay};
 #[cfg(feature = "viewer")]
 pub use window::Window;
 
