@@ -4,6 +4,7 @@
 //! Python's lock on threads of its own. A fork gets threads of its own. A panic is a `RuntimeError`. Nothing waits for a lock that
 //! another thread of the user may hold: the second one gets an error.
 
+mod episodes;
 mod hands;
 mod policy;
 mod settings;
