@@ -49,6 +49,7 @@ pub fn replay(task: &Task, dressed: bool, trace: &str, episodes: usize, about: A
     let number = |key: &str, own: f64| header[key].as_f64().filter(|x| x.is_finite() && *x > 0.0).unwrap_or(own);
     let config = task.config();
     let terms: Vec<&str> = TaskReward::default().named().map(|(name, _)| name).collect();
+    let scalars = [&SCALARS[..], &terms].concat();
     let meta = json!({
         "format": 1,
         "title": about.title,
@@ -62,7 +63,7 @@ pub fn replay(task: &Task, dressed: bool, trace: &str, episodes: usize, about: A
         "hold": number("max_consecutive_successes", config.max_consecutive_successes.into()),
         "hands": 1,
         "numbers": numbers,
-        "scalars": [&SCALARS[..], &terms].concat(),
+        "scalars": scalars,
         "terms": terms,
         "live": false,
         "episodes": rows.episodes,
