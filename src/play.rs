@@ -19,7 +19,7 @@ use crate::repose::{Score, Task};
 use crate::robustness::robustness;
 use crate::run;
 use crate::see;
-use crate::trace::Trace;
+use crate::trace::{ENOUGH, Trace};
 
 /// Plays in a window, as a film, or without either, and prints the score unless it was a window. Returns the exit code of the
 /// program.
@@ -28,7 +28,9 @@ use crate::trace::Trace;
 /// Fails if a checkpoint, setting or scene cannot be used, if a window cannot be opened, or if a trace or film cannot be written.
 pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     expect_used(&args.set, "play")?;
-    if let Some(option) = args.shot.given().filter(|_| args.video.is_none() && !wants_window(args)) {
+    if let Some(option) =
+        args.shot.given().filter(|_| args.video.is_none() && args.html.is_none() && !wants_window(args))
+    {
         let text = format!("{option} applies only to a film (--video) or a window");
         return Err(usage_error("play", &text).into());
     }
@@ -44,7 +46,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         None => Config::resolve(None, &args.set).and_then(|config| Task::new(&config.env, &config.hand))?,
     };
     let config = task.config();
-    for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
+    for output in [&args.trace, &args.video, &args.out, &args.html].into_iter().flatten() {
         let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
         run::expect_output(output, policy, config.model_file())?;
     }
@@ -82,7 +84,9 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
     let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
     // Opened before playing, so that a path that cannot be written to does not cost the score.
     let output = args.trace.as_deref().map(os::OutputFile::create).transpose()?;
-    let mut trace = output.as_ref().map(|_| Trace::new(task, checkpoint.as_deref()));
+    let page = args.html.as_deref().map(os::OutputFile::create).transpose()?;
+    let enough = if page.is_some() { usize::MAX } else { ENOUGH };
+    let mut trace = (output.is_some() || page.is_some()).then(|| Trace::new(task, checkpoint.as_deref(), enough));
     let mut goal_times = GoalTimes::new(config);
     if let (Some(output), Some(video)) = (&output, &args.video) {
         ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
@@ -94,7 +98,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         }
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
-        let episodes = episodes(args, 256);
+        let episodes = episodes(args, if args.html.is_some() { 1 } else { 256 });
         let bar = os::progress_bar(episodes.count as u64, "episodes", actor.name());
         Trial { task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
     };
@@ -111,8 +115,9 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         }
         return Ok(os::exit_code(requests.signal()));
     };
-    if let (Some(output), Some(trace)) = (output, trace) {
-        output.finish(trace.finish().as_bytes())?;
+    if let Some(text) = trace.map(Trace::finish) {
+        output.map(|output| output.finish(text.as_bytes())).transpose()?;
+        page.map(|page| write_page(page, task, args, &text, checkpoint.as_deref())).transpose()?;
     }
     played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if args.json {
@@ -131,6 +136,27 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
     Ok(ExitCode::SUCCESS)
 }
 
+/// Writes the episodes of a trace as one HTML file.
+fn write_page(
+    output: os::OutputFile,
+    task: &Task,
+    args: &PlayArgs,
+    trace: &str,
+    checkpoint: Option<&str>,
+) -> Result<()> {
+    let shown = see::task_for_display(task, &args.shot, [1280, 720], crate::sim::Quality::Fast)?;
+    let title = checkpoint.map_or("no policy".to_owned(), |checkpoint| match checkpoint {
+        "built into the program" => "the built-in policy".to_owned(),
+        other => other.to_owned(),
+    });
+    let about = see::About { title, policy: checkpoint.map(str::to_owned), seed: Some(args.seed), settings: json!({}) };
+    let page = see::replay(&shown, trace, args.episodes.unwrap_or(1) as usize, about)?.html();
+    let said = format!("{}: {} kB", output.path().display(), page.len() / 1000);
+    output.finish(page.as_bytes())?;
+    os::say(&said);
+    Ok(())
+}
+
 /// Returns the actor that a policy is played as.
 fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
     let policy = loaded.policy.freeze();
@@ -138,7 +164,8 @@ fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
 }
 
 fn wants_window(args: &PlayArgs) -> bool {
-    let otherwise = args.robustness || args.headless || args.json || args.trace.is_some() || args.video.is_some();
+    let outputs = [&args.trace, &args.video, &args.html];
+    let otherwise = args.robustness || args.headless || args.json || outputs.into_iter().any(Option::is_some);
     args.window || !otherwise && cfg!(feature = "viewer") && os::has_display()
 }
 

@@ -6,8 +6,8 @@ use crate::env::{End, Env};
 use crate::evaluate::Moment;
 use crate::repose::{Group, Task, add_settings};
 
-/// The number of records at which writing stops; episodes are written whole and in order.
-const ENOUGH: usize = 2000;
+/// The number of records at which a trace stops by default; episodes are written whole and in order.
+pub const ENOUGH: usize = 2000;
 
 /// The records of episodes that may still be needed.
 pub struct Trace {
@@ -16,11 +16,13 @@ pub struct Trace {
     episodes: Vec<Vec<String>>,
     /// The last episode that may be needed, as far as is known.
     last: usize,
+    /// The number of records at which writing stops.
+    enough: usize,
 }
 
 impl Trace {
-    /// Creates an empty trace of a task, played by the policy in `checkpoint`.
-    pub fn new(task: &Task, checkpoint: Option<&str>) -> Self {
+    /// Creates an empty trace of a task, played by the policy in `checkpoint`, of whole episodes until there are `enough` records.
+    pub fn new(task: &Task, checkpoint: Option<&str>, enough: usize) -> Self {
         let (config, hand) = (task.config(), task.hand());
         let mut header = json!({
             "sim_dt": config.sim_dt,
@@ -42,7 +44,7 @@ impl Trace {
             "vel_obs_scale": config.vel_obs_scale,
         });
         add_settings(config, &mut header);
-        Self { header, episodes: Vec::new(), last: usize::MAX }
+        Self { header, episodes: Vec::new(), last: usize::MAX, enough }
     }
 
     /// Records `moment` if it may be needed.
@@ -60,7 +62,7 @@ impl Trace {
         let mut records = 0;
         let full = self.episodes.iter().position(|lines| {
             records += lines.len();
-            records >= ENOUGH
+            records >= self.enough
         });
         if let Some(last) = full {
             self.last = last;

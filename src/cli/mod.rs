@@ -240,6 +240,12 @@ pub struct PlayArgs {
     /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub trace: Option<PathBuf>,
+    /// Write the episodes as one HTML file that any browser shows, without a network [default: 1 episode, at most 20]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["video", "window", "robustness"], help_heading = OUTPUT)]
+    pub html: Option<PathBuf>,
+    /// Show the episodes of this trace in the HTML file, without playing
+    #[arg(long, value_name = "FILE", requires = "html", conflicts_with_all = ["trace", "json", "policy", "ckpt", "stochastic"], help_heading = OUTPUT)]
+    pub from_trace: Option<PathBuf>,
     /// Film the episodes one after another, as .mp4 or .gif; needs no display
     #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub video: Option<PathBuf>,

@@ -83,7 +83,10 @@ impl Page {
 
 /// Returns text without indents, empty lines and lines of comment.
 fn lean(text: &str) -> String {
-    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*"));
+    let lines = text
+        .lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*"));
     lines.map(|line| format!("{line}\n")).collect()
 }
 
@@ -105,7 +108,8 @@ fn table(rows: usize, columns: usize, value: impl Fn(usize, usize) -> i64) -> Ve
         let before = if row == 0 { 0 } else { value(row - 1, column) };
         (value(row, column) - before) as u16
     });
-    let (low, high): (Vec<u8>, Vec<u8>) = differences.map(|difference| (difference as u8, (difference >> 8) as u8)).unzip();
+    let (low, high): (Vec<u8>, Vec<u8>) =
+        differences.map(|difference| (difference as u8, (difference >> 8) as u8)).unzip();
     [low, high].concat()
 }
 
@@ -166,7 +170,8 @@ mod tests {
     #[test]
     fn what_ends_a_script_does_not_end_the_data() {
         let meta = json!({ "policy": "</script><script>alert(1)</script>" });
-        let page = Page { meta, scene: json!({}), meshes: Vec::new(), rows: vec![vec![1.0]], counts: Vec::new() }.html();
+        let page =
+            Page { meta, scene: json!({}), meshes: Vec::new(), rows: vec![vec![1.0]], counts: Vec::new() }.html();
         assert_eq!(page.matches("</script>").count(), PAGE.matches("</script>").count());
         assert!(!page.contains("alert(1)</script>") && page.contains("\\u003c/script>"));
     }

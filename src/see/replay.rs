@@ -4,7 +4,7 @@ use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 
 use crate::draw::Page;
-use crate::repose::{TaskReward, Task};
+use crate::repose::{Task, TaskReward};
 use crate::sim::Drawing;
 
 /// The most episodes of a file: it is read at once, and each adds 57 kB.
@@ -28,14 +28,15 @@ pub struct About {
     pub settings: Value,
 }
 
-/// Returns the page that shows the first `episodes` of a trace of `task`, which was loaded for display, with meshes if `dressed`.
+/// Returns the page that shows the first `episodes` of a trace of `task`, which was loaded for display.
 ///
 /// # Errors
 /// Fails if the text is no trace, or one of another scene.
-pub fn replay(task: &Task, dressed: bool, trace: &str, episodes: usize, about: About) -> Result<Page> {
+pub fn replay(task: &Task, trace: &str, episodes: usize, about: About) -> Result<Page> {
     let mut lines = trace.lines();
-    let header: Value = lines.next().and_then(|line| serde_json::from_str(line).ok()).context("it does not begin with a header")?;
-    let mut drawing = task.scene().drawing(dressed, task.config().model_file().is_none());
+    let header: Value =
+        lines.next().and_then(|line| serde_json::from_str(line).ok()).context("it does not begin with a header")?;
+    let mut drawing = task.scene().drawing(task.config().model_file().is_none());
     let mut rows = Rows::new(task, &drawing);
     for (number, line) in lines.enumerate() {
         ensure!(number < MOST_RECORDS, "it has more than {MOST_RECORDS} records");
@@ -101,7 +102,8 @@ impl Rows {
     /// Fails if it is none, or of another scene.
     fn add(&mut self, record: &Value) -> Result<()> {
         let list = |key: &str, length: usize| {
-            let found: Option<Vec<f64>> = record[key].as_array().and_then(|list| list.iter().map(Value::as_f64).collect());
+            let found: Option<Vec<f64>> =
+                record[key].as_array().and_then(|list| list.iter().map(Value::as_f64).collect());
             let fits = found.filter(|found| found.len() == length && found.iter().all(|x| x.abs() < 1e9));
             fits.with_context(|| format!("{key} is not a list of {length} numbers, as in this scene"))
         };
@@ -131,8 +133,14 @@ impl Rows {
         if let Some(first) = self.rows.last_mut().filter(|first| first[error - 1] == 0.0 && places > 0 && !begins) {
             first[error] = row[error];
         }
-        for (key, end) in [("terminated", "the cube was dropped"), ("truncated", "the time was up"), ("diverged", "the physics diverged")] {
-            if record[key] == true && let Some(episode) = self.episodes.last_mut() {
+        for (key, end) in [
+            ("terminated", "the cube was dropped"),
+            ("truncated", "the time was up"),
+            ("diverged", "the physics diverged"),
+        ] {
+            if record[key] == true
+                && let Some(episode) = self.episodes.last_mut()
+            {
                 episode["end"] = end.into();
             }
         }

@@ -114,9 +114,11 @@ fn is_false(flag: &bool) -> bool {
 }
 
 impl Scene {
-    /// Returns what a page needs to draw this scene. `dressed` if the hand has meshes over its primitives.
-    pub fn drawing(&self, dressed: bool, is_builtin: bool) -> Drawing {
+    /// Returns what a page needs to draw this scene.
+    pub fn drawing(&self, is_builtin: bool) -> Drawing {
         let model = &*self.model;
+        // Only the built-in hand is shown by meshes over its primitives.
+        let dressed = is_builtin && model.ffi().nmesh > 0;
         let (mut geoms, mut used, mut floor) = (Vec::new(), BTreeMap::new(), None);
         for geom in 0..model.ngeom() as usize {
             if is_floor(model, geom) {
@@ -213,7 +215,8 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: bool, used: &mut BTreeMap<u
 
 /// Returns a mesh with one corner for each pair of point and normal that a triangle uses, in the order of their first use.
 fn drawn_mesh(model: &MjModel, mesh: usize) -> DrawnMesh {
-    let [first, points, normals] = [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
+    let [first, points, normals] =
+        [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
     let (mut places, mut corners, mut triangles) = (BTreeMap::new(), Vec::new(), Vec::new());
     for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
