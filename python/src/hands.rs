@@ -116,17 +116,17 @@ impl Hands {
 
     /// Returns the last observations `[N, O]` of the hands that the last step cut off or ended; zeros for others.
     fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
-        let size = self.observation_size();
+        let (size, blocks) = (self.observation_size(), &state.pool.blocks);
         let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
-        let blocks = state.pool.blocks.iter();
-        let rows = blocks.flat_map(|block| block.ends.iter().zip(block.final_observations.chunks_exact(size)));
+        if self.autoreset != Autoreset::SameStep || !blocks.iter().flat_map(|block| &block.ends).any(is_cut) {
+            return Ok(None);
+        }
+        let rows = blocks.iter().flat_map(|block| block.ends.iter().zip(block.final_observations.chunks_exact(size)));
         let mut finals = vec![0.0; self.count * size];
-        let mut any = false;
         for (to, (_, row)) in finals.chunks_exact_mut(size).zip(rows).filter(|(_, (end, _))| is_cut(end)) {
             to.copy_from_slice(row);
-            any = true;
         }
-        (any && self.autoreset == Autoreset::SameStep).then(|| self.rows(py, finals)).transpose()
+        self.rows(py, finals).map(Some)
     }
 
     /// Returns the terms of the last step; zeros where a new episode took the place of the step.
