@@ -295,7 +295,7 @@ pub struct Player {
     lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
-    /// The policy's workspace, from its first step on.
+    /// The policy's workspace, from the first step of an episode on.
     work: Option<Workspace>,
 }
 
@@ -312,14 +312,21 @@ impl Player {
     /// Starts the episode with the given number.
     pub fn start(&mut self, episodes: Episodes, episode: usize) {
         self.lane.start(episodes, episode, &mut self.observation);
+        self.work = None;
     }
 
-    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it. The policy must be
-    /// the same in every call.
+    /// Takes one step with the action of `actor`, and returns the end of the episode if the step ended it. The sizes of its
+    /// policy must be the same throughout an episode.
     pub fn step(&mut self, actor: &Actor) -> Option<End> {
+        self.step_changed(actor, |_| {})
+    }
+
+    /// Takes one step with the action of `actor` after a change to it.
+    pub fn step_changed(&mut self, actor: &Actor, change: impl FnOnce(&mut [f32])) -> Option<End> {
         self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
         actor.choose(&self.observation, lane, &mut self.action, self.work.as_mut());
+        change(&mut self.action);
         self.lane.step(&self.action, &mut self.observation)
     }
 

@@ -285,7 +285,10 @@ fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
 }
 
 /// Checks that a scene other than the built-in one was named by the user.
-fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
+///
+/// # Errors
+/// Fails if it was not; the message says how to name it.
+pub fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
     if let Some(model) = env.model_file().filter(|_| !named) {
         let set = os::quoted(&format!("{MODEL}={}", model.display()));
         bail!("it uses a custom scene, and no path in a file is followed: add --set {set} to use that scene");

@@ -19,8 +19,8 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Creates an empty trace of a task, played by the policy in `checkpoint`.
-    pub fn new(task: &Task, checkpoint: Option<&str>) -> Self {
+    /// Creates an empty trace of a task, played by the policy in `checkpoint` in episodes drawn from `seed`.
+    pub fn new(task: &Task, checkpoint: Option<&str>, seed: u64) -> Self {
         let (config, hand) = (task.config(), task.hand());
         let mut header = json!({
             "sim_dt": config.sim_dt,
@@ -32,6 +32,8 @@ impl Trace {
             "model": config.model,
             "goal_position": config.goal_position.value,
             "checkpoint": checkpoint,
+            "seed": seed,
+            "settings": config.changed(),
             "observation": hand.layout.groups.map(|Group { name, start, length, unit, .. }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
             }),

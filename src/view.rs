@@ -1,7 +1,7 @@
-//! Showing the scene without a policy: in a window, or as one picture.
+//! Showing the scene without a policy: in a window, in a browser, or as one picture.
 
 use std::path::Path;
-#[cfg(any(feature = "video", feature = "viewer"))]
+use std::rc::Rc;
 use std::sync::Arc;
 
 #[cfg(not(all(feature = "video", feature = "viewer")))]
@@ -10,9 +10,8 @@ use anyhow::{Context, Result};
 
 use crate::cli::{Motion, ViewArgs, usage_error};
 use crate::config::{Config, expect_used, user_file};
-use crate::evaluate::{Actor, Episodes};
+use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
-#[cfg(any(feature = "video", feature = "viewer"))]
 use crate::repose::Task;
 use crate::run;
 use crate::see;
@@ -24,7 +23,7 @@ const ACTORS: [(Motion, &str, Actor); 3] = [
     (Motion::Wave, "wave", Actor::Wave),
 ];
 
-/// Shows the scene in a window, or writes one picture of it.
+/// Shows the scene in a window or on a page, or writes one picture of it.
 ///
 /// # Errors
 /// Fails if a setting or the scene cannot be used, if no window can be opened (with what is missing), or if the picture cannot be
@@ -34,6 +33,9 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if args.shot.size.is_some() && args.screenshot.is_none() {
         return Err(usage_error("view", "--size applies only to a picture (--screenshot)").into());
     }
+    if args.shot.quality.is_some() && args.web.is_some() {
+        return Err(usage_error("view", "--quality applies only to a picture (--screenshot) or a window").into());
+    }
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
     let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
     if let Some(path) = &args.screenshot {
@@ -41,14 +43,28 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     }
     let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
     let episodes = Episodes::scored(args.seed, usize::MAX);
+    if let Some(port) = args.web {
+        return show_on_page(port, args, &config, first);
+    }
     match &args.screenshot {
         Some(path) => draw(path, args, &config, &ACTORS[first].2, episodes),
         None => show(args, &config, first, episodes),
     }
 }
 
+/// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
+fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Result<()> {
+    let task = task_for_display(config, args)?;
+    let sliders = see::Sliders::new(&task);
+    let scene = config.env.model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
+    let about = see::About { title: scene, policy: None, seed: Some(args.seed) };
+    let own = sliders.clone();
+    let step = move |player: &mut Player| player.step_changed(&ACTORS[actor].2, |action| own.change(action));
+    let turn = see::Turn { step: Rc::new(step), policy: None };
+    see::Live::open(port, &task, (&about, args.shot.camera), 1, &turn, Some(sliders))?.show(&mut || turn.clone())
+}
+
 /// Loads the task, and tells what of the user's scene the settings replace.
-#[cfg(any(feature = "video", feature = "viewer"))]
 fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
     let task = Task::new(&config.env, &config.hand)?;
     let task = see::task_for_display(&task, &args.shot, [1280, 720], crate::sim::Quality::High)?;

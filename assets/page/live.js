@@ -18,7 +18,7 @@ class Feed {
     clearTimeout(this.retry);
     if (this.source || document.hidden) return;
     const source = this.source = new EventSource("events");
-    this.heard = performance.now();
+    [this.heard, this.best] = [performance.now(), Infinity];
     const on = (name, act) => source.addEventListener(name, (event) => {
       if (source !== this.source) return;
       this.heard = performance.now();
@@ -46,12 +46,12 @@ class Feed {
     this.wait = Math.min(5000, 1.5 * this.wait);
   }
 
-  /** The first event of a connection. What comes may not go on from what is there. */
+  /** The first event of a connection, and the first one after some that were missed. What comes does not go on from what is there. */
   greet({ key, episodes, controls }) {
     if (key !== this.recording.meta.key) return location.reload(); // another program, with another scene
     episodes.forEach((about, hand) => this.recording.announce(hand, about));
     if (controls) showControls(controls);
-    [this.best, this.wait, this.punctual] = [Infinity, 1000, performance.now()];
+    [this.wait, this.punctual] = [1000, performance.now()];
     notice("");
   }
 

@@ -204,7 +204,7 @@ pub struct PlayArgs {
     /// Use the policy of the hand on the other side: this hand is its mirror image
     #[arg(long, help_heading = POLICY)]
     pub mirror: bool,
-    /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film, 1]
+    /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film or an HTML file, 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
     /// Random seed; episode k is drawn from (seed, k)
@@ -240,6 +240,24 @@ pub struct PlayArgs {
     /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub trace: Option<PathBuf>,
+    /// Write at most 20 episodes as one HTML file, which any browser shows without a network
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["window", "robustness"], help_heading = OUTPUT)]
+    pub html: Option<PathBuf>,
+    /// Show the episodes of this trace in the HTML file, without playing anew
+    #[arg(long, value_name = "FILE", requires = "html", help_heading = OUTPUT,
+        conflicts_with_all = ["trace", "video", "json", "headless", "episodes", "policy", "ckpt", "mirror", "stochastic"])]
+    pub from_trace: Option<PathBuf>,
+    /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free one) [default port: 7070]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT,
+        conflicts_with_all = ["window", "headless", "json", "trace", "html", "video", "robustness", "episodes"])]
+    pub web: Option<u16>,
+    /// Number of hands on that page
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "web", help_heading = OUTPUT,
+        value_parser = clap::value_parser!(u64).range(1..=16))]
+    pub hands: u64,
+    /// Follow a training: each episode is played by the newest policy of the run
+    #[arg(long, requires = "web", conflicts_with = "policy", help_heading = OUTPUT)]
+    pub follow: bool,
     /// Film the episodes one after another, as .mp4 or .gif; needs no display
     #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub video: Option<PathBuf>,
@@ -284,6 +302,10 @@ pub struct ViewArgs {
     /// Write one PNG picture and exit, without opening a window; needs no display
     #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub screenshot: Option<PathBuf>,
+    /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free one) [default port:
+    /// 7070]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot", help_heading = PICTURE)]
+    pub web: Option<u16>,
     /// Time of the picture in the episode, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]
     pub at: f64,

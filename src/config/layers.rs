@@ -141,6 +141,20 @@ impl Config {
     }
 }
 
+impl EnvConfig {
+    /// Returns the settings that differ from the default ones, by dotted key. The number of hands is none of the task.
+    ///
+    /// # Panics
+    /// Never panics: settings are tables.
+    pub fn changed(&self) -> Table {
+        let table = Table::try_from(self).expect("settings are a table");
+        let default = Self::deserialize(DEFAULTS["env"].clone()).expect("the defaults are valid");
+        let default = Table::try_from(default).expect("settings are a table");
+        let differs = |(key, value): &(String, Value)| key != "num_envs" && default[key] != *value;
+        table.into_iter().filter(differs).map(|(key, value)| (format!("env.{key}"), value)).collect()
+    }
+}
+
 impl PolicyConfig {
     /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
     /// added and removed between versions. What the built-in scene has given it does not hold in another.

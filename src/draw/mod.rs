@@ -4,8 +4,10 @@ mod bar_chart;
 mod chart;
 #[cfg(feature = "video")]
 mod film;
+mod page;
 
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
 pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
 #[cfg(feature = "video")]
 pub use film::{FilmFormat, FilmWriter, Frame, gif_of, write_png};
+pub use page::{Mesh, Page};

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
+use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
 
@@ -67,6 +68,21 @@ pub fn read_bytes_if(path: &Path, check: impl Fn(&[u8]) -> Result<()>) -> Result
     room.with_context(|| format!("{}: there is no memory for its {size} bytes", path.display()))?;
     file.take(LARGEST_BYTES).read_to_end(&mut bytes).cannot("read", path)?;
     Ok(bytes)
+}
+
+/// What changes when a file is replaced or written to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stamp {
+    inode: u64,
+    modified: Option<SystemTime>,
+}
+
+impl Stamp {
+    /// Returns the stamp of a file, if it is there.
+    pub fn of(path: &Path) -> Option<Self> {
+        let facts = fs::metadata(path).ok()?;
+        Some(Self { inode: facts.ino(), modified: facts.modified().ok() })
+    }
 }
 
 /// Checks that `path` still names this open file, which may have been deleted or replaced.

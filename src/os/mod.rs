@@ -1,6 +1,7 @@
-//! The system around the program: files, the terminal, signals, locks, threads, and pip.
+//! The system around the program: files, the terminal, signals, locks, threads, pip, and a server for a page.
 
 mod file;
+mod http;
 mod interrupt;
 mod lock;
 mod machine;
@@ -8,11 +9,12 @@ mod meshes;
 mod output;
 mod pip;
 mod progress;
+mod server;
 mod similar;
 mod terminal;
 mod threads;
 
-pub use file::{Cannot, expect_named, read_bytes, read_bytes_if, read_text, same_file};
+pub use file::{Cannot, Stamp, expect_named, read_bytes, read_bytes_if, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{LOCK, Locked};
 pub use machine::{Machine, program_checksum};
@@ -22,6 +24,7 @@ pub use output::{
     write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, progress_bar};
+pub use server::{Server, Take};
 pub use similar::similar;
-pub use terminal::{called_as, has_display, number, print, quoted, quoted_path, say, shortened, speak_as};
+pub use terminal::{called_as, has_display, is_terminal, number, print, quoted, quoted_path, say, shortened, speak_as};
 pub use threads::{start_threads, thread_pool};

@@ -1,6 +1,6 @@
 //! What the program says: on stdout, on stderr, and as commands for a shell.
 
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::Path;
 use std::sync::OnceLock;
 
@@ -90,6 +90,11 @@ pub fn called_as() -> String {
         return format!("cargo run {}--", if is_release { "--release " } else { "" });
     }
     std::env::args_os().next().map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
+}
+
+/// Whether somebody reads stderr as it is written.
+pub fn is_terminal() -> bool {
+    std::io::stderr().is_terminal()
 }
 
 /// Whether there is a display on which a window could open.

@@ -196,7 +196,8 @@ impl FixedPolicy {
         self.in_groups(observations, 1, |policy, seen, values, work| policy.values(seen, values, work))
     }
 
-    fn frozen(&self) -> FrozenPolicy<'_> {
+    /// Returns the policy for acting, without copying its weights.
+    pub fn frozen(&self) -> FrozenPolicy<'_> {
         let policy = &self.policy;
         let net = |layers, copies| Net::new(layers, &policy.parameters, policy.activation).with_copies(copies);
         let (actor, critic) = (net(&policy.layout.actor, &self.copies[0]), net(&policy.layout.critic, &self.copies[1]));

@@ -218,8 +218,7 @@ impl Repose {
     /// Draws a new goal and resets the hold counter.
     fn replace_goal(&mut self) {
         self.goal = self.draw_rotation();
-        let [x, y, z] = self.task.config.goal_position.value;
-        let position = [x, y, z + self.task.config.target_height];
+        let position = self.task.goal_place();
         self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.

@@ -207,6 +207,12 @@ impl Task {
         self.mirror.as_ref().map(|mirror| mirror.matrix(self.hand.layout.size))
     }
 
+    /// Returns where the goal is shown.
+    pub fn goal_place(&self) -> [f64; 3] {
+        let [x, y, z] = self.config.goal_position.value;
+        [x, y, z + self.config.target_height]
+    }
+
     /// Returns the description of observations and actions for a learner.
     pub fn spaces(&self) -> Spaces {
         self.hand.layout.spaces(&self.symmetry)

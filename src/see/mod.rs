@@ -1,17 +1,26 @@
-//! The task on display: in a window, as a film or as a picture.
+//! The task on display: in a window, as a film or as a picture, and in a browser.
 //!
 //! Without the feature `viewer` there is no window; without `video` there are no films or pictures. What would show them refuses
 //! with one of the messages below. Neither feature changes anything else.
 
+mod clock;
+mod columns;
 mod display;
 #[cfg(feature = "video")]
 mod film;
+mod live;
+mod replay;
+mod sliders;
 #[cfg(feature = "viewer")]
 mod window;
 
+pub use columns::About;
 pub use display::task_for_display;
 #[cfg(feature = "video")]
 pub use film::{EpisodeFilms, Film, screenshot};
+pub use live::{Live, MOST_HANDS, Turn};
+pub use replay::{MOST_EPISODES, Replay};
+pub use sliders::Sliders;
 #[cfg(feature = "viewer")]
 pub use window::Window;
 

@@ -6,16 +6,15 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
+use super::clock::Clock;
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
 use crate::repose::{Repose, Step, Task, TaskReward, task_reward};
-use crate::sim::{Controls, Gauge, Readout, Trend, Viewer};
+use crate::sim::{Gauge, Readout, Trend, Viewer};
 
 /// The minimum time between two frames.
 const FRAME: Duration = Duration::from_micros(16_667);
-/// The maximum lag, in seconds, of a machine that cannot keep up.
-const LARGEST_LAG: f64 = 0.25;
 /// Printed when a window opens.
 const KEYS: &str = "window: Space pauses, Right steps, Up and Down change the speed, G new goal, R reset, P next kind of actions, \
                     X MuJoCo's panel, Ctrl+Q closes";
@@ -67,7 +66,14 @@ impl Window {
             if asked.new_goal {
                 player.new_goal();
             }
-            for _ in 0..clock.steps_due(&asked) {
+            let due = match asked.paused {
+                true => {
+                    clock.pause();
+                    asked.steps
+                }
+                false => clock.steps_due(asked.speed),
+            };
+            for _ in 0..due {
                 let end = player.step(&actors[asked.choice]);
                 tally.steps += 1;
                 extend(&mut curves, player.env(), tally.steps);
@@ -79,33 +85,6 @@ impl Window {
         }
         tally.add(player.env(), false);
         Ok(tally.summary())
-    }
-}
-
-/// A clock that converts elapsed time into control steps.
-struct Clock {
-    ctrl_dt: f64,
-    last: Instant,
-    /// Scene time that is still to be played, s.
-    owed: f64,
-}
-
-impl Clock {
-    fn new(ctrl_dt: f64) -> Self {
-        Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
-    }
-
-    fn steps_due(&mut self, asked: &Controls) -> u32 {
-        let passed = self.last.elapsed().as_secs_f64();
-        self.last = Instant::now();
-        if asked.paused {
-            self.owed = 0.0;
-            return asked.steps;
-        }
-        self.owed = (self.owed + passed * asked.speed).min(LARGEST_LAG * asked.speed.max(1.0));
-        let steps = (self.owed / self.ctrl_dt).floor();
-        self.owed -= steps * self.ctrl_dt;
-        steps as u32
     }
 }
 
@@ -190,30 +169,5 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
         ],
         bars: vec![("within the tolerance", vec![hold]), ("reward of this step", terms.collect())],
         curves: curves.to_vec(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn controls(paused: bool, speed: f64, steps: u32) -> Controls {
-        Controls { paused, speed, choice: 0, steps, reset: false, new_goal: false }
-    }
-
-    #[test]
-    fn a_pause_lets_single_steps_through_and_does_not_catch_up_afterwards() {
-        let mut clock = Clock::new(1e-3);
-        clock.last -= Duration::from_secs(10);
-        assert_eq!(clock.steps_due(&controls(true, 1.0, 3)), 3);
-        assert_eq!(clock.steps_due(&controls(true, 1.0, 0)), 0);
-        assert!(clock.steps_due(&controls(false, 1.0, 0)) < 200, "the time of the pause is not made up for");
-    }
-
-    #[test]
-    fn a_machine_that_is_too_slow_falls_behind_instead_of_stalling() {
-        let mut clock = Clock::new(0.01);
-        clock.last -= Duration::from_secs(60);
-        assert_eq!(clock.steps_due(&controls(false, 1.0, 0)), 25);
     }
 }

@@ -10,7 +10,7 @@ use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use super::compilation::{Compilation, VISUAL};
 
 /// The group of geoms that are not drawn.
-const HIDDEN: i32 = 3;
+pub(super) const HIDDEN: i32 = 3;
 /// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 

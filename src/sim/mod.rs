@@ -4,6 +4,7 @@
 //! rad, lengths in m, in the world frame.
 
 mod compilation;
+mod drawing;
 mod fatal;
 mod files;
 mod fingerprint;
@@ -25,6 +26,7 @@ mod variation;
 mod viewer;
 
 pub use compilation::{Compilation, Cone, origin};
+pub use drawing::{Drawing, DrawnMesh};
 pub use fatal::{before_fatal_error, stepping};
 pub use files::scene_files;
 pub use look::{Camera, Look, Quality, mesh_files};

@@ -70,6 +70,13 @@ pub enum Frame {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mocap(pub(super) usize);
 
+impl Mocap {
+    /// Returns its number among the mocap bodies.
+    pub fn number(self) -> usize {
+        self.0
+    }
+}
+
 /// An actuator with one control.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Actuator {

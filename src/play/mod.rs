@@ -1,15 +1,21 @@
-//! Playing a policy: in a window, as a film, or for its score over whole episodes (a table or one JSON object), with a trace of
-//! the first episodes.
+//! Playing a policy: in a window or a browser, as a film or an HTML file, or for its score over whole episodes (a table or one JSON
+//! object), with a trace of the first episodes.
+
+mod browser;
+mod files;
 
 use std::process::ExitCode;
 use std::sync::Arc;
 
 #[cfg(not(feature = "video"))]
 use anyhow::bail;
-use anyhow::{Context, Result, ensure};
+#[cfg(not(feature = "viewer"))]
+use anyhow::ensure;
+use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
-use crate::cli::{Baseline, PlayArgs, usage_error};
+use self::files::Files;
+use crate::cli::{Baseline, PlayArgs, Shot, usage_error};
 use crate::config::{Config, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
@@ -19,7 +25,6 @@ use crate::repose::{Score, Task};
 use crate::robustness::robustness;
 use crate::run;
 use crate::see;
-use crate::trace::Trace;
 
 /// Plays in a window, as a film, or without either, and prints the score unless it was a window. Returns the exit code of the
 /// program.
@@ -28,23 +33,21 @@ use crate::trace::Trace;
 /// Fails if a checkpoint, setting or scene cannot be used, if a window cannot be opened, or if a trace or film cannot be written.
 pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     expect_used(&args.set, "play")?;
-    if let Some(option) = args.shot.given().filter(|_| args.video.is_none() && !wants_window(args)) {
-        let text = format!("{option} applies only to a film (--video) or a window");
-        return Err(usage_error("play", &text).into());
+    expect_together(args)?;
+    if let Some(trace) = &args.from_trace {
+        return browser::from_trace(trace, args).map(|()| ExitCode::SUCCESS);
     }
-    if args.shot.size.is_some() && args.video.is_none() {
-        return Err(usage_error("play", "--size applies only to a film (--video)").into());
-    }
+    let followed = if args.follow { Some(browser::followed(args)?) } else { None };
     let loaded = match args.policy {
         Some(_) => None,
-        None => Some(Loaded::find(args.ckpt.as_deref(), &args.set)?),
+        None => Some(Loaded::find(followed.as_deref().or(args.ckpt.as_deref()), &args.set)?),
     };
     let task = match &loaded {
         Some(loaded) => loaded.task(&args.set)?,
         None => Config::resolve(None, &args.set).and_then(|config| Task::new(&config.env, &config.hand))?,
     };
     let config = task.config();
-    for output in [&args.trace, &args.video, &args.out].into_iter().flatten() {
+    for output in [&args.trace, &args.video, &args.out, &args.html].into_iter().flatten() {
         let policy = loaded.as_ref().and_then(|loaded| loaded.origin.file());
         run::expect_output(output, policy, config.model_file())?;
     }
@@ -62,13 +65,46 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     if let (Some(loaded), true) = (&loaded, args.robustness) {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
     }
+    if let Some(port) = args.web {
+        return browser::live(port, args, &task, loaded, followed.as_deref());
+    }
     #[cfg(not(feature = "viewer"))]
     ensure!(!wants_window(args), see::NO_WINDOWS);
     #[cfg(feature = "viewer")]
     if wants_window(args) && show(args, &task, loaded.as_ref())? {
         return Ok(ExitCode::SUCCESS);
     }
+    if !os::has_display() && leaves_open(args) && os::is_terminal() {
+        os::say("note: there is no display; --web shows the hand in a browser, --html makes a file for one");
+    }
     play_unseen(args, requests, &task, loaded.as_ref())
+}
+
+/// Checks that options that are valid alone are so together.
+fn expect_together(args: &PlayArgs) -> Result<()> {
+    let is_page = args.html.is_some() || args.web.is_some();
+    let is_shown = is_page || args.video.is_some() || wants_window(args);
+    let given = args.shot.given().filter(|_| !is_shown);
+    let most = see::MOST_EPISODES as u64;
+    let text = match args {
+        _ if given.is_some() => {
+            format!(
+                "{} applies only to a film (--video), a page (--html, --web) or a window",
+                given.unwrap_or_default()
+            )
+        }
+        PlayArgs { video: None, shot: Shot { size: Some(_), .. }, .. } => {
+            "--size applies only to a film (--video)".into()
+        }
+        PlayArgs { video: None, shot: Shot { quality: Some(_), .. }, .. } if is_page => {
+            "--quality applies only to a film (--video) or a window".into()
+        }
+        PlayArgs { html: Some(_), episodes: Some(episodes), .. } if *episodes > most => {
+            format!("--html shows at most {most} episodes: a larger file would be slow to open")
+        }
+        _ => return Ok(()),
+    };
+    Err(usage_error("play", &text).into())
 }
 
 /// Plays without a window and prints the score.
@@ -80,21 +116,14 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         (None, _) => Actor::Zero,
     };
     let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
-    // Opened before playing, so that a path that cannot be written to does not cost the score.
-    let output = args.trace.as_deref().map(os::OutputFile::create).transpose()?;
-    let mut trace = output.as_ref().map(|_| Trace::new(task, checkpoint.as_deref()));
+    let mut files = Files::begin(task, checkpoint.as_deref(), args)?;
     let mut goal_times = GoalTimes::new(config);
-    if let (Some(output), Some(video)) = (&output, &args.video) {
-        ensure!(!output.is_of(video), "--trace {0} --video {0}: one file cannot be both", video.display());
-    }
     let mut observe = |moment: &Moment| {
         goal_times.observe(moment);
-        if let Some(trace) = &mut trace {
-            trace.record(moment);
-        }
+        files.observe(moment);
     };
     let score = |actor: &Actor, observe: &mut dyn FnMut(&Moment)| {
-        let episodes = episodes(args, 256);
+        let episodes = episodes(args, if args.html.is_some() { 1 } else { 256 });
         let bar = os::progress_bar(episodes.count as u64, "episodes", actor.name());
         Trial { task, actor, episodes, stop: requests.stop() }.score(&bar, observe)
     };
@@ -106,14 +135,12 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         None => score(&actor, &mut observe)?,
     };
     let Some(played) = played else {
-        if let Some(output) = output {
-            os::say(&format!("{}: interrupted, not written", output.path().display()));
+        for path in [&args.trace, &args.html].into_iter().flatten() {
+            os::say(&format!("{}: interrupted, not written", path.display()));
         }
         return Ok(os::exit_code(requests.signal()));
     };
-    if let (Some(output), Some(trace)) = (output, trace) {
-        output.finish(trace.finish().as_bytes())?;
-    }
+    files.finish(&browser::about(loaded, args))?;
     played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if args.json {
         os::print(&format!("{}\n", json_score(&played, &goal_times, checkpoint.as_deref(), args.seed)))?;
@@ -123,7 +150,7 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         os::print(&format!("checkpoint {checkpoint}\n"))?;
     }
     let mut columns = vec![(actor.name(), played)];
-    if loaded.is_some() && args.video.is_none() {
+    if loaded.is_some() && args.video.is_none() && args.html.is_none() {
         let zero = score(&Actor::Zero, &mut |_| {})?.context("these episodes cannot be interrupted")?;
         columns.push((Actor::Zero.name(), zero));
     }
@@ -138,8 +165,14 @@ fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
 }
 
 fn wants_window(args: &PlayArgs) -> bool {
-    let otherwise = args.robustness || args.headless || args.json || args.trace.is_some() || args.video.is_some();
-    args.window || !otherwise && cfg!(feature = "viewer") && os::has_display()
+    args.window || leaves_open(args) && cfg!(feature = "viewer") && os::has_display()
+}
+
+/// Whether no option says how to play.
+fn leaves_open(args: &PlayArgs) -> bool {
+    let outputs = [&args.trace, &args.video, &args.html];
+    let said = args.window || args.robustness || args.headless || args.json || args.web.is_some();
+    !said && outputs.into_iter().all(Option::is_none)
 }
 
 /// Plays in a window. Returns false if none can be opened and none was requested explicitly.
@@ -159,7 +192,7 @@ fn show(args: &PlayArgs, task: &Task, loaded: Option<&Loaded>) -> Result<bool> {
     };
     let window = match see::Window::open(&task, names, first) {
         Err(error) if !args.window => {
-            os::say(&format!("note: {error:#}\n  Continuing as with --headless."));
+            os::say(&format!("note: {error:#}\n  Continuing as with --headless; --web shows the hand in a browser."));
             return Ok(false);
         }
         window => window?,

@@ -1,0 +1,249 @@
+//! Requests and answers of HTTP/1.1, as far as a page of this program needs them.
+
+use std::io::{self, Read, Write};
+use std::net::{Shutdown, TcpStream};
+use std::time::{Duration, Instant};
+
+/// The most bytes of the head of a request, and of its body.
+const LONGEST_HEAD: usize = 8192;
+const LONGEST_BODY: usize = 4096;
+
+/// How long a request may take, and how long an answer may make no progress.
+pub(super) const PATIENCE: Duration = Duration::from_secs(5);
+
+/// How long and how much is read of a request that is refused, so that the answer is not lost.
+const LINGER: Duration = Duration::from_millis(500);
+const MOST_LINGERED: u64 = 1 << 16;
+
+/// A request whose head and body have arrived whole.
+#[derive(Debug)]
+pub(super) struct Request {
+    pub(super) method: String,
+    /// Without the part from a question mark on.
+    pub(super) path: String,
+    headers: Vec<(String, String)>,
+    pub(super) body: Vec<u8>,
+}
+
+/// A status line without the protocol, and a sentence.
+pub(super) type Refusal = (&'static str, &'static str);
+
+const MALFORMED: Refusal = ("400 Bad Request", "This is no request of HTTP/1.1.");
+const TOO_LONG: Refusal = ("431 Request Header Fields Too Large", "The request is too long.");
+const LATE: Refusal = ("408 Request Timeout", "The request took too long.");
+const NO_LENGTH: Refusal = ("411 Length Required", "The length of the body is not given.");
+const TOO_LARGE: Refusal = ("413 Content Too Large", "The body is too long.");
+const ELSEWHERE: Refusal =
+    ("403 Forbidden", "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.");
+const FOREIGN: Refusal = ("403 Forbidden", "Only the page itself may send this.");
+
+impl Request {
+    /// Reads a request. Returns `None` if the other side has gone.
+    ///
+    /// # Errors
+    /// Fails with what to answer.
+    pub(super) fn read(stream: &mut TcpStream) -> Result<Option<Self>, Refusal> {
+        let deadline = Instant::now() + PATIENCE;
+        let (mut bytes, mut end) = (Vec::new(), None);
+        while end.is_none() {
+            if !read_some(stream, &mut bytes, LONGEST_HEAD, deadline)? {
+                return Ok(None);
+            }
+            end = bytes.windows(4).position(|four| four == b"\r\n\r\n");
+            if end.is_none() && bytes.len() >= LONGEST_HEAD {
+                return Err(TOO_LONG);
+            }
+        }
+        let mut body = bytes.split_off(end.unwrap_or_default() + 4);
+        let mut request = Self::parse(&bytes).ok_or(MALFORMED)?;
+        if request.method == "POST" {
+            let length = request.length()?;
+            while body.len() < length {
+                if !read_some(stream, &mut body, length, deadline)? {
+                    return Ok(None);
+                }
+            }
+            body.truncate(length);
+            request.body = body;
+        }
+        Ok(Some(request))
+    }
+
+    fn parse(head: &[u8]) -> Option<Self> {
+        let mut lines = std::str::from_utf8(head).ok()?.trim_end_matches("\r\n").split("\r\n");
+        let [method, target, version] = Vec::from_iter(lines.next()?.split(' ')).try_into().ok()?;
+        let path = target.split('?').next()?;
+        let headers: Option<Vec<_>> = lines
+            .map(|line| {
+                let (name, value) = line.split_once(':')?;
+                let is_name = !name.is_empty() && name.bytes().all(|c| c.is_ascii_graphic());
+                is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))
+            })
+            .collect();
+        let fits = path.starts_with('/') && version.starts_with("HTTP/1.");
+        fits.then_some(Self { method: method.into(), path: path.into(), headers: headers?, body: Vec::new() })
+    }
+
+    /// Returns the value of a header, unless it is there more than once.
+    fn header(&self, name: &str) -> Option<&str> {
+        let mut found = self.headers.iter().filter(|(own, _)| own == name);
+        let (_, value) = found.next()?;
+        found.next().is_none().then_some(value)
+    }
+
+    fn length(&self) -> Result<usize, Refusal> {
+        let digits = self.header("content-length").filter(|text| text.bytes().all(|c| c.is_ascii_digit()));
+        let length = digits.filter(|_| self.header("transfer-encoding").is_none()).ok_or(NO_LENGTH)?;
+        length.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
+    }
+
+    /// Checks that the address in the browser is one of this machine: another name may have been made to lead here.
+    ///
+    /// # Errors
+    /// Fails with what to answer.
+    pub(super) fn expect_local(&self) -> Result<(), Refusal> {
+        let host = self.header("host").unwrap_or_default();
+        let name = match host.rsplit_once(':') {
+            Some((name, port)) if port.bytes().all(|c| c.is_ascii_digit()) => name,
+            _ => host,
+        };
+        let is_local = ["localhost", "127.0.0.1", "[::1]"].iter().any(|local| name.eq_ignore_ascii_case(local));
+        is_local.then_some(()).ok_or(ELSEWHERE)
+    }
+
+    /// Checks that the request comes from the page, and not from one of another origin that is open in the same browser.
+    ///
+    /// # Errors
+    /// Fails with what to answer.
+    pub(super) fn expect_own(&self) -> Result<(), Refusal> {
+        // The type makes a browser ask before it sends this from another origin, which is not answered.
+        let is_json =
+            self.header("content-type").is_some_and(|kind| kind.split(';').next() == Some("application/json"));
+        let is_own = match (self.header("sec-fetch-site"), self.header("origin"), self.header("host")) {
+            (Some(site), _, _) => site == "same-origin",
+            (None, Some(origin), Some(host)) => origin.strip_prefix("http://") == Some(host),
+            _ => false,
+        };
+        (is_json && is_own).then_some(()).ok_or(FOREIGN)
+    }
+}
+
+/// Reads what has arrived, so that there are at most so many bytes. Returns false at the end of the stream.
+fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline: Instant) -> Result<bool, Refusal> {
+    let left = deadline.saturating_duration_since(Instant::now());
+    if left.is_zero() || stream.set_read_timeout(Some(left)).is_err() {
+        return Err(LATE);
+    }
+    let mut part = [0; 1024];
+    let room = part.len().min(most - bytes.len());
+    match stream.read(&mut part[..room]) {
+        Ok(count) => {
+            bytes.extend(&part[..count]);
+            Ok(count > 0)
+        }
+        Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(true),
+        Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => Err(LATE),
+        Err(_) => Ok(false),
+    }
+}
+
+/// Returns the head of an answer that is not kept anywhere, and is shown in no other page.
+pub(super) fn head(status: &str, more: &[(&str, &str)]) -> String {
+    let always = [
+        ("Cache-Control", "no-store"),
+        ("X-Content-Type-Options", "nosniff"),
+        ("X-Frame-Options", "DENY"),
+        ("Cross-Origin-Resource-Policy", "same-origin"),
+        ("Referrer-Policy", "no-referrer"),
+        ("Connection", "close"),
+    ];
+    let lines = always.iter().chain(more).map(|(name, value)| format!("{name}: {value}\r\n"));
+    format!("HTTP/1.1 {status}\r\n{}\r\n", lines.collect::<String>())
+}
+
+/// Answers with a text, if it is not empty.
+///
+/// # Errors
+/// Fails if the other side does not read it.
+pub(super) fn answer(stream: &mut TcpStream, status: &str, more: &[(&str, &str)], text: &str) -> io::Result<()> {
+    let length = text.len().to_string();
+    let of_text = [("Content-Length", &*length)];
+    let mut all = head(status, &[more, if text.is_empty() { &[] } else { &of_text }].concat()).into_bytes();
+    all.extend(text.as_bytes());
+    stream.write_all(&all)
+}
+
+/// Answers with a refusal. What the other side still sends is read, up to a limit, since a closed connection would lose the answer.
+pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal, more: &[(&str, &str)]) {
+    let more = [more, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
+    let sent = answer(stream, status, &more, &format!("{sentence}\n"));
+    if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
+        let _ = stream.set_read_timeout(Some(LINGER));
+        let _ = io::copy(&mut stream.take(MOST_LINGERED), &mut io::sink());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request(lines: &[&str]) -> Option<Request> {
+        Request::parse(format!("{}\r\n\r\n", lines.join("\r\n")).as_bytes())
+    }
+
+    #[test]
+    fn what_is_no_request_is_not_taken_for_one() {
+        for lines in [
+            &["GET /"][..],
+            &["GET  / HTTP/1.1"],
+            &["GET / HTTP/2"],
+            &["GET http://localhost/ HTTP/1.1"],
+            &["GET / HTTP/1.1", "no colon"],
+            &["GET / HTTP/1.1", "a b: c"],
+            &["GET / HTTP/1.1", "Host: localhost", " evil.example"],
+            &[""],
+        ] {
+            assert!(request(lines).is_none(), "{lines:?}");
+        }
+        assert_eq!(request(&["GET /events?again=1 HTTP/1.1"]).unwrap().path, "/events");
+    }
+
+    #[test]
+    fn only_names_of_this_machine_are_answered() {
+        let allowed = |hosts: &[&str]| {
+            let hosts = hosts.iter().map(|host| format!("Host: {host}"));
+            let lines: Vec<String> = std::iter::once("GET / HTTP/1.1".to_owned()).chain(hosts).collect();
+            request(&lines.iter().map(String::as_str).collect::<Vec<_>>()).unwrap().expect_local().is_ok()
+        };
+        for host in ["localhost", "LocalHost:80", "127.0.0.1:7070", "[::1]:7070", "[::1]"] {
+            assert!(allowed(&[host]), "{host}");
+        }
+        for host in ["evil.example", "localhost.evil.example", "evil.example:localhost", "127.0.0.1.evil.example", ""] {
+            assert!(!allowed(&[host]), "{host}");
+        }
+        assert!(!allowed(&[]) && !allowed(&["localhost", "evil.example"]) && !allowed(&["localhost", "localhost"]));
+    }
+
+    #[test]
+    fn only_the_page_itself_may_send_something() {
+        let allowed = |lines: &[&str]| {
+            let all = [&["POST /controls HTTP/1.1", "Host: localhost:1"], lines].concat();
+            request(&all).unwrap().expect_own().is_ok()
+        };
+        let json = "Content-Type: application/json";
+        assert!(allowed(&[json, "Origin: http://localhost:1"]));
+        assert!(allowed(&[json, "Origin: https://hub.example", "Sec-Fetch-Site: same-origin"]));
+        for lines in [
+            &[json][..],
+            &["Content-Type: text/plain", "Origin: http://localhost:1"],
+            &["Origin: http://localhost:1"],
+            &[json, "Origin: http://localhost:2"],
+            &[json, "Origin: http://evil.example"],
+            &[json, "Origin: http://localhost:1", "Sec-Fetch-Site: cross-site"],
+            &[json, "Origin: http://localhost:1", "Sec-Fetch-Site: same-site"],
+            &[json, "Origin: null"],
+        ] {
+            assert!(!allowed(lines), "{lines:?}");
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! A page on this machine, and a stream of events that it reads: a thread for each connection, and a bound on everything.
+
+use std::collections::VecDeque;
+use std::io::Write;
+use std::net::{Ipv4Addr, TcpListener, TcpStream};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+
+use super::http::{PATIENCE, Refusal, Request, answer, head, refuse};
+
+/// The most readers of events, and the most connections, with those that only fetch the page.
+const MOST_READERS: usize = 8;
+const MOST_CONNECTIONS: usize = 32;
+
+/// The events that are kept for readers that are a little late.
+const KEPT: usize = 64;
+
+/// The time without an event after which a reader is told that there is none.
+const QUIET: Duration = Duration::from_secs(1);
+
+/// The sentence for a port that cannot be had, after the reason.
+const OTHER_PORT: &str = "name another one, e.g. --web 7171, or --web 0 for any that is free";
+
+/// What happens with the body of a POST to `controls`; an error is a sentence about it.
+pub type Take = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
+
+/// A page that is served as long as the program runs.
+pub struct Server {
+    shared: Arc<Shared>,
+    port: u16,
+}
+
+struct Shared {
+    page: String,
+    take: Option<Take>,
+    news: Mutex<News>,
+    /// Something was sent, or somebody reads.
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct News {
+    /// The event that each reader gets first, and again where it has missed some.
+    hello: Arc<str>,
+    /// The number of the first event that is kept.
+    first: u64,
+    events: VecDeque<Arc<str>>,
+    readers: usize,
+    connections: usize,
+}
+
+impl News {
+    /// Returns the number of the next event.
+    fn next(&self) -> u64 {
+        self.first + self.events.len() as u64
+    }
+}
+
+impl Server {
+    /// Serves a page on this port of 127.0.0.1 (0: any free one). Without `take`, no request changes anything.
+    ///
+    /// # Errors
+    /// Fails if the port cannot be had, or if the system refuses a thread.
+    pub fn open(port: u16, page: String, take: Option<Take>) -> Result<Self> {
+        let cannot = || format!("cannot use port {port} of 127.0.0.1; {OTHER_PORT}");
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).with_context(cannot)?;
+        let port = listener.local_addr().with_context(cannot)?.port();
+        let shared = Arc::new(Shared { page, take, news: Mutex::default(), changed: Condvar::new() });
+        let own = shared.clone();
+        let accepting = thread::Builder::new().name("server".into());
+        accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
+        Ok(Self { shared, port })
+    }
+
+    /// Returns the port.
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Sets the event that readers get first.
+    pub fn greet(&self, hello: &str) {
+        self.shared.news().hello = hello.into();
+    }
+
+    /// Sends events, each as the protocol writes it, to all readers. Those that are too late miss them.
+    pub fn send(&self, events: &str) {
+        let mut news = self.shared.news();
+        news.events.push_back(events.into());
+        if news.events.len() > KEPT {
+            news.events.pop_front();
+            news.first += 1;
+        }
+        self.shared.changed.notify_all();
+    }
+
+    /// Waits until somebody reads the events, and returns whether it had to.
+    pub fn wait_for_reader(&self) -> bool {
+        let news = self.shared.news();
+        let waits = news.readers == 0;
+        drop(self.shared.changed.wait_while(news, |news| news.readers == 0));
+        waits
+    }
+}
+
+impl Shared {
+    /// Returns the news. A thread that panicked with them has left them whole.
+    fn news(&self) -> MutexGuard<'_, News> {
+        self.news.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn accept(self: Arc<Self>, listener: &TcpListener) {
+        for stream in listener.incoming() {
+            // Without one, there may be no descriptors left for a while.
+            let Ok(mut stream) = stream else {
+                thread::sleep(Duration::from_millis(50));
+                continue;
+            };
+            let _ = stream.set_write_timeout(Some(PATIENCE));
+            let Some(place) = Place::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
+                let _ = answer(&mut stream, "503 Service Unavailable", &[], "There are too many connections.\n");
+                continue;
+            };
+            let connection = thread::Builder::new().name("connection".into());
+            // Without a thread, the connection is closed.
+            let _ = connection.spawn(move || place.shared.serve(stream));
+        }
+    }
+
+    fn serve(self: &Arc<Self>, mut stream: TcpStream) {
+        let _ = stream.set_nodelay(true);
+        let refusal = match Request::read(&mut stream) {
+            Ok(Some(request)) => self.answer(&mut stream, &request),
+            Ok(None) => Ok(()),
+            Err(refusal) => Err((refusal, "GET")),
+        };
+        if let Err((refusal, allowed)) = refusal {
+            refuse(&mut stream, refusal, &[("Allow", allowed)]);
+        }
+    }
+
+    /// Answers a request; an error is a refusal, with the methods that are allowed.
+    fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), (Refusal, &'static str)> {
+        request.expect_local().map_err(|refusal| (refusal, "GET"))?;
+        let take = self.take.as_ref().filter(|_| request.path == "/controls");
+        let allowed = if take.is_some() { "POST" } else { "GET" };
+        if !matches!(&*request.path, "/" | "/events") && take.is_none() {
+            return Err((("404 Not Found", "There is no such page."), allowed));
+        }
+        if request.method != allowed {
+            return Err((("405 Method Not Allowed", "This cannot be done with the page."), allowed));
+        }
+        if let Some(take) = take {
+            request.expect_own().map_err(|refusal| (refusal, allowed))?;
+            take(&request.body).map_err(|sentence| (("400 Bad Request", sentence), allowed))?;
+            let _ = answer(stream, "204 No Content", &[], "");
+        } else if request.path == "/" {
+            let _ = answer(stream, "200 OK", &[("Content-Type", "text/html; charset=utf-8")], &self.page);
+        } else {
+            let place = Place::take(self, MOST_READERS, |news| &mut news.readers);
+            let _place = place.ok_or((("503 Service Unavailable", "There are too many viewers."), allowed))?;
+            // An error is a reader that has gone, or has read nothing for too long.
+            let _ = self.send_events(stream);
+        }
+        Ok(())
+    }
+
+    fn send_events(&self, stream: &mut TcpStream) -> std::io::Result<()> {
+        let more = [("Content-Type", "text/event-stream"), ("X-Accel-Buffering", "no")];
+        let (mut text, mut next) = {
+            let news = self.news();
+            (head("200 OK", &more) + &news.hello, news.next())
+        };
+        loop {
+            stream.write_all(text.as_bytes())?;
+            let waited = self.changed.wait_timeout_while(self.news(), QUIET, |news| news.next() == next);
+            let (news, _) = waited.unwrap_or_else(PoisonError::into_inner);
+            text = match next.checked_sub(news.first) {
+                Some(old) if old < news.events.len() as u64 => {
+                    news.events.range(old as usize..).map(|e| &**e).collect()
+                }
+                Some(_) => "event: beat\ndata: 1\n\n".to_owned(),
+                None => news.hello.to_string(),
+            };
+            next = news.next();
+        }
+    }
+}
+
+/// A place among the connections or readers, as long as it lives.
+struct Place {
+    shared: Arc<Shared>,
+    count: fn(&mut News) -> &mut usize,
+}
+
+impl Place {
+    /// Returns a place, unless all of them are taken.
+    fn take(shared: &Arc<Shared>, most: usize, count: fn(&mut News) -> &mut usize) -> Option<Self> {
+        let mut news = shared.news();
+        let taken = count(&mut news);
+        if *taken >= most {
+            return None;
+        }
+        *taken += 1;
+        shared.changed.notify_all();
+        Some(Self { shared: shared.clone(), count })
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        *(self.count)(&mut self.shared.news()) -= 1;
+    }
+}

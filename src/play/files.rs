@@ -1,0 +1,97 @@
+//! The files of what is played: a trace, and an HTML file.
+
+use anyhow::{Result, ensure};
+
+use crate::cli::PlayArgs;
+use crate::evaluate::Moment;
+use crate::os::{self, OutputFile};
+use crate::repose::Task;
+use crate::see::{self, About, Replay};
+use crate::sim::Quality;
+use crate::trace::Trace;
+
+/// The files that the user wants. They are opened before playing, so that a path that cannot be written to does not cost the score.
+pub(super) struct Files {
+    trace: Option<(OutputFile, Trace)>,
+    page: Option<PageFile>,
+}
+
+impl Files {
+    /// Begins the files of episodes of this task, played by the policy in `checkpoint`.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub(super) fn begin(task: &Task, checkpoint: Option<&str>, args: &PlayArgs) -> Result<Self> {
+        let trace = args.trace.as_deref().map(OutputFile::create).transpose()?;
+        for (option, other) in [("--video", &args.video), ("--html", &args.html)] {
+            if let (Some(trace), Some(other)) = (&trace, other) {
+                ensure!(!trace.is_of(other), "--trace {0} {option} {0}: one file cannot be both", other.display());
+            }
+        }
+        let page = PageFile::begin(task, args)?;
+        if let (Some(page), Some(video)) = (&page, &args.video) {
+            ensure!(!page.output.is_of(video), "--html {0} --video {0}: one file cannot be both", video.display());
+        }
+        Ok(Self { trace: trace.map(|output| (output, Trace::new(task, checkpoint, args.seed))), page })
+    }
+
+    pub(super) fn observe(&mut self, moment: &Moment) {
+        if let Some((_, trace)) = &mut self.trace {
+            trace.record(moment);
+        }
+        if let Some(page) = &mut self.page {
+            page.replay.observe(moment);
+        }
+    }
+
+    /// Writes the files.
+    ///
+    /// # Errors
+    /// Fails if one of them cannot be written.
+    pub(super) fn finish(self, about: &About) -> Result<()> {
+        if let Some((output, trace)) = self.trace {
+            output.finish(trace.finish().as_bytes())?;
+        }
+        self.page.map_or(Ok(()), |page| page.finish(about))
+    }
+}
+
+/// An HTML file that is being made.
+pub(super) struct PageFile {
+    output: OutputFile,
+    replay: Replay,
+}
+
+impl PageFile {
+    /// Begins the file that the user wants, if any, of episodes of this task.
+    ///
+    /// # Errors
+    /// Fails if it cannot be written, or if the episodes are too long for it.
+    pub(super) fn begin(task: &Task, args: &PlayArgs) -> Result<Option<Self>> {
+        let Some(path) = &args.html else { return Ok(None) };
+        let output = OutputFile::create(path)?;
+        // The size is that of a film; a page has none.
+        let task = see::task_for_display(task, &args.shot, [1280, 720], Quality::Fast)?;
+        Ok(Some(Self { output, replay: Replay::new(&task, args.shot.camera)? }))
+    }
+
+    /// Takes the episodes from a trace, and returns how many did not fit.
+    ///
+    /// # Errors
+    /// Fails if the text is no trace, or one of another scene.
+    pub(super) fn read(&mut self, trace: &str) -> Result<usize> {
+        self.replay.read(trace)
+    }
+
+    /// Writes the file.
+    ///
+    /// # Errors
+    /// Fails if it cannot be written.
+    pub(super) fn finish(self, about: &About) -> Result<()> {
+        let html = self.replay.page(about)?.html();
+        let path = self.output.path().display().to_string();
+        self.output.finish(html.as_bytes())?;
+        os::say(&format!("{path}: {} kB", html.len().div_ceil(1000)));
+        Ok(())
+    }
+}

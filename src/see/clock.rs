@@ -1,0 +1,57 @@
+//! The time of what is shown as it happens.
+
+use std::time::Instant;
+
+/// The maximum lag, in seconds, of a machine that cannot keep up.
+const LARGEST_LAG: f64 = 0.25;
+
+/// A clock that converts elapsed time into control steps.
+pub(super) struct Clock {
+    ctrl_dt: f64,
+    last: Instant,
+    /// Scene time that is still to be played, s.
+    owed: f64,
+}
+
+impl Clock {
+    pub(super) fn new(ctrl_dt: f64) -> Self {
+        Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
+    }
+
+    /// Returns the steps since the last call, at so many times the speed of the clock on the wall.
+    pub(super) fn steps_due(&mut self, speed: f64) -> u32 {
+        let passed = self.last.elapsed().as_secs_f64();
+        self.last = Instant::now();
+        self.owed = (self.owed + passed * speed).min(LARGEST_LAG * speed.max(1.0));
+        let steps = (self.owed / self.ctrl_dt).floor();
+        self.owed -= steps * self.ctrl_dt;
+        steps as u32
+    }
+
+    /// Lets the time since the last call pass without steps.
+    pub(super) fn pause(&mut self) {
+        *self = Self::new(self.ctrl_dt);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn the_time_of_a_pause_is_not_made_up_for() {
+        let mut clock = Clock::new(1e-3);
+        clock.last -= Duration::from_secs(10);
+        clock.pause();
+        assert!(clock.steps_due(1.0) < 200);
+    }
+
+    #[test]
+    fn a_machine_that_is_too_slow_falls_behind_instead_of_stalling() {
+        let mut clock = Clock::new(0.01);
+        clock.last -= Duration::from_secs(60);
+        assert_eq!(clock.steps_due(1.0), 25);
+    }
+}

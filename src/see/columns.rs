@@ -1,0 +1,152 @@
+//! What a page shows of a task: its scene, and for each step a row of numbers, which are poses and then scalars.
+
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use serde_json::{Value, json};
+
+use crate::draw::Page;
+use crate::env::Env;
+use crate::repose::{Repose, Task, TaskReward};
+use crate::sim::{Camera, Drawing};
+
+/// The scalars before the terms of the reward.
+const SCALARS: [&str; 4] = ["step", "error", "held", "goals"];
+
+/// The largest number that a page is given.
+const LARGEST: f64 = 1e9;
+
+/// The scene of a task, and where the numbers of a row are.
+pub(super) struct Columns {
+    /// The task, which was loaded for display.
+    task: Arc<Task>,
+    /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place; mocap bodies but the goal stay.
+    drawing: Drawing,
+    /// The number of values in `qpos`.
+    positions: usize,
+    /// Where the orientation of the goal begins.
+    goal: usize,
+    /// Where quaternions begin.
+    quaternions: Vec<usize>,
+}
+
+impl Columns {
+    pub(super) fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
+        let mut drawing = task.scene().drawing(task.config().model_file().is_none(), camera);
+        let (positions, quaternions) = (drawing.positions(), drawing.quaternions());
+        let goal = positions + 7 * task.hand().target.number();
+        drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
+        Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
+    }
+
+    /// Returns how many numbers give the poses.
+    fn poses(&self) -> usize {
+        self.drawing.start.len()
+    }
+
+    /// Returns the names of the scalars.
+    fn scalars() -> Vec<&'static str> {
+        SCALARS.into_iter().chain(Self::terms()).collect()
+    }
+
+    /// Returns the names of the terms of the reward.
+    fn terms() -> impl Iterator<Item = &'static str> {
+        TaskReward::default().named().map(|(name, _)| name)
+    }
+
+    /// Returns the place of the rotation error.
+    pub(super) fn error(&self) -> usize {
+        self.poses() + 1
+    }
+
+    /// Returns the row of an environment after a reset or a step, with these terms of the reward.
+    pub(super) fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
+        let (last, episode) = (env.last_step(), env.episode());
+        let (goal, error) = if episode.length == 0 { (env.goal(), env.rot_dist()) } else { (last.goal, last.rot_dist) };
+        let scalars = [episode.length.into(), error, env.held().into(), episode.goals.into()];
+        self.row(env.simulation().qpos(), &goal, scalars, &reward.values())
+    }
+
+    /// Returns the row of a record of a trace.
+    ///
+    /// # Errors
+    /// Fails if it is none, or is one of another scene.
+    pub(super) fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
+        let number = |value: &Value| value.as_f64().filter(|x| x.abs() < LARGEST);
+        let list = |key: &str, length: usize| {
+            let found: Option<Vec<f64>> = record[key].as_array().and_then(|list| list.iter().map(number).collect());
+            let fits = found.filter(|found| found.len() == length);
+            fits.with_context(|| format!("`{key}` is not a list of {length} numbers, as in this scene"))
+        };
+        // A reset has no errors and no reward.
+        let value = |value: &Value| number(value).unwrap_or(0.0);
+        let scalars = ["step", "rot_dist", "held", "goals"].map(|key| value(&record[key]));
+        let reward: Vec<f64> = Self::terms().map(|term| value(&record["reward"][term])).collect();
+        Ok(self.row(&list("qpos", self.positions)?, &list("goal", 4)?, scalars, &reward))
+    }
+
+    fn row(&self, qpos: &[f64], goal: &[f64], scalars: [f64; SCALARS.len()], reward: &[f64]) -> Vec<f64> {
+        let mut row = self.drawing.start.clone();
+        row[..self.positions].copy_from_slice(qpos);
+        row[self.goal..self.goal + 4].copy_from_slice(goal);
+        row.extend(scalars.iter().chain(reward));
+        // The physics of the last step of an episode may have diverged.
+        row.iter_mut().for_each(|x| *x = if x.is_nan() { 0.0 } else { x.clamp(-LARGEST, LARGEST) });
+        row
+    }
+
+    /// Turns the quaternions of a row so that they go on from those of the row before: q and -q are the same turn.
+    pub(super) fn go_on(&self, row: &mut [f64], before: &[f64]) {
+        for &place in &self.quaternions {
+            let same: f64 = (place..place + 4).map(|i| row[i] * before[i]).sum();
+            if same < 0.0 {
+                row[place..place + 4].iter_mut().for_each(|x| *x = -*x);
+            }
+        }
+    }
+
+    /// Returns the page of these rows, with more entries for what it says of itself. Only the first one has meshes.
+    pub(super) fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Result<Page> {
+        let mut meta = self.meta(about);
+        for (key, value) in more.as_object().into_iter().flatten() {
+            meta[key] = value.clone();
+        }
+        let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
+        let meshes = std::mem::take(&mut self.drawing.meshes).into_iter();
+        let meshes = meshes.map(|mesh| (mesh.corners, mesh.triangles)).collect();
+        let scene = serde_json::to_value(&self.drawing).context("the scene")?;
+        Ok(Page { meta, scene, meshes, rows, counts })
+    }
+
+    fn meta(&self, about: &About) -> Value {
+        let config = self.task.config();
+        json!({
+            "format": 1,
+            "title": about.title,
+            "program": format!("shadow-repose {}", env!("CARGO_PKG_VERSION")),
+            "policy": about.policy,
+            "seed": about.seed,
+            "settings": config.changed(),
+            "dt": config.ctrl_dt,
+            "every": 1,
+            "tolerance": config.success_tolerance,
+            "hold": config.max_consecutive_successes,
+            "hands": 1,
+            "numbers": self.poses(),
+            "scalars": Self::scalars(),
+            "terms": Self::terms().collect::<Vec<_>>(),
+            "live": false,
+        })
+    }
+}
+
+/// What a page says of all that it shows.
+#[derive(Clone, Debug)]
+pub struct About {
+    /// What is shown, in a few words.
+    pub title: String,
+    /// The policy, by its place.
+    pub policy: Option<String>,
+    /// What the episodes are drawn from.
+    pub seed: Option<u64>,
+}

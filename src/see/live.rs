@@ -1,0 +1,189 @@
+//! Hands on a page while they move. Nothing moves while nobody looks.
+
+use std::rc::Rc;
+use std::sync::Arc;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use base64::prelude::{BASE64_STANDARD, Engine};
+use serde_json::{Value, json};
+
+use super::clock::Clock;
+use super::columns::{About, Columns};
+use super::sliders::Sliders;
+use crate::env::End;
+use crate::evaluate::{Episodes, Player};
+use crate::os::{self, Machine, Server};
+use crate::repose::{Task, TaskReward};
+use crate::sim::Camera;
+
+/// The most hands on a page.
+pub const MOST_HANDS: u64 = 16;
+
+/// The time between two rows, s, as far as it is a multiple of a control step; a page interpolates.
+const BETWEEN_ROWS: f64 = 0.02;
+
+/// The time between two looks at the clock.
+const TICK: Duration = Duration::from_millis(5);
+
+/// Takes one step of an episode, and returns its end if there is one.
+type Stepping = dyn Fn(&mut Player) -> Option<End>;
+
+/// Who acts in an episode.
+#[derive(Clone)]
+pub struct Turn {
+    /// Takes one step.
+    pub step: Rc<Stepping>,
+    /// What the page calls the policy, if it is not the one that it names throughout.
+    pub policy: Option<String>,
+}
+
+/// Hands on a page of this machine.
+pub struct Live {
+    task: Arc<Task>,
+    columns: Columns,
+    server: Server,
+    sliders: Option<Sliders>,
+    key: String,
+    /// Control steps from row to row.
+    every: u64,
+    episodes: Episodes,
+    hands: Vec<Hand>,
+}
+
+/// A hand on the page.
+struct Hand {
+    player: Player,
+    turn: Turn,
+    /// The number of its episode.
+    episode: usize,
+    has_ended: bool,
+    /// The sum since the last row.
+    reward: TaskReward,
+}
+
+impl Live {
+    /// Serves a page with `hands` hands on this port, and says where. The first episodes are `turn`'s.
+    ///
+    /// # Errors
+    /// Fails if the port cannot be had.
+    pub fn open(
+        port: u16,
+        task: &Arc<Task>,
+        (about, camera): (&About, Option<Camera>),
+        hands: usize,
+        turn: &Turn,
+        sliders: Option<Sliders>,
+    ) -> Result<Self> {
+        let mut columns = Columns::new(task, camera);
+        let every = (BETWEEN_ROWS / task.config().ctrl_dt).round().max(1.0) as u64;
+        let mut more = json!({ "live": true, "hands": hands, "every": every });
+        if let Some(sliders) = &sliders {
+            more["sliders"] = sliders.described();
+        }
+        let page = columns.page(about, more, Vec::new())?;
+        let key = page.key();
+        let server = Server::open(port, page.html(), sliders.as_ref().map(Sliders::taker))?;
+        let (port, machine) = (server.port(), Machine::this().name);
+        os::say(&format!(
+            "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
+             from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
+        ));
+        let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
+        let hand = |episode| {
+            let player = Player::new(task, Episodes { first: episode, ..episodes });
+            Hand { player, turn: turn.clone(), episode, has_ended: false, reward: TaskReward::default() }
+        };
+        let hands = (0..hands).map(hand).collect();
+        let live = Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands };
+        live.greet();
+        Ok(live)
+    }
+
+    /// Shows the hands for as long as the program runs; `next` says who acts in each further episode.
+    pub fn show(mut self, next: &mut dyn FnMut() -> Turn) -> ! {
+        let (start, mut clock, mut steps, mut begun) = (Instant::now(), self.clock(), 0_u64, self.hands.len());
+        loop {
+            if self.server.wait_for_reader() {
+                clock.pause();
+            }
+            if let Some(sliders) = self.sliders.as_ref().filter(|sliders| sliders.take_moved()) {
+                self.server.send(&event("controls", &sliders.values()));
+                self.greet();
+            }
+            for _ in 0..clock.steps_due(1.0) {
+                for hand in 0..self.hands.len() {
+                    if self.hands[hand].has_ended {
+                        self.begin(hand, begun, next());
+                        begun += 1;
+                    } else {
+                        self.hands[hand].step();
+                    }
+                }
+                steps += 1;
+                if steps % self.every == 0 {
+                    let row = self.row();
+                    self.server.send(&format!("id: {}\ndata: {row}\n\n", start.elapsed().as_millis()));
+                }
+            }
+            sleep(TICK);
+        }
+    }
+
+    fn clock(&self) -> Clock {
+        Clock::new(self.task.config().ctrl_dt)
+    }
+
+    fn begin(&mut self, hand: usize, episode: usize, turn: Turn) {
+        let own = &mut self.hands[hand];
+        own.player.start(self.episodes, episode);
+        (own.turn, own.episode, own.has_ended) = (turn, episode, false);
+        own.reward = TaskReward::default();
+        let mut about = self.about(&self.hands[hand]);
+        about["hand"] = hand.into();
+        self.server.send(&event("episode", &about));
+        self.greet();
+    }
+
+    /// Returns what the page says of the episode of a hand.
+    fn about(&self, hand: &Hand) -> Value {
+        let mut about = json!({ "seed": format!("{}, episode {}", self.episodes.seed, hand.episode) });
+        if let Some(policy) = &hand.turn.policy {
+            about["policy"] = policy.as_str().into();
+        }
+        about
+    }
+
+    fn greet(&self) {
+        let episodes: Vec<Value> = self.hands.iter().map(|hand| self.about(hand)).collect();
+        let mut hello = json!({ "key": self.key, "episodes": episodes });
+        if let Some(sliders) = &self.sliders {
+            hello["controls"] = sliders.values();
+        }
+        self.server.greet(&event("hello", &hello));
+    }
+
+    /// Returns the row of all hands, as the page reads it.
+    fn row(&mut self) -> String {
+        let rows = self.hands.iter_mut().flat_map(|hand| {
+            let reward = std::mem::take(&mut hand.reward);
+            self.columns.of(hand.player.env(), reward)
+        });
+        let bytes: Vec<u8> = rows.flat_map(|value| (value as f32).to_le_bytes()).collect();
+        BASE64_STANDARD.encode(bytes)
+    }
+}
+
+impl Hand {
+    fn step(&mut self) {
+        let end = (self.turn.step)(&mut self.player);
+        self.has_ended = end.is_some();
+        self.reward += self.player.env().last_step().reward;
+    }
+}
+
+/// Returns an event as the protocol writes it.
+fn event(name: &str, data: &Value) -> String {
+    format!("event: {name}\ndata: {data}\n\n")
+}

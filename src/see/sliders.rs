@@ -1,0 +1,127 @@
+//! The sliders of a page, which move the actuators of a hand.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use serde_json::{Value, json};
+
+use crate::os::Take;
+use crate::repose::Task;
+
+/// What a request is told that moves none of the actuators.
+const MALFORMED: &str = "Only a list of pairs of an actuator's number and a finite value is read.";
+
+/// A slider for each actuator, in action order. An actuator obeys its slider from the first time that this is moved.
+#[derive(Clone)]
+pub struct Sliders(Arc<Mutex<State>>);
+
+struct State {
+    sliders: Vec<Slider>,
+    /// Whether one has moved since this was last asked.
+    moved: bool,
+}
+
+struct Slider {
+    name: String,
+    range: [f64; 2],
+    /// In the unit of the range; `None`: it was not moved yet.
+    value: Option<f64>,
+}
+
+impl Slider {
+    fn value(&self) -> f64 {
+        self.value.unwrap_or((self.range[0] + self.range[1]) / 2.0)
+    }
+}
+
+impl Sliders {
+    /// Creates a slider for each actuator of a task's hand.
+    pub fn new(task: &Task) -> Self {
+        let hand = task.hand();
+        let sliders = hand.parts.actuators.iter().zip(&hand.actuators);
+        let sliders = sliders.map(|(name, actuator)| Slider { name: name.clone(), range: actuator.range, value: None });
+        Self(Arc::new(Mutex::new(State { sliders: sliders.collect(), moved: false })))
+    }
+
+    /// Changes an action to what the sliders ask for: -1 and 1 are the ends of the range of an actuator.
+    pub fn change(&self, action: &mut [f32]) {
+        for (action, slider) in action.iter_mut().zip(&self.state().sliders) {
+            let [low, high] = slider.range;
+            if let Some(value) = slider.value.filter(|_| low < high) {
+                *action = (2.0 * (value - low) / (high - low) - 1.0) as f32;
+            }
+        }
+    }
+
+    /// Returns what takes the requests of a page: `[[actuator, value], …]`.
+    pub(super) fn taker(&self) -> Take {
+        let own = self.clone();
+        Box::new(move |body| {
+            let moves: Vec<(usize, f64)> = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
+            let mut state = own.state();
+            let sound = |(actuator, value): &(usize, f64)| *actuator < state.sliders.len() && value.is_finite();
+            if !moves.iter().all(sound) {
+                return Err(MALFORMED);
+            }
+            for (actuator, value) in moves {
+                let slider = &mut state.sliders[actuator];
+                slider.value = Some(value.max(slider.range[0]).min(slider.range[1]));
+                state.moved = true;
+            }
+            Ok(())
+        })
+    }
+
+    /// Returns whether one has moved since the last call.
+    pub(super) fn take_moved(&self) -> bool {
+        std::mem::take(&mut self.state().moved)
+    }
+
+    /// Returns the value of each.
+    pub(super) fn values(&self) -> Value {
+        self.state().sliders.iter().map(Slider::value).collect()
+    }
+
+    /// Returns what a page needs to show them.
+    pub(super) fn described(&self) -> Value {
+        let described = |slider: &Slider| {
+            let [low, high] = slider.range;
+            json!({ "name": slider.name, "low": low, "high": high, "value": slider.value() })
+        };
+        self.state().sliders.iter().map(described).collect()
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn what_a_page_sends_moves_actuators_within_their_ranges_and_nothing_else_does() {
+        let config = Config::resolve(None, &[]).unwrap();
+        let task = Task::new(&config.env, &config.hand).unwrap();
+        let sliders = Sliders::new(&task);
+        let take = sliders.taker();
+        let [low, high] = task.hand().actuators[3].range;
+        let acted = || {
+            let mut action = [0.25; 20];
+            sliders.change(&mut action);
+            action
+        };
+        assert!(acted() == [0.25; 20] && !sliders.take_moved());
+        for bad in ["", "[]x", "[[20,0]]", "[[-1,0]]", "[[0,null]]", "[[0]]", "[[0,1e999]]", "{}", "[[3,0],[99,0]]"] {
+            assert!(take(bad.as_bytes()).is_err(), "{bad}");
+        }
+        assert!(acted() == [0.25; 20] && !sliders.take_moved(), "a request is taken whole or not at all");
+        take(format!("[[3,{}]]", low + 0.75 * (high - low)).as_bytes()).unwrap();
+        assert!(sliders.take_moved() && !sliders.take_moved());
+        assert!((acted()[3] - 0.5).abs() < 1e-6 && acted()[4] == 0.25);
+        take(b"[[3,1e300]]").unwrap();
+        assert_eq!(acted()[3], 1.0);
+        assert_eq!(sliders.values()[3], high);
+    }
+}

@@ -1,0 +1,268 @@
+//! What is needed to draw a scene elsewhere: its bodies and joints, its visible shapes, its meshes.
+
+use std::collections::BTreeMap;
+
+use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtJoint, MjtObjBase};
+use serde::Serialize;
+
+use super::Scene;
+use super::look::{Camera, HIDDEN};
+
+/// A scene as a page draws it. Lengths in m, quaternions w, x, y, z; a pose is in the frame of the parent or of the body.
+#[derive(Clone, Debug, Serialize)]
+pub struct Drawing {
+    /// Every body after its parent; the first is the world.
+    pub bodies: Vec<DrawnBody>,
+    /// The shapes that are seen.
+    pub geoms: Vec<DrawnGeom>,
+    /// The height of a level floor without end, which is no shape.
+    pub floor: Option<f64>,
+    /// From where it is seen at first.
+    pub camera: DrawnCamera,
+    /// The numbers that give the poses, in the default pose: `qpos`, then position and orientation of each mocap body.
+    pub start: Vec<f64>,
+    /// The meshes of the shapes.
+    #[serde(skip)]
+    pub meshes: Vec<DrawnMesh>,
+}
+
+/// A body.
+#[derive(Clone, Debug, Serialize)]
+pub struct DrawnBody {
+    parent: usize,
+    pos: [f64; 3],
+    quat: [f64; 4],
+    joints: Vec<DrawnJoint>,
+    /// The index of its pose among the numbers, if it is a mocap body.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mocap: Option<usize>,
+}
+
+/// A joint: which numbers move it, and its number at rest.
+#[derive(Clone, Debug, Serialize)]
+struct DrawnJoint {
+    r#type: &'static str,
+    at: usize,
+    pos: [f64; 3],
+    axis: [f64; 3],
+    rest: f64,
+}
+
+/// A shape of a body.
+#[derive(Clone, Debug, Serialize)]
+pub struct DrawnGeom {
+    r#type: &'static str,
+    body: usize,
+    size: [f64; 3],
+    pos: [f64; 3],
+    quat: [f64; 4],
+    rgba: [f32; 4],
+    specular: f32,
+    shininess: f32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mesh: Option<usize>,
+    /// Whether it is part of a fine picture, or of a plain one, only.
+    #[serde(skip_serializing_if = "is_false")]
+    fine: bool,
+    #[serde(skip_serializing_if = "is_false")]
+    plain: bool,
+}
+
+/// A point of view on a sphere around a centre; degrees.
+#[derive(Clone, Debug, Serialize)]
+pub struct DrawnCamera {
+    azimuth: f64,
+    elevation: f64,
+    distance: f64,
+    center: [f64; 3],
+    fovy: f64,
+    /// Whether the page may come nearer, until all of the first picture fills it.
+    fit: bool,
+}
+
+/// A mesh: corners, each with its normal, and triangles of corners.
+#[derive(Clone, Debug)]
+pub struct DrawnMesh {
+    /// Points and normals.
+    pub corners: Vec<([f32; 3], [f32; 3])>,
+    /// Three corners each.
+    pub triangles: Vec<[usize; 3]>,
+}
+
+impl Drawing {
+    /// Returns the number of values in `qpos`.
+    pub fn positions(&self) -> usize {
+        self.start.len() - 7 * self.bodies.iter().filter(|body| body.mocap.is_some()).count()
+    }
+
+    /// Returns where quaternions begin among the numbers.
+    pub fn quaternions(&self) -> Vec<usize> {
+        let of_body = |body: &DrawnBody| {
+            let of_joints = body.joints.iter().filter_map(|joint| match joint.r#type {
+                "free" => Some(joint.at + 3),
+                "ball" => Some(joint.at),
+                _ => None,
+            });
+            of_joints.chain(body.mocap.map(|at| at + 3)).collect::<Vec<_>>()
+        };
+        self.bodies.iter().flat_map(of_body).collect()
+    }
+}
+
+/// Near enough to the built-in hand for hand, cube and goal to fill the picture, and what the camera looks at.
+const NEAR: (Camera, [f64; 3]) = (Camera { azimuth: 142.0, elevation: -33.0, distance: 0.58 }, [0.315, 0.0, 0.362]);
+
+fn is_false(flag: &bool) -> bool {
+    !flag
+}
+
+impl Scene {
+    /// Returns what a page needs to draw this scene, perhaps from this camera.
+    pub fn drawing(&self, is_builtin: bool, from: Option<Camera>) -> Drawing {
+        let model = &*self.model;
+        // Only the built-in hand is shown by meshes over its primitives.
+        let dressed = is_builtin && model.ffi().nmesh > 0;
+        let (mut geoms, mut used, mut floor) = (Vec::new(), BTreeMap::new(), None);
+        for geom in 0..model.ngeom() as usize {
+            if is_floor(model, geom) {
+                floor = Some(model.geom_pos()[geom][2]);
+            } else if let Some(drawn) = drawn_geom(model, geom, dressed, &mut used) {
+                geoms.push(drawn);
+            }
+        }
+        let mut meshes: Vec<_> = used.into_iter().collect();
+        meshes.sort_by_key(|(_, place)| *place);
+        Drawing {
+            bodies: (0..model.nbody() as usize).map(|body| drawn_body(model, body)).collect(),
+            geoms,
+            floor,
+            camera: camera(model, is_builtin, from),
+            start: start(model),
+            meshes: meshes.into_iter().map(|(mesh, _)| drawn_mesh(model, mesh)).collect(),
+        }
+    }
+}
+
+fn drawn_body(model: &MjModel, body: usize) -> DrawnBody {
+    let first = model.body_jntadr()[body].max(0) as usize;
+    let joint = |joint: usize| {
+        let at = model.jnt_qposadr()[joint] as usize;
+        DrawnJoint {
+            r#type: match model.jnt_type()[joint] {
+                MjtJoint::mjJNT_FREE => "free",
+                MjtJoint::mjJNT_BALL => "ball",
+                MjtJoint::mjJNT_SLIDE => "slide",
+                MjtJoint::mjJNT_HINGE => "hinge",
+            },
+            at,
+            pos: model.jnt_pos()[joint],
+            axis: model.jnt_axis()[joint],
+            rest: model.qpos0()[at],
+        }
+    };
+    let mocap = usize::try_from(model.body_mocapid()[body]).ok();
+    DrawnBody {
+        parent: model.body_parentid()[body] as usize,
+        pos: model.body_pos()[body],
+        quat: model.body_quat()[body],
+        joints: (first..first + model.body_jntnum()[body] as usize).map(joint).collect(),
+        mocap: mocap.map(|mocap| model.nq() as usize + 7 * mocap),
+    }
+}
+
+fn is_floor(model: &MjModel, geom: usize) -> bool {
+    let [width, length, _] = model.geom_size()[geom];
+    let level = model.geom_quat()[geom][0] > 0.9999 && model.geom_bodyid()[geom] == 0;
+    model.geom_type()[geom] == MjtGeomBase::mjGEOM_PLANE && level && width == 0.0 && length == 0.0
+}
+
+/// Returns a shape, unless it is of a kind that a page does not draw, or hidden.
+fn drawn_geom(model: &MjModel, geom: usize, dressed: bool, used: &mut BTreeMap<usize, usize>) -> Option<DrawnGeom> {
+    let kind = match model.geom_type()[geom] {
+        MjtGeomBase::mjGEOM_PLANE => "plane",
+        MjtGeomBase::mjGEOM_SPHERE => "sphere",
+        MjtGeomBase::mjGEOM_CAPSULE => "capsule",
+        MjtGeomBase::mjGEOM_ELLIPSOID => "ellipsoid",
+        MjtGeomBase::mjGEOM_CYLINDER => "cylinder",
+        MjtGeomBase::mjGEOM_BOX => "box",
+        MjtGeomBase::mjGEOM_MESH => "mesh",
+        _ => return None,
+    };
+    let body = model.geom_bodyid()[geom] as usize;
+    let of_hand = || model.id_to_name(MjtObjBase::mjOBJ_BODY, body).is_some_and(|name| name.starts_with("rh_"));
+    // The primitives of a dressed hand are hidden, but for a plain picture.
+    let plain = dressed && kind != "mesh" && of_hand();
+    if model.geom_group()[geom] >= HIDDEN && !plain {
+        return None;
+    }
+    let material = usize::try_from(model.geom_matid()[geom]).ok();
+    let shine = |of: &[f32]| material.map_or(0.5, |material| of[material]);
+    let mesh = (kind == "mesh").then(|| {
+        let next = used.len();
+        *used.entry(model.geom_dataid()[geom] as usize).or_insert(next)
+    });
+    Some(DrawnGeom {
+        r#type: kind,
+        body,
+        size: model.geom_size()[geom],
+        pos: model.geom_pos()[geom],
+        quat: model.geom_quat()[geom],
+        rgba: material.map_or(model.geom_rgba()[geom], |material| model.mat_rgba()[material]),
+        specular: shine(model.mat_specular()),
+        shininess: shine(model.mat_shininess()),
+        mesh,
+        fine: dressed && kind == "mesh",
+        plain,
+    })
+}
+
+/// Returns a mesh with one corner for each pair of point and normal that a triangle uses, in the order of their first use.
+fn drawn_mesh(model: &MjModel, mesh: usize) -> DrawnMesh {
+    let [first, points, normals] =
+        [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
+    let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
+    let (mut places, mut corners, mut triangles) = (BTreeMap::new(), Vec::new(), Vec::new());
+    for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
+        triangles.push([0, 1, 2].map(|corner| {
+            let point = model.mesh_vert()[(points + face[corner]) as usize];
+            let normal = model.mesh_normal()[(normals + directions[corner]) as usize];
+            // Points of one place and direction, as a picture shows them, are one corner.
+            let key = (point.map(|x| (x * 5e4).round() as i64), normal.map(|x| (x * 16.0).round() as i64));
+            *places.entry(key).or_insert_with(|| {
+                corners.push((point, normal));
+                corners.len() - 1
+            })
+        }));
+    }
+    triangles.retain(|[a, b, c]| a != b && b != c && a != c);
+    DrawnMesh { corners, triangles }
+}
+
+fn camera(model: &MjModel, is_builtin: bool, from: Option<Camera>) -> DrawnCamera {
+    let (global, stat) = (&model.vis().global, model.stat());
+    let of = |Camera { azimuth, elevation, distance }, center, fovy, fit| DrawnCamera {
+        azimuth,
+        elevation,
+        distance,
+        center,
+        fovy,
+        fit,
+    };
+    let own =
+        Camera { azimuth: global.azimuth.into(), elevation: global.elevation.into(), distance: 1.5 * stat.extent };
+    match from {
+        Some(from) => of(from, stat.center, global.fovy.into(), false),
+        None if is_builtin => of(NEAR.0, NEAR.1, 40.0, false),
+        None => of(own, stat.center, global.fovy.into(), true),
+    }
+}
+
+fn start(model: &MjModel) -> Vec<f64> {
+    let mut numbers = model.qpos0().to_vec();
+    let mocap = (0..model.nbody() as usize).filter(|&body| model.body_mocapid()[body] >= 0);
+    for body in mocap {
+        numbers.extend(model.body_pos()[body]);
+        numbers.extend(model.body_quat()[body]);
+    }
+    numbers
+}
