@@ -15,14 +15,14 @@
 //! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, see, sim, tags |
-//! | [`mod@play`] | plays a policy: in a window, as a film, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
+//! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
 //! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
-//! | [`see`] | rendering of the task: window, film, picture | cli, draw, env, evaluate, os, repose, run, sim |
+//! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, run, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule, spaces |
@@ -35,8 +35,8 @@
 //! | [`config`] | all settings, their defaults and rules | os, sim |
 //! | [`sim`] | the only interface to MuJoCo | os, quat, schedule |
 //! | [`run`] | the folder of a run and its logs | os, sim |
-//! | [`draw`] | charts, films and pictures as files | os |
-//! | [`os`] | the system around the program: files, terminal, signals, locks, pip | - |
+//! | [`draw`] | charts, films, pictures and pages as files | os |
+//! | [`os`] | the system around the program: files, terminal, signals, locks, pip, a server for a page | - |
 //! | [`tags`] | what a training logs: names, meanings, units | repose |
 //! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | os, rng, schedule |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |

@@ -21,6 +21,7 @@ mod mpi;
 mod outputs;
 mod own_hand;
 mod own_scene;
+mod page;
 mod permissions;
 #[cfg(feature = "video")]
 mod pictures;

@@ -31,7 +31,7 @@ fn can_draw() -> bool {
 }
 
 /// Returns the width and height, and the pixels, of a PNG file.
-fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
+pub(crate) fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
     let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
     let mut rgb = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut rgb).unwrap();
