@@ -296,18 +296,18 @@ struct Live {
 
 impl Live {
     fn start(folder: &Path, args: &[&str]) -> Self {
-        let mut program = command(folder, args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut said = BufReader::new(program.stderr.take().unwrap());
+        let program = command(folder, args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut live = Self { program, port: 0 };
+        let mut said = BufReader::new(live.program.stderr.take().unwrap());
         let mut all = String::new();
-        while said.read_line(&mut all).unwrap() > 0 {
-            if let Some((_, rest)) = all.split_once("http://127.0.0.1:") {
-                let port = rest.split('/').next().unwrap().parse().unwrap();
-                // What it says later is read, so that it does not wait.
-                std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
-                return Self { program, port };
-            }
+        while live.port == 0 {
+            assert!(said.read_line(&mut all).unwrap() > 0, "{all}");
+            let address = all.split_once("http://127.0.0.1:").and_then(|(_, rest)| rest.split('/').next());
+            live.port = address.map_or(0, |port| port.parse().unwrap());
         }
-        panic!("{all}");
+        // What it says later is read, so that it does not wait.
+        std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
+        live
     }
 
     fn connect(&self) -> TcpStream {
