@@ -65,7 +65,7 @@ impl Page {
         (self.meta["rows"], self.meta["scale"]) = (self.rows.len().into(), scale.into());
         let (code, style) = (format!("\"use strict\";\n{}", CODE.map(lean).concat()), lean(STYLE));
         let policy = format!(
-            "default-src 'none'; script-src {}; style-src {}; connect-src '{}'; base-uri 'none'; form-action 'none'",
+            "default-src 'none'; script-src {}; style-src {}; img-src data:; connect-src '{}'; base-uri 'none'; form-action 'none'",
             hash(&code),
             hash(&style),
             if is_live { "self" } else { "none" }
