@@ -168,7 +168,7 @@ impl Trial<'_> {
             }
             Ok(())
         };
-        Ok(self.play(&mut observer)?.map(|played| Score::of(&played)))
+        Ok(self.play(&mut observer)?.map(|played| Score::of(&played, self.task.config().ctrl_dt)))
     }
 
     /// Plays the episodes that `exchange` deals here, seen by the observer, and returns all of them in order, or `None` if they were

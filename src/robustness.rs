@@ -200,7 +200,7 @@ mod tests {
     fn row(condition: Condition, goals: u32, kept: f64) -> Row {
         let config = Config::resolve(None, &condition.sets).unwrap().env;
         let episode = EpisodeStats { length: 10, goals, ..Default::default() };
-        Row { condition, config, score: Score::of(&[episode, episode]), kept }
+        Row { condition, config, score: Score::of(&[episode, episode], 0.01), kept }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Description, FIGURES, Lesson, TaskReward, TrainingReward};
+use crate::repose::{Description, FIGURES, Lesson, OF_EVALUATIONS, TaskReward, TrainingReward};
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -69,7 +69,8 @@ pub fn quantity(name: &str) -> Option<Quantity> {
     }
     GROUPS.iter().find_map(|(group, of, episodes)| {
         let figure = name.strip_prefix(group)?;
-        let known = FIGURES.iter().find(|known| known.0 == figure)?;
+        let of_evaluations = OF_EVALUATIONS.iter().filter(|_| *group == "eval/");
+        let known = FIGURES.iter().chain(of_evaluations).find(|known| known.0 == figure)?;
         Some(Quantity { title: format!("{}, {of}", known.1), description: format!("{} {episodes}", known.2) })
     })
 }

@@ -19,8 +19,9 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Creates an empty trace of a task, played by the policy in `checkpoint` in episodes drawn from `seed`.
-    pub fn new(task: &Task, checkpoint: Option<&str>, seed: u64) -> Self {
+    /// Creates an empty trace of a task, played by the `actor` of this name, with the policy in `checkpoint`, in episodes drawn from
+    /// `seed`.
+    pub fn new(task: &Task, actor: &str, checkpoint: Option<&str>, seed: u64) -> Self {
         let (config, hand) = (task.config(), task.hand());
         let mut header = json!({
             "sim_dt": config.sim_dt,
@@ -31,9 +32,10 @@ impl Trace {
             "max_episode_steps": config.max_episode_steps(),
             "model": config.model,
             "goal_position": config.goal_position.value,
+            "actor": actor,
             "checkpoint": checkpoint,
             "seed": seed,
-            "settings": config.changed(),
+            "settings": config.unlike_default(),
             "observation": hand.layout.groups.map(|Group { name, start, length, unit, .. }| {
                 json!({ "name": name, "start": start, "length": length, "unit": unit })
             }),

@@ -33,6 +33,9 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if args.shot.size.is_some() && args.screenshot.is_none() {
         return Err(usage_error("view", "--size applies only to a picture (--screenshot)").into());
     }
+    if args.at.is_some() && args.web.is_some() {
+        return Err(usage_error("view", "--at applies only to a picture (--screenshot)").into());
+    }
     if args.shot.quality.is_some() && args.web.is_some() {
         return Err(usage_error("view", "--quality applies only to a picture (--screenshot) or a window").into());
     }
@@ -60,8 +63,8 @@ fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Re
     let about = see::About { title: scene, policy: None, seed: Some(args.seed) };
     let own = sliders.clone();
     let step = move |player: &mut Player| player.step_changed(&ACTORS[actor].2, |action| own.change(action));
-    let turn = see::Turn { step: Rc::new(step), policy: None };
-    see::Live::open(port, &task, (&about, args.shot.camera), 1, &turn, Some(sliders))?.show(&mut || turn.clone())
+    let acting = see::Acting { step: Rc::new(step), policy: None };
+    see::Live::open(port, &task, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }
 
 /// Loads the task, and tells what of the user's scene the settings replace.
@@ -78,7 +81,7 @@ fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
 #[cfg(feature = "video")]
 fn draw(path: &Path, args: &ViewArgs, config: &Config, actor: &Actor, episodes: Episodes) -> Result<()> {
     let task = task_for_display(config, args)?;
-    let [width, height] = see::screenshot(path, &task, actor, episodes, args.at)?;
+    let [width, height] = see::screenshot(path, &task, actor, episodes, args.at.unwrap_or(0.5))?;
     os::say(&format!("{}: {width}x{height}", path.display()));
     Ok(())
 }

@@ -161,7 +161,8 @@ pub(crate) fn evaluate(
             Ok(())
         })?;
         let checkpoint = loaded.origin.to_string();
-        let score = played.map(|played| json_score(&Score::of(&played), &goal_times, Some(&checkpoint), seed));
+        let score = played.map(|played| Score::of(&played, task.config().ctrl_dt));
+        let score = score.map(|score| json_score(&score, &goal_times, Some(&checkpoint), seed));
         anyhow::Ok(score.map_or(String::new(), |score| score.to_string()))
     })?;
     played.map_err(refused)

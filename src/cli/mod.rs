@@ -53,11 +53,11 @@ pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
     #[command(after_help = examples!("train --seed 1 --name first", "train --resume"))]
     Train(TrainArgs),
-    /// Play a policy in a window, as a film, or for its score alone
-    #[command(after_help = examples!("play --ckpt builtin --headless", "play --video film.mp4"))]
+    /// Play a policy in a window or a browser, as a film, or for its score alone
+    #[command(after_help = examples!("play --ckpt builtin --headless", "play --ckpt builtin --web"))]
     Play(PlayArgs),
-    /// Show the scene without a policy
-    #[command(after_help = examples!("view --actions wave", "view --screenshot hand.png"))]
+    /// Show the scene without a policy, in a window or a browser
+    #[command(after_help = examples!("view --actions wave", "view --web"))]
     View(ViewArgs),
     /// Write a policy as an ONNX file, for programs in other languages
     #[command(after_help = examples!("export --out policy.onnx", "export --ckpt builtin --out builtin.onnx"))]
@@ -245,25 +245,27 @@ pub struct PlayArgs {
     pub html: Option<PathBuf>,
     /// Show the episodes of this trace in the HTML file, without playing anew
     #[arg(long, value_name = "FILE", requires = "html", help_heading = OUTPUT,
-        conflicts_with_all = ["trace", "video", "json", "headless", "episodes", "policy", "ckpt", "mirror", "stochastic"])]
+        conflicts_with_all = [
+            "trace", "video", "json", "headless", "episodes", "policy", "ckpt", "mirror", "stochastic", "seed", "threads", "fps", "out",
+        ])]
     pub from_trace: Option<PathBuf>,
     /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free one) [default port: 7070]
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT,
         conflicts_with_all = ["window", "headless", "json", "trace", "html", "video", "robustness", "episodes"])]
     pub web: Option<u16>,
-    /// Number of hands on that page
-    #[arg(long, value_name = "N", default_value_t = 1, requires = "web", help_heading = OUTPUT,
+    /// Number of hands on that page, at most 16 [default: 1]
+    #[arg(long, value_name = "N", requires = "web", help_heading = OUTPUT,
         value_parser = clap::value_parser!(u64).range(1..=16))]
-    pub hands: u64,
+    pub hands: Option<u64>,
     /// Follow a training: each episode is played by the newest policy of the run
     #[arg(long, requires = "web", conflicts_with = "policy", help_heading = OUTPUT)]
     pub follow: bool,
     /// Film the episodes one after another, as .mp4 or .gif; needs no display
     #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub video: Option<PathBuf>,
-    /// Frames of the film per second of simulated time
-    #[arg(long, default_value_t = 50, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120), help_heading = PICTURE)]
-    pub fps: u32,
+    /// Frames of the film per second of simulated time [default: 50]
+    #[arg(long, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120), help_heading = PICTURE)]
+    pub fps: Option<u32>,
     /// Size, camera and rendering.
     #[command(flatten)]
     pub shot: Shot,
@@ -306,9 +308,9 @@ pub struct ViewArgs {
     /// 7070]
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot", help_heading = PICTURE)]
     pub web: Option<u16>,
-    /// Time of the picture in the episode, in seconds
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]
-    pub at: f64,
+    /// Time of the picture in the episode, in seconds [default: 0.5]
+    #[arg(long, value_name = "SECONDS", requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]
+    pub at: Option<f64>,
     /// Size, camera and rendering.
     #[command(flatten)]
     pub shot: Shot,

@@ -114,20 +114,6 @@ impl Config {
         Ok(changed)
     }
 
-    /// Lists the settings that differ in `other`, except those that may change during a run: the total number of steps, the
-    /// number of threads and the path of the scene.
-    pub fn differences(&self, other: &Self) -> Vec<String> {
-        let table = |of: &Self| {
-            let mut same = of.clone();
-            (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, of.shards());
-            same.env.model = BUILTIN_MODEL.into();
-            Table::try_from(same).expect("a configuration is a tree of tables")
-        };
-        let (own, other) = (table(self), table(other));
-        let both = settings(&own).zip(settings(&other)).filter(|((_, own), (_, other))| own != other);
-        both.map(|((key, own), (_, other))| format!("{key} = {other}, not {own}")).collect()
-    }
-
     /// Returns the whole configuration as TOML.
     pub fn to_text(&self) -> String {
         let sections = Table::try_from(self).expect("a configuration is a tree of tables");
@@ -138,20 +124,6 @@ impl Config {
             text.push('\n');
         }
         text
-    }
-}
-
-impl EnvConfig {
-    /// Returns the settings that differ from the default ones, by dotted key. The number of hands is none of the task.
-    ///
-    /// # Panics
-    /// Never panics: settings are tables.
-    pub fn changed(&self) -> Table {
-        let table = Table::try_from(self).expect("settings are a table");
-        let default = Self::deserialize(DEFAULTS["env"].clone()).expect("the defaults are valid");
-        let default = Table::try_from(default).expect("settings are a table");
-        let differs = |(key, value): &(String, Value)| key != "num_envs" && default[key] != *value;
-        table.into_iter().filter(differs).map(|(key, value)| (format!("env.{key}"), value)).collect()
     }
 }
 

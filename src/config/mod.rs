@@ -7,6 +7,7 @@
 //! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
 
 mod applicability;
+mod differences;
 mod layers;
 mod overlay;
 mod ramp;

@@ -13,7 +13,7 @@ pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
 /// How long and how much is read of a request that is refused, so that the answer is not lost.
 const LINGER: Duration = Duration::from_millis(500);
-const MOST_LINGERED: u64 = 1 << 16;
+const MOST_LINGERED: usize = 1 << 16;
 
 /// A request whose head and body have arrived whole.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ pub(super) struct Request {
 /// A status line without the protocol, and a sentence.
 pub(super) type Refusal = (&'static str, &'static str);
 
-const MALFORMED: Refusal = ("400 Bad Request", "This is no request of HTTP/1.1.");
+const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.");
 const TOO_LONG: Refusal = ("431 Request Header Fields Too Large", "The request is too long.");
 const LATE: Refusal = ("408 Request Timeout", "The request took too long.");
 const NO_LENGTH: Refusal = ("411 Length Required", "The length of the body is not given.");
@@ -92,7 +92,8 @@ impl Request {
     }
 
     fn length(&self) -> Result<usize, Refusal> {
-        let digits = self.header("content-length").filter(|text| text.bytes().all(|c| c.is_ascii_digit()));
+        let digits = self.header("content-length");
+        let digits = digits.filter(|text| !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit()));
         let length = digits.filter(|_| self.header("transfer-encoding").is_none()).ok_or(NO_LENGTH)?;
         length.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
     }
@@ -178,8 +179,8 @@ pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal, more: 
     let more = [more, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
     let sent = answer(stream, status, &more, &format!("{sentence}\n"));
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
-        let _ = stream.set_read_timeout(Some(LINGER));
-        let _ = io::copy(&mut stream.take(MOST_LINGERED), &mut io::sink());
+        let (deadline, mut rest) = (Instant::now() + LINGER, Vec::new());
+        while rest.len() < MOST_LINGERED && read_some(stream, &mut rest, MOST_LINGERED, deadline) == Ok(true) {}
     }
 }
 

@@ -24,7 +24,7 @@ pub use output::{
     write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, progress_bar};
-pub use server::{Server, Take};
+pub use server::{OnPost, Server};
 pub use similar::similar;
 pub use terminal::{called_as, has_display, is_terminal, number, print, quoted, quoted_path, say, shortened, speak_as};
 pub use threads::{start_threads, thread_pool};

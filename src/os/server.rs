@@ -7,7 +7,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
 
 use super::http::{PATIENCE, Refusal, Request, answer, head, refuse};
 
@@ -21,11 +21,11 @@ const KEPT: usize = 64;
 /// The time without an event after which a reader is told that there is none.
 const QUIET: Duration = Duration::from_secs(1);
 
-/// The sentence for a port that cannot be had, after the reason.
-const OTHER_PORT: &str = "name another one, e.g. --web 7171, or --web 0 for any that is free";
+/// What a user can do about a port that cannot be opened.
+const OTHER_PORT: &str = "choose another one, e.g. --web 7171, or --web 0 for any that is free";
 
 /// What happens with the body of a POST to `controls`; an error is a sentence about it.
-pub type Take = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
+pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
 
 /// A page that is served as long as the program runs.
 pub struct Server {
@@ -35,7 +35,7 @@ pub struct Server {
 
 struct Shared {
     page: String,
-    take: Option<Take>,
+    on_post: Option<OnPost>,
     news: Mutex<News>,
     /// Something was sent, or somebody reads.
     changed: Condvar,
@@ -60,15 +60,15 @@ impl News {
 }
 
 impl Server {
-    /// Serves a page on this port of 127.0.0.1 (0: any free one). Without `take`, no request changes anything.
+    /// Serves a page on this port of 127.0.0.1 (0: any free one). Without `on_post`, no request changes anything.
     ///
     /// # Errors
-    /// Fails if the port cannot be had, or if the system refuses a thread.
-    pub fn open(port: u16, page: String, take: Option<Take>) -> Result<Self> {
-        let cannot = || format!("cannot use port {port} of 127.0.0.1; {OTHER_PORT}");
-        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).with_context(cannot)?;
-        let port = listener.local_addr().with_context(cannot)?.port();
-        let shared = Arc::new(Shared { page, take, news: Mutex::default(), changed: Condvar::new() });
+    /// Fails if the port cannot be opened, or if the system refuses a thread.
+    pub fn open(port: u16, page: String, on_post: Option<OnPost>) -> Result<Self> {
+        let cannot = |error| anyhow!("cannot use port {port} of 127.0.0.1: {error}; {OTHER_PORT}");
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
+        let port = listener.local_addr().map_err(cannot)?.port();
+        let shared = Arc::new(Shared { page, on_post, news: Mutex::default(), changed: Condvar::new() });
         let own = shared.clone();
         let accepting = thread::Builder::new().name("server".into());
         accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
@@ -119,13 +119,13 @@ impl Shared {
                 continue;
             };
             let _ = stream.set_write_timeout(Some(PATIENCE));
-            let Some(place) = Place::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
+            let Some(slot) = Slot::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
                 let _ = answer(&mut stream, "503 Service Unavailable", &[], "There are too many connections.\n");
                 continue;
             };
             let connection = thread::Builder::new().name("connection".into());
             // Without a thread, the connection is closed.
-            let _ = connection.spawn(move || place.shared.serve(stream));
+            let _ = connection.spawn(move || slot.shared.serve(stream));
         }
     }
 
@@ -137,30 +137,31 @@ impl Shared {
             Err(refusal) => Err((refusal, "GET")),
         };
         if let Err((refusal, allowed)) = refusal {
-            refuse(&mut stream, refusal, &[("Allow", allowed)]);
+            let allow = [("Allow", allowed)];
+            refuse(&mut stream, refusal, if refusal.0.starts_with("405") { &allow } else { &[] });
         }
     }
 
     /// Answers a request; an error is a refusal, with the methods that are allowed.
     fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), (Refusal, &'static str)> {
         request.expect_local().map_err(|refusal| (refusal, "GET"))?;
-        let take = self.take.as_ref().filter(|_| request.path == "/controls");
-        let allowed = if take.is_some() { "POST" } else { "GET" };
-        if !matches!(&*request.path, "/" | "/events") && take.is_none() {
+        let on_post = self.on_post.as_ref().filter(|_| request.path == "/controls");
+        let allowed = if on_post.is_some() { "POST" } else { "GET" };
+        if !matches!(&*request.path, "/" | "/events") && on_post.is_none() {
             return Err((("404 Not Found", "There is no such page."), allowed));
         }
         if request.method != allowed {
-            return Err((("405 Method Not Allowed", "This cannot be done with the page."), allowed));
+            return Err((("405 Method Not Allowed", "This method is not allowed here."), allowed));
         }
-        if let Some(take) = take {
+        if let Some(on_post) = on_post {
             request.expect_own().map_err(|refusal| (refusal, allowed))?;
-            take(&request.body).map_err(|sentence| (("400 Bad Request", sentence), allowed))?;
+            on_post(&request.body).map_err(|sentence| (("400 Bad Request", sentence), allowed))?;
             let _ = answer(stream, "204 No Content", &[], "");
         } else if request.path == "/" {
             let _ = answer(stream, "200 OK", &[("Content-Type", "text/html; charset=utf-8")], &self.page);
         } else {
-            let place = Place::take(self, MOST_READERS, |news| &mut news.readers);
-            let _place = place.ok_or((("503 Service Unavailable", "There are too many viewers."), allowed))?;
+            let slot = Slot::take(self, MOST_READERS, |news| &mut news.readers);
+            let _slot = slot.ok_or((("503 Service Unavailable", "There are too many viewers."), allowed))?;
             // An error is a reader that has gone, or has read nothing for too long.
             let _ = self.send_events(stream);
         }
@@ -189,14 +190,14 @@ impl Shared {
     }
 }
 
-/// A place among the connections or readers, as long as it lives.
-struct Place {
+/// One of the connections or readers that there may be, as long as it lives.
+struct Slot {
     shared: Arc<Shared>,
     count: fn(&mut News) -> &mut usize,
 }
 
-impl Place {
-    /// Returns a place, unless all of them are taken.
+impl Slot {
+    /// Returns a slot, unless all of them are taken.
     fn take(shared: &Arc<Shared>, most: usize, count: fn(&mut News) -> &mut usize) -> Option<Self> {
         let mut news = shared.news();
         let taken = count(&mut news);
@@ -209,7 +210,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Slot {
     fn drop(&mut self) {
         *(self.count)(&mut self.shared.news()) -= 1;
     }

@@ -4,99 +4,131 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::rc::Rc;
 
-use anyhow::{Context, Result, ensure};
-use serde_json::Value;
+use anyhow::{Context, Result, bail, ensure};
+use serde_json::{Value, json};
 use toml::Table;
 
+use super::actors::{actor_of, baseline};
 use super::files::PageFile;
-use crate::cli::{Baseline, PlayArgs};
+use crate::cli::PlayArgs;
 use crate::config::{Config, Source};
 use crate::evaluate::{Actor, Player};
-use crate::load::{Loaded, MODEL, PolicySource, expect_named_scene};
+use crate::load::{Loaded, MODEL, expect_named_scene};
 use crate::os::{self, Stamp};
 use crate::ppo::FixedPolicy;
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
-use crate::see::{self, About, Live, Turn};
+use crate::see::{self, About, Acting, Live};
 use crate::sim::Quality;
 
-/// Returns what a page says of who plays.
-pub(super) fn about(loaded: Option<&Loaded>, args: &PlayArgs) -> About {
-    let Some(loaded) = loaded else {
-        let title = if args.policy == Some(Baseline::Random) { "Random actions" } else { "Zero actions" };
-        return About { title: title.into(), policy: None, seed: Some(args.seed) };
+/// What is said of the origin of a policy that is built in.
+const BUILT_IN: &str = "built into the program";
+
+/// Returns what a page says of an actor, of the place of its policy and what that is, and of a seed.
+pub(super) fn about(actor: &str, policy: Option<(&str, &str)>, seed: Option<u64>) -> About {
+    let title = match policy.map(|(place, _)| place) {
+        Some(place) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
+        Some(place) => place.to_owned(),
+        None => format!("{}{}", actor[..1].to_uppercase(), &actor[1..]),
     };
-    let title = match &loaded.origin {
-        PolicySource::BuiltIn(_) => "A built-in policy".to_owned(),
-        PolicySource::File(path) => path.display().to_string(),
-    };
-    let policy = if args.stochastic { format!("{}, stochastic actions", loaded.name) } else { loaded.name.clone() };
-    About { title, policy: Some(policy), seed: Some(args.seed) }
+    let policy = policy.map(|(_, name)| match actor {
+        "policy" => name.to_owned(),
+        other => format!("{name} ({other})"),
+    });
+    About { title, policy, seed }
 }
 
-/// Shows the hand on a page for as long as the program runs; with `followed`, played by the newest policy in this file.
+/// The newest policy of a run.
+pub(super) struct Followed {
+    run: RunFolder,
+    /// Its file, and what that was like before it was last read.
+    pub(super) path: PathBuf,
+    stamp: Option<Stamp>,
+}
+
+impl Followed {
+    /// Finds the run that the user wants to follow, by default the newest.
+    ///
+    /// # Errors
+    /// Fails if the user names no run, or if there is none.
+    pub(super) fn find(args: &PlayArgs) -> Result<Self> {
+        let place =
+            args.ckpt.clone().or_else(run::newest_run).context("--follow needs a run, and there is none here")?;
+        let run = RunFolder::containing(&place).context("--follow needs a run")?;
+        let path = run.checkpoints().latest();
+        Ok(Self { stamp: Stamp::of(&path), run, path })
+    }
+
+    /// Returns whether the file is another one than before.
+    fn has_changed(&mut self) -> bool {
+        let before = self.stamp;
+        self.stamp = Stamp::of(&self.path);
+        self.stamp != before
+    }
+}
+
+/// Shows the hand on a page for as long as the program runs. Each episode of a run that is `followed` has its newest policy.
 ///
 /// # Errors
-/// Fails if the port cannot be had.
+/// Fails if the port cannot be opened.
 pub(super) fn live(
     port: u16,
     args: &PlayArgs,
     task: &Task,
     loaded: Option<Loaded>,
-    followed: Option<&Path>,
+    mut followed: Option<Followed>,
 ) -> Result<ExitCode> {
     let task = see::task_for_display(task, &args.shot, [1280, 720], Quality::Fast)?;
-    let mut about = about(loaded.as_ref(), args);
-    if let Some(run) = followed.and_then(Path::parent).and_then(Path::parent) {
-        about = About { title: run.display().to_string(), policy: None, ..about };
-    }
-    let mut turn = match &loaded {
-        Some(loaded) => turn_of(loaded, args.stochastic),
+    let baseline = baseline(args);
+    let (mut about, mut acting) = match &loaded {
+        Some(loaded) => {
+            let name = actor_of(loaded, args).name();
+            (
+                about(name, Some((&loaded.origin.to_string(), &loaded.name)), Some(args.seed)),
+                acting_of(loaded, args.stochastic),
+            )
+        }
         None => {
-            let actor = if args.policy == Some(Baseline::Random) { Actor::Random } else { Actor::Zero };
-            Turn { step: Rc::new(move |player| player.step(&actor)), policy: None }
+            let about = about(baseline.name(), None, Some(args.seed));
+            (about, Acting { step: Rc::new(move |player| player.step(&baseline)), policy: None })
         }
     };
-    let mut stamp = followed.and_then(Stamp::of);
+    if let Some(followed) = &followed {
+        about = About { title: followed.run.path().display().to_string(), policy: None, ..about };
+    }
     let record = loaded.map(|loaded| loaded.record);
-    let live = Live::open(port, &task, (&about, args.shot.camera), args.hands as usize, &turn, None)?;
+    let hands = args.hands.unwrap_or(1) as usize;
+    let live = Live::open(port, &task, (&about, args.shot.camera), hands, &acting, None)?;
     live.show(&mut || {
-        let Some(path) = followed.filter(|path| Stamp::of(path) != stamp) else { return turn.clone() };
-        stamp = Stamp::of(path);
-        match Loaded::find(Some(path), &args.set) {
-            Ok(newer) if Some(&newer.record) == record.as_ref() => turn = turn_of(&newer, args.stochastic),
-            Ok(_) => os::say(&format!("warning: {} is for another hand; the one before plays on", path.display())),
-            Err(error) => os::say(&format!("warning: {error:#}\n  The policy before plays on.")),
+        if let Some(followed) = &mut followed
+            && followed.has_changed()
+        {
+            let place = followed.path.display();
+            match Loaded::find(Some(&followed.path), &args.set) {
+                Ok(newer) if Some(&newer.record) == record.as_ref() => acting = acting_of(&newer, args.stochastic),
+                Ok(_) => os::say(&format!("warning: {place} is for another hand; the one before plays on")),
+                Err(error) => os::say(&format!("warning: {error:#}\n  The policy before plays on.")),
+            }
         }
-        turn.clone()
+        acting.clone()
     })
 }
 
-/// Returns the file whose newest content a page follows.
-///
-/// # Errors
-/// Fails if the user names no run, and there is none.
-pub(super) fn followed(args: &PlayArgs) -> Result<PathBuf> {
-    let place = args.ckpt.clone().or_else(run::newest_run).context("--follow needs a run, and there is none here")?;
-    let run = RunFolder::containing(&place).context("--follow needs a run")?;
-    Ok(run.checkpoints().latest())
-}
-
-fn turn_of(loaded: &Loaded, stochastic: bool) -> Turn {
+fn acting_of(loaded: &Loaded, stochastic: bool) -> Acting {
     let policy = FixedPolicy::new(loaded.policy.clone());
     let step = move |player: &mut Player| {
         let frozen = policy.frozen();
         player.step(&if stochastic { Actor::Stochastic(frozen) } else { Actor::Mean(frozen) })
     };
-    Turn { step: Rc::new(step), policy: Some(loaded.name.clone()) }
+    Acting { step: Rc::new(step), policy: Some(loaded.name.clone()) }
 }
 
-/// Shows the episodes of the trace in the file `path` as an HTML file.
+/// Writes the episodes of the trace in the file `path` as the file `html`.
 ///
 /// # Errors
 /// Fails if the file is no trace, if its scene is not the built-in one and the user does not name it, or if the HTML file cannot be
 /// written.
-pub(super) fn from_trace(path: &Path, args: &PlayArgs) -> Result<()> {
+pub(super) fn from_trace(path: &Path, html: &Path, args: &PlayArgs) -> Result<()> {
     let cannot = || format!("cannot use the trace {}", path.display());
     let is_begun = |start: &[u8]| {
         ensure!(start.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());
@@ -106,25 +138,33 @@ pub(super) fn from_trace(path: &Path, args: &PlayArgs) -> Result<()> {
     let header = serde_json::from_str::<Value>(text.lines().next().unwrap_or_default()).ok();
     let header = header.filter(|header| header.get("observation").is_some());
     let header = header.context("it does not begin with the header of a trace").with_context(cannot)?;
+    if let Some(set) = args.set.iter().find(|set| set.key != MODEL && !set.key.starts_with("hand.")) {
+        bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be named", set.key);
+    }
     let config = Config::resolve(Some(&settings(path, &header).with_context(cannot)?), &args.set)?;
     expect_named_scene(&config.env, args.set.iter().any(|set| set.key == MODEL)).with_context(cannot)?;
     let task = Task::new(&config.env, &config.hand)?;
-    let html = args.html.as_deref().context("a file to write")?;
+    let joints = json!(task.hand().parts.joints);
+    ensure!(header["joint_names"] == joints, "{}: it is of another hand, with other joints", cannot());
     run::expect_output(html, Some(path), task.config().model_file())?;
-    let mut page = PageFile::begin(&task, args)?.context("a file to write")?;
+    let mut page = PageFile::begin(html, &task, args)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {
         os::say(&format!("note: {left_out} more episodes of {} are not in the file", path.display()));
     }
-    let policy = header["checkpoint"].as_str();
-    let title = format!("{}, played before", policy.unwrap_or("A hand without a policy"));
-    page.finish(&About { title, policy: policy.map(str::to_owned), seed: header["seed"].as_u64() })
+    let actor = header["actor"].as_str().filter(|actor| actor.is_ascii() && !actor.is_empty()).unwrap_or("policy");
+    let policy = header["checkpoint"].as_str().map(|place| (place, place));
+    page.finish(&about(actor, policy, header["seed"].as_u64()))
 }
 
-/// Returns the settings of the header of a trace as a configuration file; a file of an older version has none.
+/// Returns the settings of the header of a trace as a configuration file.
+///
+/// # Errors
+/// Fails if there are none.
 fn settings(path: &Path, header: &Value) -> Result<Source> {
     let mut env = Table::new();
-    for (key, value) in header["settings"].as_object().into_iter().flatten() {
+    let settings = header["settings"].as_object();
+    for (key, value) in settings.context("it has no settings: an older version wrote it; play the episodes again")? {
         let value = toml::Value::try_from(value).with_context(|| format!("its setting {}", os::shortened(key)))?;
         env.insert(key.strip_prefix("env.").unwrap_or(key).to_owned(), value);
     }

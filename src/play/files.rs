@@ -1,5 +1,7 @@
 //! The files of what is played: a trace, and an HTML file.
 
+use std::path::Path;
+
 use anyhow::{Result, ensure};
 
 use crate::cli::PlayArgs;
@@ -17,22 +19,22 @@ pub(super) struct Files {
 }
 
 impl Files {
-    /// Begins the files of episodes of this task, played by the policy in `checkpoint`.
+    /// Begins the files of episodes of this task, played by the `actor` of this name and the policy in `checkpoint`.
     ///
     /// # Errors
     /// Fails if one of them cannot be written.
-    pub(super) fn begin(task: &Task, checkpoint: Option<&str>, args: &PlayArgs) -> Result<Self> {
+    pub(super) fn begin(task: &Task, actor: &str, checkpoint: Option<&str>, args: &PlayArgs) -> Result<Self> {
         let trace = args.trace.as_deref().map(OutputFile::create).transpose()?;
         for (option, other) in [("--video", &args.video), ("--html", &args.html)] {
             if let (Some(trace), Some(other)) = (&trace, other) {
                 ensure!(!trace.is_of(other), "--trace {0} {option} {0}: one file cannot be both", other.display());
             }
         }
-        let page = PageFile::begin(task, args)?;
+        let page = args.html.as_deref().map(|path| PageFile::begin(path, task, args)).transpose()?;
         if let (Some(page), Some(video)) = (&page, &args.video) {
             ensure!(!page.output.is_of(video), "--html {0} --video {0}: one file cannot be both", video.display());
         }
-        Ok(Self { trace: trace.map(|output| (output, Trace::new(task, checkpoint, args.seed))), page })
+        Ok(Self { trace: trace.map(|output| (output, Trace::new(task, actor, checkpoint, args.seed))), page })
     }
 
     pub(super) fn observe(&mut self, moment: &Moment) {
@@ -63,16 +65,16 @@ pub(super) struct PageFile {
 }
 
 impl PageFile {
-    /// Begins the file that the user wants, if any, of episodes of this task.
+    /// Begins a file of episodes of this task.
     ///
     /// # Errors
     /// Fails if it cannot be written, or if the episodes are too long for it.
-    pub(super) fn begin(task: &Task, args: &PlayArgs) -> Result<Option<Self>> {
-        let Some(path) = &args.html else { return Ok(None) };
+    pub(super) fn begin(path: &Path, task: &Task, args: &PlayArgs) -> Result<Self> {
         let output = OutputFile::create(path)?;
         // The size is that of a film; a page has none.
         let task = see::task_for_display(task, &args.shot, [1280, 720], Quality::Fast)?;
-        Ok(Some(Self { output, replay: Replay::new(&task, args.shot.camera)? }))
+        let episodes = if args.from_trace.is_some() { 0 } else { args.episodes.unwrap_or(1) as usize };
+        Ok(Self { output, replay: Replay::new(&task, args.shot.camera, episodes)? })
     }
 
     /// Takes the episodes from a trace, and returns how many did not fit.

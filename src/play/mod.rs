@@ -1,6 +1,7 @@
 //! Playing a policy: in a window or a browser, as a film or an HTML file, or for its score over whole episodes (a table or one JSON
 //! object), with a trace of the first episodes.
 
+mod actors;
 mod browser;
 mod files;
 
@@ -14,6 +15,8 @@ use anyhow::ensure;
 use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
+use self::actors::{actor_of, baseline};
+use self::browser::Followed;
 use self::files::Files;
 use crate::cli::{Baseline, PlayArgs, Shot, usage_error};
 use crate::config::{Config, expect_used};
@@ -35,12 +38,14 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     expect_used(&args.set, "play")?;
     expect_together(args)?;
     if let Some(trace) = &args.from_trace {
-        return browser::from_trace(trace, args).map(|()| ExitCode::SUCCESS);
+        let html = args.html.as_deref().context("--from-trace needs --html")?;
+        return browser::from_trace(trace, html, args).map(|()| ExitCode::SUCCESS);
     }
-    let followed = if args.follow { Some(browser::followed(args)?) } else { None };
+    let followed = args.follow.then(|| Followed::find(args)).transpose()?;
+    let place = followed.as_ref().map(|followed| &*followed.path).or(args.ckpt.as_deref());
     let loaded = match args.policy {
         Some(_) => None,
-        None => Some(Loaded::find(followed.as_deref().or(args.ckpt.as_deref()), &args.set)?),
+        None => Some(Loaded::find(place, &args.set)?),
     };
     let task = match &loaded {
         Some(loaded) => loaded.task(&args.set)?,
@@ -66,7 +71,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         return robustness(args, loaded, &actor_of(loaded, args), requests);
     }
     if let Some(port) = args.web {
-        return browser::live(port, args, &task, loaded, followed.as_deref());
+        return browser::live(port, args, &task, loaded, followed);
     }
     #[cfg(not(feature = "viewer"))]
     ensure!(!wants_window(args), see::NO_WINDOWS);
@@ -86,7 +91,16 @@ fn expect_together(args: &PlayArgs) -> Result<()> {
     let is_shown = is_page || args.video.is_some() || wants_window(args);
     let given = args.shot.given().filter(|_| !is_shown);
     let most = see::MOST_EPISODES as u64;
+    // Where an option that excludes another one is given, clap does not ask for the other one.
+    let needs = [
+        ("--hands", args.hands.is_some(), "--web", args.web.is_some()),
+        ("--follow", args.follow, "--web", args.web.is_some()),
+        ("--fps", args.fps.is_some(), "--video", args.video.is_some()),
+        ("--out", args.out.is_some(), "--robustness", args.robustness),
+    ];
+    let lacking = needs.into_iter().find(|(_, given, _, there)| *given && !there);
     let text = match args {
+        _ if let Some((option, _, needed, _)) = lacking => format!("{option} applies only with {needed}"),
         _ if given.is_some() => {
             format!(
                 "{} applies only to a film (--video), a page (--html, --web) or a window",
@@ -110,13 +124,9 @@ fn expect_together(args: &PlayArgs) -> Result<()> {
 /// Plays without a window and prints the score.
 fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: Option<&Loaded>) -> Result<ExitCode> {
     let config = task.config();
-    let actor = match (loaded, args.policy) {
-        (Some(loaded), _) => actor_of(loaded, args),
-        (None, Some(Baseline::Random)) => Actor::Random,
-        (None, _) => Actor::Zero,
-    };
+    let actor = loaded.map_or_else(|| baseline(args), |loaded| actor_of(loaded, args));
     let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
-    let mut files = Files::begin(task, checkpoint.as_deref(), args)?;
+    let mut files = Files::begin(task, actor.name(), checkpoint.as_deref(), args)?;
     let mut goal_times = GoalTimes::new(config);
     let mut observe = |moment: &Moment| {
         goal_times.observe(moment);
@@ -140,7 +150,8 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
         }
         return Ok(os::exit_code(requests.signal()));
     };
-    files.finish(&browser::about(loaded, args))?;
+    let policy = checkpoint.as_deref().zip(loaded.map(|loaded| &*loaded.name));
+    files.finish(&browser::about(actor.name(), policy, Some(args.seed)))?;
     played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if args.json {
         os::print(&format!("{}\n", json_score(&played, &goal_times, checkpoint.as_deref(), args.seed)))?;
@@ -156,12 +167,6 @@ fn play_unseen(args: &PlayArgs, requests: &Requests, task: &Arc<Task>, loaded: O
     }
     os::print(&table(&columns))?;
     Ok(ExitCode::SUCCESS)
-}
-
-/// Returns the actor that a policy is played as.
-fn actor_of<'a>(loaded: &'a Loaded, args: &PlayArgs) -> Actor<'a> {
-    let policy = loaded.policy.freeze();
-    if args.stochastic { Actor::Stochastic(policy) } else { Actor::Mean(policy) }
 }
 
 fn wants_window(args: &PlayArgs) -> bool {
@@ -213,7 +218,7 @@ fn film(
 ) -> Result<Option<Score>> {
     let task = see::task_for_display(task, &args.shot, [640, 480], crate::sim::Quality::Fast)?;
     let all = episodes(args, 1);
-    let mut film = see::Film::create(path, &task, args.fps, all.count as u64)?;
+    let mut film = see::Film::create(path, &task, args.fps.unwrap_or(50), all.count as u64)?;
     // Unlike the other outputs, a film is worth keeping if it is interrupted.
     requests.wait_for_end();
     let mut played = Vec::new();
@@ -230,7 +235,7 @@ fn film(
         }
     }
     os::say(&format!("{}: {}", path.display(), film.finish()?));
-    Ok((played.len() == all.count).then(|| Score::of(&played)))
+    Ok((played.len() == all.count).then(|| Score::of(&played, task.config().ctrl_dt)))
 }
 
 /// Returns the requested episodes, or `otherwise` of them if no number was given.
@@ -250,6 +255,10 @@ pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str
         "in_tolerance": score.in_tolerance,
         "rot_dist": score.rot_dist,
         "steps_per_goal": score.steps_per_goal,
+        "seconds_per_goal": score.seconds_per_goal,
+        "success_rate": score.success_rate,
+        "success_rate_5": score.success_rate_5,
+        "turned": score.turned,
         "drop_rate": score.drop_rate,
         "episode_length": score.length,
         "return": score.episode_return,
@@ -280,9 +289,13 @@ fn figures(score: &Score) -> Vec<(String, String)> {
     let goals = [("episodes", score.episodes.to_string()), ("goals per episode", number(score.goals, 3))];
     let interval = (score.episodes > 1).then(|| ("  95 % interval", format!("{low} … {high}")));
     let others = [
+        ("success rate, %", number(100.0 * score.success_rate, 1)),
+        ("  of five goals, %", number(100.0 * score.success_rate_5, 1)),
         ("steps in tolerance, %", number(100.0 * score.in_tolerance, 2)),
         ("rotation error, rad", number(score.rot_dist, 3)),
+        ("turned, rad/100 steps", number(score.turned, 2)),
         ("steps per goal", number(score.steps_per_goal, 0)),
+        ("seconds per goal", number(score.seconds_per_goal, 2)),
         ("drop rate, %", number(100.0 * score.drop_rate, 1)),
         ("episode length, steps", number(score.length, 1)),
         ("return", number(score.episode_return, 2)),
@@ -300,9 +313,11 @@ mod tests {
     #[test]
     fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {
         let goal_times = GoalTimes::new(&Config::resolve(None, &[]).unwrap().env);
-        let value = json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }]), &goal_times, None, 3);
+        let value =
+            json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }], 0.01), &goal_times, None, 3);
         let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
-        let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal drop_rate \
+        let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal \
+                        seconds_per_goal success_rate success_rate_5 turned drop_rate \
                         episode_length return reward diverged checkpoint seed steps_to_goal drops_first_second steps_fit";
         assert_eq!(keys.join(" "), expected);
         assert!(value["steps_per_goal"].is_null() && value["checkpoint"].is_null());
@@ -312,7 +327,7 @@ mod tests {
 
     #[test]
     fn the_table_has_a_column_for_each_score() {
-        let score = Score::of(&[EpisodeStats { length: 10, goals: 2, ..Default::default() }]);
+        let score = Score::of(&[EpisodeStats { length: 10, goals: 2, ..Default::default() }], 0.01);
         let text = table(&[("policy", score), ("zero actions", score)]);
         let goals = text.lines().find(|line| line.starts_with("goals per episode")).unwrap();
         assert_eq!(goals.matches("2.000").count(), 2, "{text}");

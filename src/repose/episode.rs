@@ -28,6 +28,9 @@ pub struct EpisodeStats {
     pub diverged: bool,
     /// Whether it was randomised. Not written by `save`; the environment stores it beside the episode.
     pub randomized: bool,
+    /// Sum of the rotation towards the goal, rad; negative away from it. Not written by `save`: only evaluations use it, which
+    /// play episodes whole.
+    pub turned: f64,
 }
 
 impl EpisodeStats {
@@ -51,7 +54,7 @@ impl EpisodeStats {
         ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
         let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);
         let [dropped, diverged] = [dropped, diverged].map(|flag| flag != 0);
-        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped, diverged, randomized: false })
+        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped, diverged, ..Self::default() })
     }
 }
 
@@ -111,6 +114,14 @@ pub struct Score {
     pub rot_dist: f64,
     /// Steps per goal reached.
     pub steps_per_goal: f64,
+    /// Seconds of the simulation per goal reached.
+    pub seconds_per_goal: f64,
+    /// Fraction of the episodes with at least one goal.
+    pub success_rate: f64,
+    /// Fraction of the episodes with at least five goals.
+    pub success_rate_5: f64,
+    /// Rotation towards the goal in 100 steps, rad.
+    pub turned: f64,
     /// Fraction of the episodes that ended with a drop.
     pub drop_rate: f64,
     /// Mean length in control steps.
@@ -128,7 +139,7 @@ pub struct Score {
 #[derive(Clone, Copy)]
 pub struct Figure(pub &'static str, pub &'static str, pub &'static str, fn(&Score) -> f64);
 
-/// The figures that a training logs.
+/// The figures that a training logs of its own episodes.
 #[rustfmt::skip]
 pub const FIGURES: [Figure; 7] = [
     Figure("return", "return", "Sum of the task's rewards of an episode.", |score| score.episode_return),
@@ -140,7 +151,16 @@ pub const FIGURES: [Figure; 7] = [
     Figure("steps_per_goal", "steps per goal", "Control steps per goal reached.", |score| score.steps_per_goal),
 ];
 
-/// The figures that summarise an evaluation during training.
+/// The figures that only scores and evaluations have.
+#[rustfmt::skip]
+pub const OF_EVALUATIONS: [Figure; 4] = [
+    Figure("success_rate", "share of episodes with a goal", "Fraction of the episodes with at least one goal.", |score| score.success_rate),
+    Figure("success_rate_5", "share of episodes with five goals", "Fraction of the episodes with at least five goals.", |score| score.success_rate_5),
+    Figure("seconds_per_goal", "seconds per goal", "Seconds of the simulation per goal reached.", |score| score.seconds_per_goal),
+    Figure("turned", "turned towards the goal (rad/100 steps)", "Rotation towards the goal in 100 steps, rad.", |score| score.turned),
+];
+
+/// The figures of every score that summarise an evaluation during training.
 const HEADLINE: [&str; 4] = ["goals", "drop_rate", "rot_dist", "return"];
 
 impl Score {
@@ -149,19 +169,20 @@ impl Score {
         divergence(self.diverged as u64, self.env_steps)
     }
 
-    /// Returns all figures by name.
+    /// Returns the figures of a training's own episodes by name.
     pub fn named(&self) -> [(&'static str, f64); FIGURES.len()] {
         FIGURES.map(|Figure(name, .., value)| (name, value(self)))
     }
 
     /// Returns the figures, by name, that summarise an evaluation during training.
-    pub fn headline(&self) -> impl Iterator<Item = (&'static str, f64)> {
+    pub fn headline(&self) -> impl Iterator<Item = (&'static str, f64)> + use<> {
         let all = self.named();
-        HEADLINE.into_iter().filter_map(move |wanted| all.into_iter().find(|(name, _)| *name == wanted))
+        let first = HEADLINE.into_iter().filter_map(move |wanted| all.into_iter().find(|(name, _)| *name == wanted));
+        first.chain(OF_EVALUATIONS.map(|Figure(name, .., value)| (name, value(self))))
     }
 
-    /// Computes the score of `episodes`.
-    pub fn of(episodes: &[EpisodeStats]) -> Self {
+    /// Computes the score of `episodes` with control steps of `ctrl_dt` seconds.
+    pub fn of(episodes: &[EpisodeStats], ctrl_dt: f64) -> Self {
         let n = episodes.len() as f64;
         let sum = |f: &dyn Fn(&EpisodeStats) -> f64| episodes.iter().map(f).sum::<f64>();
         let count = |f: &dyn Fn(&EpisodeStats) -> bool| episodes.iter().filter(|e| f(e)).count();
@@ -171,6 +192,7 @@ impl Score {
         let mean = goals / n;
         let variance = sum(&|e| (f64::from(e.goals) - mean).powi(2)) / (n - 1.0);
         let margin = 1.96 * (variance / n).sqrt();
+        let steps_per_goal = if goals > 0.0 { steps / goals } else { f64::NAN };
         let mut total = TaskReward::default();
         episodes.iter().for_each(|e| total += e.reward);
         Self {
@@ -180,7 +202,11 @@ impl Score {
             goals_ci95: [mean - margin, mean + margin].map(|x| if x.is_nan() { x } else { x.max(0.0) }),
             in_tolerance: sum(&|e| f64::from(e.in_tolerance)) / steps,
             rot_dist: sum(&|e| e.rot_dist_sum) / (steps - diverged as f64),
-            steps_per_goal: if goals > 0.0 { steps / goals } else { f64::NAN },
+            steps_per_goal,
+            seconds_per_goal: steps_per_goal * ctrl_dt,
+            success_rate: count(&|e| e.goals >= 1) as f64 / n,
+            success_rate_5: count(&|e| e.goals >= 5) as f64 / n,
+            turned: 100.0 * sum(&|e| e.turned) / steps,
             drop_rate: count(&|e| e.dropped) as f64 / n,
             length: steps / n,
             episode_return: total.total() / n,
@@ -203,6 +229,7 @@ mod tests {
             in_tolerance: 200,
             rot_dist_sum: 500.0,
             reward: reward(30.0),
+            turned: 9.0,
             ..Default::default()
         };
         let two = EpisodeStats {
@@ -212,10 +239,13 @@ mod tests {
             dropped: true,
             ..Default::default()
         };
-        let score = Score::of(&[one, two]);
+        let score = Score::of(&[one, two], 0.02);
         assert_eq!((score.episodes, score.env_steps, score.diverged), (2, 1500, 0));
         assert_eq!((score.goals, score.drop_rate, score.length), (2.0, 0.5, 750.0));
         assert_eq!((score.episode_return, score.steps_per_goal, score.rot_dist), (20.0, 375.0, 1.0));
+        assert_eq!((score.success_rate, score.success_rate_5, score.seconds_per_goal), (0.5, 0.0, 7.5));
+        assert_eq!(Score::of(&[EpisodeStats { goals: 5, ..one }, two], 0.02).success_rate_5, 0.5);
+        assert!((score.turned - 0.6).abs() < 1e-12);
         // Standard deviation √8, standard error 2.
         assert!((score.goals_ci95[1] - (2.0 + 1.96 * 2.0)).abs() < 1e-12);
         assert_eq!(score.goals_ci95[0], 0.0);
@@ -224,8 +254,9 @@ mod tests {
 
     #[test]
     fn nothing_scores_nothing() {
-        let score = Score::of(&[]);
+        let score = Score::of(&[], 0.01);
         assert!(score.goals.is_nan() && score.rot_dist.is_nan() && score.goals_ci95[0].is_nan());
-        assert!(Score::of(&[EpisodeStats { length: 5, ..Default::default() }]).steps_per_goal.is_nan());
+        let idle = Score::of(&[EpisodeStats { length: 5, ..Default::default() }], 0.01);
+        assert!(idle.steps_per_goal.is_nan() && idle.seconds_per_goal.is_nan() && idle.success_rate == 0.0);
     }
 }

@@ -18,7 +18,7 @@ mod task;
 
 pub use divergence::{Diverged, Tail, divergence};
 pub use environment::{Repose, StepDetails};
-pub use episode::{EpisodeStats, FIGURES, Figure, Score, StepSums};
+pub use episode::{EpisodeStats, FIGURES, Figure, OF_EVALUATIONS, Score, StepSums};
 pub use hand::{ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::Lesson;
 pub use observation::{Group, Layout};

@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use anyhow::Result;
 use protobuf::Message;
 use tensorboard_proto::event::{Event, Event_oneof_what as What, SessionLog, SessionLog_SessionStatus};
-use tensorboard_proto::summary::{Summary, Summary_Value_oneof_value as Content};
+use tensorboard_proto::summary::{Summary, Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_rs::record_writer::RecordWriter;
 
 use super::records::length_up_to;
@@ -30,28 +30,37 @@ pub(super) struct EventFile {
 pub const SETTINGS: &str = "settings";
 
 impl EventFile {
-    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,
-    /// and discards values from earlier files at `first_step` and later. The file begins with the `settings` of the run (TOML).
+    /// Creates an event file in `folder` that begins with the `settings` of the run (TOML), as [`EventFile::open`] does.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
     pub(super) fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
+        let mut events = Self::open(folder, first_step, tags)?;
+        let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
+        let written = events.summary([(SETTINGS, settings)].into_iter(), first_step);
+        written.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
+    }
+
+    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,
+    /// and discards values from earlier files at `first_step` and later.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be written.
+    pub(super) fn open(folder: &Path, first_step: u64, tags: &Descriptions) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
         let seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
         let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
         let file = File::create_new(&path).cannot("create", &path)?;
-        let mut events = Self { path, file, undescribed: tags.clone() };
-        let begun = events.begin(first_step, settings).and_then(|()| Ok(sync_folder(&events.path)?));
+        let events = Self { path, file, undescribed: tags.clone() };
+        let begun = events.begin(first_step).and_then(|()| Ok(sync_folder(&events.path)?));
         begun.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
     }
 
-    fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
+    fn begin(&self, first_step: u64) -> Result<()> {
         self.write(What::file_version("brain.Event:2".into()), 0)?;
         let session = SessionLog { status: SessionLog_SessionStatus::START, ..SessionLog::default() };
-        self.write(What::session_log(session), first_step)?;
-        let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
-        self.summary([(SETTINGS, settings)].into_iter(), first_step)
+        self.write(What::session_log(session), first_step)
     }
 
     /// Adds the values of one step and flushes. `NaN` values are left out.
@@ -67,8 +76,16 @@ impl EventFile {
     }
 
     fn summary<'a>(&mut self, values: impl Iterator<Item = (&'a str, Content)>, step: u64) -> Result<()> {
-        let value = values.map(|(tag, content)| value(tag, content, self.undescribed.remove(tag))).collect();
-        self.write(What::summary(Summary { value, ..Summary::default() }), step)
+        let values = values.map(|(tag, content)| value(tag, content, self.undescribed.remove(tag))).collect();
+        self.values(values, step)
+    }
+
+    /// Adds values as they are.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be written.
+    pub(super) fn values(&self, values: Vec<Summary_Value>, step: u64) -> Result<()> {
+        self.write(What::summary(Summary { value: values.into(), ..Summary::default() }), step)
     }
 
     fn write(&self, what: What, step: u64) -> Result<()> {
@@ -109,7 +126,7 @@ pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 }
 
 /// Returns this program's event files in `folder`, each with the seconds in its name.
-fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
+pub(super) fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).cannot("read", folder)?;
     let ours = entries.flatten().filter_map(|entry| {
@@ -123,14 +140,12 @@ fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
 }
 
 /// Returns the seconds since 1970.
-fn now() -> f64 {
+pub(super) fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
 
 #[cfg(test)]
 mod tests {
-    use tensorboard_proto::summary::Summary_Value;
-
     use super::super::{Animation, histogram};
     use super::*;
 

@@ -9,6 +9,7 @@ use std::time::SystemTime;
 use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
+use super::hparams::HPARAMS;
 use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
@@ -23,8 +24,19 @@ const STOP: &str = "stop";
 /// A file with this name says that the training is not to be continued.
 pub(super) const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
-const OURS: [&str; 10] =
-    [CONFIG, VERSION, POLICY, LOCK, METRICS, DIVERGED, "metrics.before-", "events.out.", CHECKPOINTS, OUR_PARTIAL];
+const OURS: [&str; 11] = [
+    CONFIG,
+    VERSION,
+    POLICY,
+    LOCK,
+    METRICS,
+    DIVERGED,
+    HPARAMS,
+    "metrics.before-",
+    "events.out.",
+    CHECKPOINTS,
+    OUR_PARTIAL,
+];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
@@ -109,7 +121,7 @@ impl RunFolder {
         for entry in self.entries().into_iter().flatten() {
             let _ = fs::remove_file(entry.path());
         }
-        for folder in [self.checkpoints().folder(), &self.path] {
+        for folder in [self.checkpoints().folder(), &self.path.join(HPARAMS), &self.path] {
             let _ = fs::remove_dir(folder);
         }
     }
@@ -184,11 +196,12 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Returns the files of the run: those with the names of a run's files, and all in `checkpoints` and `diverged`. Other files
+    /// Returns the files of the run: those with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`. Other files
     /// in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
-        let folders = [self.path.clone(), self.checkpoints().folder().to_owned(), self.path.join(DIVERGED)];
+        let inner = [DIVERGED, HPARAMS].map(|name| self.path.join(name));
+        let folders = [&[self.path.clone(), self.checkpoints().folder().to_owned()][..], &inner].concat();
         for folder in folders.iter().filter(|folder| folder.exists()) {
             for entry in fs::read_dir(folder).cannot("read", folder)? {
                 found.push(entry.cannot("read", folder)?);

@@ -11,6 +11,7 @@ use anyhow::Result;
 
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
+use super::hparams::{self, HPARAMS, Hparams};
 use super::metrics::Metrics;
 use super::summary::{Descriptions, Media};
 use crate::os::{Status, StatusLine};
@@ -27,6 +28,9 @@ pub struct Report {
     settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
+    hparams: Hparams,
+    /// The row of TensorBoard's HPARAMS.
+    session: Log<EventFile>,
     /// From the iteration before the first one of the run to the last one that was logged.
     iterations: Range<u64>,
     /// Control steps up to its end.
@@ -94,16 +98,18 @@ impl Report {
             settings: String::new(),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
+            hparams: Hparams::default(),
+            session: Log::new(HPARAMS),
             iterations: 0..0,
             env_steps: 0,
             progress,
         }
     }
 
-    /// Adds descriptions of all that is logged, and the settings of the run (TOML), for TensorBoard.
+    /// Adds descriptions of all that is logged, the settings of the run (TOML) and its hyperparameters, for TensorBoard.
     #[must_use]
-    pub fn described(self, descriptions: Descriptions, settings: String) -> Self {
-        Self { descriptions, settings, ..self }
+    pub fn described(self, descriptions: Descriptions, settings: String, hparams: Hparams) -> Self {
+        Self { descriptions, settings, hparams, ..self }
     }
 
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
@@ -121,6 +127,14 @@ impl Report {
             }
             Err(error) => self.metrics.give_up(&self.progress, 0, &error),
         }
+        match self.begin_session() {
+            Ok(session) => self.session.writer = Some(session),
+            Err(error) => self.session.give_up(&self.progress, 0, &error),
+        }
+    }
+
+    fn begin_session(&self) -> Result<EventFile> {
+        hparams::begin(&self.folder, self.env_steps, &self.hparams)
     }
 
     fn open_events(&self) -> Result<EventFile> {
@@ -142,6 +156,15 @@ impl Report {
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
         self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, figures));
         self.metrics.write(&self.progress, |metrics| metrics.row(&row));
+        if !status.evaluation.is_nan() {
+            let best = self.hparams.goals.map_or(status.evaluation, |goals| goals.max(status.evaluation));
+            self.hparams.goals = Some(best);
+            let drop_rate = values.iter().find(|(name, _)| name.as_ref() == "eval/drop_rate");
+            let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
+            let metrics = hparams::metrics(best, drop_rate, status.steps_per_s);
+            self.session
+                .write(&self.progress, |events| events.iteration(status.env_steps, &metrics, &Media::default()));
+        }
         self.progress.show(status);
     }
 
@@ -149,10 +172,18 @@ impl Report {
     pub fn sync(&mut self) {
         self.metrics.sync(&self.progress, Metrics::sync);
         self.events.sync(&self.progress, |events| events.sync());
+        self.session.sync(&self.progress, |events| events.sync());
         // The whole folder may have been deleted.
         let _ = fs::create_dir_all(&self.folder);
         self.metrics.writer = self.metrics.writer.take().or_else(|| Some(self.open_metrics().ok()?.0));
         self.events.writer = self.events.writer.take().or_else(|| self.open_events().ok());
+        self.session.writer = self.session.writer.take().or_else(|| self.begin_session().ok());
+    }
+
+    /// Says in the row of TensorBoard's HPARAMS that the run has made all its steps, or has failed.
+    pub fn end(&mut self, succeeded: bool) {
+        let step = self.env_steps;
+        self.session.write(&self.progress, |events| events.values(hparams::end(succeeded)?, step));
     }
 
     /// Ends the progress line, and reports the iterations that the logs lack.
@@ -222,7 +253,7 @@ mod tests {
         assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
         report.iteration(4, &[("a", 4.0)], &Media::default(), &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
-        assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 3);
     }
 
     #[test]

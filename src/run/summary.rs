@@ -45,13 +45,20 @@ pub(super) fn value(tag: &str, content: Content, description: Option<String>) ->
         Content::image(_) => ("images", 3),
         _ => ("text", 2),
     };
+    let Some(description) = description else {
+        return Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
+    };
+    let mut value = with_metadata(tag, content, plugin, data_class);
+    value.mut_metadata().set_summary_description(description);
+    value
+}
+
+/// Returns a value of a tag that says which plugin shows it, and of which class its data are.
+pub(super) fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32) -> Summary_Value {
     let mut value = Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
-    if let Some(description) = description {
-        let metadata = value.mut_metadata();
-        metadata.mut_plugin_data().set_plugin_name(plugin.to_owned());
-        metadata.mut_unknown_fields().add_varint(DATA_CLASS, data_class);
-        metadata.set_summary_description(description);
-    }
+    let metadata = value.mut_metadata();
+    metadata.mut_plugin_data().set_plugin_name(plugin.to_owned());
+    metadata.mut_unknown_fields().add_varint(DATA_CLASS, data_class.into());
     value
 }
 

@@ -13,8 +13,12 @@ use crate::sim::{Camera, Drawing};
 /// The scalars before the terms of the reward.
 const SCALARS: [&str; 4] = ["step", "error", "held", "goals"];
 
-/// The largest number that a page is given.
+/// The largest number of a pose (m, rad) and of a scalar that a page is given. The largest one of a column sets its precision.
+const FARTHEST: f64 = 100.0;
 const LARGEST: f64 = 1e9;
+
+/// The largest count: a page counts in 16 bits.
+pub(super) const MOST: u32 = 32_767;
 
 /// The scene of a task, and where the numbers of a row are.
 pub(super) struct Columns {
@@ -78,11 +82,20 @@ impl Columns {
             let fits = found.filter(|found| found.len() == length);
             fits.with_context(|| format!("`{key}` is not a list of {length} numbers, as in this scene"))
         };
-        // A reset has no errors and no reward.
-        let value = |value: &Value| number(value).unwrap_or(0.0);
-        let scalars = ["step", "rot_dist", "held", "goals"].map(|key| value(&record[key]));
-        let reward: Vec<f64> = Self::terms().map(|term| value(&record["reward"][term])).collect();
-        Ok(self.row(&list("qpos", self.positions)?, &list("goal", 4)?, scalars, &reward))
+        // A reset has no errors, no counts and no reward.
+        let is_reset = record["reset"] == true;
+        let value = |value: &Value, what: &str| match number(value) {
+            None if is_reset => Ok(0.0),
+            found => found.with_context(|| format!("`{what}` is not a number")),
+        };
+        let count = |key: &str| {
+            let count = if is_reset && key != "step" { Some(0) } else { record[key].as_u64() };
+            let count = count.filter(|count| *count <= MOST.into());
+            count.map(|count| count as f64).with_context(|| format!("`{key}` is not a count up to {MOST}"))
+        };
+        let scalars = [count("step")?, value(&record["rot_dist"], "rot_dist")?, count("held")?, count("goals")?];
+        let reward: Result<Vec<f64>> = Self::terms().map(|term| value(&record["reward"][term], term)).collect();
+        Ok(self.row(&list("qpos", self.positions)?, &list("goal", 4)?, scalars, &reward?))
     }
 
     fn row(&self, qpos: &[f64], goal: &[f64], scalars: [f64; SCALARS.len()], reward: &[f64]) -> Vec<f64> {
@@ -91,8 +104,16 @@ impl Columns {
         row[self.goal..self.goal + 4].copy_from_slice(goal);
         row.extend(scalars.iter().chain(reward));
         // The physics of the last step of an episode may have diverged.
-        row.iter_mut().for_each(|x| *x = if x.is_nan() { 0.0 } else { x.clamp(-LARGEST, LARGEST) });
+        for (place, x) in row.iter_mut().enumerate() {
+            let most = if place < self.poses() { FARTHEST } else { LARGEST };
+            *x = if x.is_nan() { 0.0 } else { x.clamp(-most, most) };
+        }
         row
+    }
+
+    /// Gives a row the poses of the row before: those after a step that diverged mean nothing.
+    pub(super) fn stay(&self, row: &mut [f64], before: &[f64]) {
+        row[..self.poses()].copy_from_slice(&before[..self.poses()]);
     }
 
     /// Turns the quaternions of a row so that they go on from those of the row before: q and -q are the same turn.
@@ -126,7 +147,7 @@ impl Columns {
             "program": format!("shadow-repose {}", env!("CARGO_PKG_VERSION")),
             "policy": about.policy,
             "seed": about.seed,
-            "settings": config.changed(),
+            "settings": config.unlike_default(),
             "dt": config.ctrl_dt,
             "every": 1,
             "tolerance": config.success_tolerance,

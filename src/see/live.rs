@@ -18,10 +18,7 @@ use crate::os::{self, Machine, Server};
 use crate::repose::{Task, TaskReward};
 use crate::sim::Camera;
 
-/// The most hands on a page.
-pub const MOST_HANDS: u64 = 16;
-
-/// The time between two rows, s, as far as it is a multiple of a control step; a page interpolates.
+/// The time between two rows, s, rounded to control steps; a page interpolates between rows.
 const BETWEEN_ROWS: f64 = 0.02;
 
 /// The time between two looks at the clock.
@@ -32,7 +29,7 @@ type Stepping = dyn Fn(&mut Player) -> Option<End>;
 
 /// Who acts in an episode.
 #[derive(Clone)]
-pub struct Turn {
+pub struct Acting {
     /// Takes one step.
     pub step: Rc<Stepping>,
     /// What the page calls the policy, if it is not the one that it names throughout.
@@ -55,7 +52,7 @@ pub struct Live {
 /// A hand on the page.
 struct Hand {
     player: Player,
-    turn: Turn,
+    acting: Acting,
     /// The number of its episode.
     episode: usize,
     has_ended: bool,
@@ -64,16 +61,16 @@ struct Hand {
 }
 
 impl Live {
-    /// Serves a page with `hands` hands on this port, and says where. The first episodes are `turn`'s.
+    /// Serves a page with `hands` hands on this port, and says where. The first episodes are `acting`'s.
     ///
     /// # Errors
-    /// Fails if the port cannot be had.
+    /// Fails if the port cannot be opened.
     pub fn open(
         port: u16,
         task: &Arc<Task>,
         (about, camera): (&About, Option<Camera>),
         hands: usize,
-        turn: &Turn,
+        acting: &Acting,
         sliders: Option<Sliders>,
     ) -> Result<Self> {
         let mut columns = Columns::new(task, camera);
@@ -84,7 +81,7 @@ impl Live {
         }
         let page = columns.page(about, more, Vec::new())?;
         let key = page.key();
-        let server = Server::open(port, page.html(), sliders.as_ref().map(Sliders::taker))?;
+        let server = Server::open(port, page.html(), sliders.as_ref().map(Sliders::on_post))?;
         let (port, machine) = (server.port(), Machine::this().name);
         os::say(&format!(
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
@@ -93,7 +90,7 @@ impl Live {
         let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
         let hand = |episode| {
             let player = Player::new(task, Episodes { first: episode, ..episodes });
-            Hand { player, turn: turn.clone(), episode, has_ended: false, reward: TaskReward::default() }
+            Hand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
         };
         let hands = (0..hands).map(hand).collect();
         let live = Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands };
@@ -102,15 +99,16 @@ impl Live {
     }
 
     /// Shows the hands for as long as the program runs; `next` says who acts in each further episode.
-    pub fn show(mut self, next: &mut dyn FnMut() -> Turn) -> ! {
-        let (start, mut clock, mut steps, mut begun) = (Instant::now(), self.clock(), 0_u64, self.hands.len());
+    pub fn show(mut self, next: &mut dyn FnMut() -> Acting) -> ! {
+        let (start, mut clock, mut steps, mut begun) =
+            (Instant::now(), Clock::new(self.task.config().ctrl_dt), 0_u64, self.hands.len());
         loop {
             if self.server.wait_for_reader() {
                 clock.pause();
             }
             if let Some(sliders) = self.sliders.as_ref().filter(|sliders| sliders.take_moved()) {
-                self.server.send(&event("controls", &sliders.values()));
                 self.greet();
+                self.server.send(&event("controls", &sliders.values()));
             }
             for _ in 0..clock.steps_due(1.0) {
                 for hand in 0..self.hands.len() {
@@ -131,25 +129,22 @@ impl Live {
         }
     }
 
-    fn clock(&self) -> Clock {
-        Clock::new(self.task.config().ctrl_dt)
-    }
-
-    fn begin(&mut self, hand: usize, episode: usize, turn: Turn) {
+    fn begin(&mut self, hand: usize, episode: usize, acting: Acting) {
         let own = &mut self.hands[hand];
         own.player.start(self.episodes, episode);
-        (own.turn, own.episode, own.has_ended) = (turn, episode, false);
+        (own.acting, own.episode, own.has_ended) = (acting, episode, false);
         own.reward = TaskReward::default();
         let mut about = self.about(&self.hands[hand]);
         about["hand"] = hand.into();
-        self.server.send(&event("episode", &about));
+        // First, so that a viewer who comes in between knows it.
         self.greet();
+        self.server.send(&event("episode", &about));
     }
 
     /// Returns what the page says of the episode of a hand.
     fn about(&self, hand: &Hand) -> Value {
         let mut about = json!({ "seed": format!("{}, episode {}", self.episodes.seed, hand.episode) });
-        if let Some(policy) = &hand.turn.policy {
+        if let Some(policy) = &hand.acting.policy {
             about["policy"] = policy.as_str().into();
         }
         about
@@ -177,7 +172,7 @@ impl Live {
 
 impl Hand {
     fn step(&mut self) {
-        let end = (self.turn.step)(&mut self.player);
+        let end = (self.acting.step)(&mut self.player);
         self.has_ended = end.is_some();
         self.reward += self.player.env().last_step().reward;
     }

@@ -18,7 +18,7 @@ pub use columns::About;
 pub use display::task_for_display;
 #[cfg(feature = "video")]
 pub use film::{EpisodeFilms, Film, screenshot};
-pub use live::{Live, MOST_HANDS, Turn};
+pub use live::{Acting, Live};
 pub use replay::{MOST_EPISODES, Replay};
 pub use sliders::Sliders;
 #[cfg(feature = "viewer")]

@@ -6,18 +6,16 @@ use std::sync::Arc;
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 
-use super::columns::{About, Columns};
+use super::columns::{About, Columns, MOST};
 use crate::draw::Page;
 use crate::env::End;
 use crate::evaluate::Moment;
 use crate::repose::{Task, TaskReward};
 use crate::sim::Camera;
 
-/// The most episodes of a file: a browser reads it at once, and each adds 57 kB.
+/// The most episodes of a file, and the most steps of all of them: a browser reads it at once, and 1000 steps add 57 kB.
 pub const MOST_EPISODES: usize = 20;
-
-/// The most steps of an episode: a page counts them in 16 bits.
-const MOST_STEPS: usize = 32_767;
+const MOST_STEPS: usize = 60_000;
 
 /// Episodes that become a file.
 pub struct Replay {
@@ -34,24 +32,20 @@ struct Recorded {
 }
 
 impl Replay {
-    /// Begins a file of `task`, which was loaded for display, perhaps with another camera than its own.
+    /// Begins a file of so many `episodes` of `task`, which was loaded for display, perhaps with another camera than its own.
     ///
     /// # Errors
-    /// Fails if its episodes are longer than a page can count.
-    pub fn new(task: &Arc<Task>, camera: Option<Camera>) -> Result<Self> {
-        let steps = task.config().max_episode_steps() as usize;
-        ensure!(
-            steps <= MOST_STEPS,
-            "env.max_episode_seconds: an HTML file shows episodes of at most {MOST_STEPS} steps, not {steps}"
-        );
+    /// Fails if they are longer than a page can count, or than a browser opens soon.
+    pub fn new(task: &Arc<Task>, camera: Option<Camera>, episodes: usize) -> Result<Self> {
+        let steps = task.config().max_episode_steps();
+        let (longest, all) = (steps <= MOST, steps as usize * episodes);
+        ensure!(longest, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
+        ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: use fewer --episodes");
         Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
     }
 
-    /// Records a moment of one of the first [`MOST_EPISODES`] episodes.
+    /// Records a moment of an episode.
     pub fn observe(&mut self, moment: &Moment) {
-        if moment.episode >= MOST_EPISODES {
-            return;
-        }
         let (last, begins) = (moment.env.last_step(), moment.step.is_none());
         let row = self.columns.of(moment.env, if begins { TaskReward::default() } else { last.reward });
         let end = moment.step.and_then(|(_, end)| end).map(|end| match end {
@@ -67,27 +61,32 @@ impl Replay {
     /// # Errors
     /// Fails if the text is no trace, or one of another scene.
     pub fn read(&mut self, trace: &str) -> Result<usize> {
-        let mut begun = 0;
-        for (number, line) in trace.lines().enumerate().skip(1) {
+        let (mut begun, mut rows) = (0, 0);
+        let lines = trace.lines().enumerate().skip(1).filter(|(_, line)| !line.is_empty());
+        for (number, line) in lines {
             let what = || format!("line {}", number + 1);
-            let record: Value = serde_json::from_str(line).with_context(what)?;
+            let record: Value = serde_json::from_str(line).ok().context("it is not JSON").with_context(what)?;
             begun += usize::from(record["reset"] == true);
             ensure!(begun > 0, "{}: it is not the first record of an episode", what());
             if begun <= MOST_EPISODES {
                 let row = self.columns.of_record(&record).with_context(what)?;
                 let end = ["diverged", "terminated", "truncated"].into_iter().find(|end| record[end] == true);
-                let steps = self.add(begun - 1, row, end);
-                ensure!(steps <= MOST_STEPS, "{}: the episode has more than {MOST_STEPS} steps", what());
+                self.add(begun - 1, row, end);
+                rows += 1;
+                ensure!(rows <= MOST_STEPS + MOST_EPISODES, "it has more than {MOST_STEPS} steps");
             }
         }
         Ok(begun.saturating_sub(MOST_EPISODES))
     }
 
-    /// Adds a row to an episode, and how the episode ended, if it did, by the name that a trace gives it. Returns the number of steps.
-    fn add(&mut self, episode: usize, mut row: Vec<f64>, end: Option<&'static str>) -> usize {
+    /// Adds a row to an episode, and how the episode ended, if it did, by the name that a trace gives it.
+    fn add(&mut self, episode: usize, mut row: Vec<f64>, end: Option<&'static str>) {
         let Recorded { rows, end: ended } = self.episodes.entry(episode).or_default();
         if let Some(before) = rows.last() {
             self.columns.go_on(&mut row, before);
+            if end == Some("diverged") {
+                self.columns.stay(&mut row, before);
+            }
         }
         // A trace gives no error of a reset; that of the first step is the same to a hundredth.
         let error = self.columns.error();
@@ -98,7 +97,6 @@ impl Replay {
         }
         rows.push(row);
         *ended = end;
-        rows.len() - 1
     }
 
     /// Returns the file.

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde_json::{Value, json};
 
-use crate::os::Take;
+use crate::os::OnPost;
 use crate::repose::Task;
 
 /// What a request is told that moves none of the actuators.
@@ -52,8 +52,8 @@ impl Sliders {
         }
     }
 
-    /// Returns what takes the requests of a page: `[[actuator, value], …]`.
-    pub(super) fn taker(&self) -> Take {
+    /// Returns what happens on a request of the page: `[[actuator, value], …]`.
+    pub(super) fn on_post(&self) -> OnPost {
         let own = self.clone();
         Box::new(move |body| {
             let moves: Vec<(usize, f64)> = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
@@ -105,7 +105,7 @@ mod tests {
         let config = Config::resolve(None, &[]).unwrap();
         let task = Task::new(&config.env, &config.hand).unwrap();
         let sliders = Sliders::new(&task);
-        let take = sliders.taker();
+        let post = sliders.on_post();
         let [low, high] = task.hand().actuators[3].range;
         let acted = || {
             let mut action = [0.25; 20];
@@ -114,13 +114,13 @@ mod tests {
         };
         assert!(acted() == [0.25; 20] && !sliders.take_moved());
         for bad in ["", "[]x", "[[20,0]]", "[[-1,0]]", "[[0,null]]", "[[0]]", "[[0,1e999]]", "{}", "[[3,0],[99,0]]"] {
-            assert!(take(bad.as_bytes()).is_err(), "{bad}");
+            assert!(post(bad.as_bytes()).is_err(), "{bad}");
         }
         assert!(acted() == [0.25; 20] && !sliders.take_moved(), "a request is taken whole or not at all");
-        take(format!("[[3,{}]]", low + 0.75 * (high - low)).as_bytes()).unwrap();
+        post(format!("[[3,{}]]", low + 0.75 * (high - low)).as_bytes()).unwrap();
         assert!(sliders.take_moved() && !sliders.take_moved());
         assert!((acted()[3] - 0.5).abs() < 1e-6 && acted()[4] == 0.25);
-        take(b"[[3,1e300]]").unwrap();
+        post(b"[[3,1e300]]").unwrap();
         assert_eq!(acted()[3], 1.0);
         assert_eq!(sliders.values()[3], high);
     }

@@ -80,8 +80,8 @@ pub struct DrawnCamera {
     fit: bool,
 }
 
-/// A mesh: corners, each with its normal, and triangles of corners.
-#[derive(Clone, Debug)]
+/// A mesh, or a part of one: corners, each with its normal, and triangles of corners.
+#[derive(Clone, Debug, Default)]
 pub struct DrawnMesh {
     /// Points and normals.
     pub corners: Vec<([f32; 3], [f32; 3])>,
@@ -109,6 +109,12 @@ impl Drawing {
     }
 }
 
+/// The most corners of a part of a mesh, which a page numbers in 16 bits.
+const MOST_CORNERS: usize = 65_535;
+
+/// The colour of a shape that has none.
+const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
+
 /// Near enough to the built-in hand for hand, cube and goal to fill the picture, and what the camera looks at.
 const NEAR: (Camera, [f64; 3]) = (Camera { azimuth: 142.0, elevation: -33.0, distance: 0.58 }, [0.315, 0.0, 0.362]);
 
@@ -122,23 +128,32 @@ impl Scene {
         let model = &*self.model;
         // Only the built-in hand is shown by meshes over its primitives.
         let dressed = is_builtin && model.ffi().nmesh > 0;
-        let (mut geoms, mut used, mut floor) = (Vec::new(), BTreeMap::new(), None);
+        let (mut geoms, mut meshes, mut parts, mut floor) = (Vec::new(), Vec::new(), BTreeMap::new(), None);
         for geom in 0..model.ngeom() as usize {
-            if is_floor(model, geom) {
+            if floor.is_none() && is_floor(model, geom) {
                 floor = Some(model.geom_pos()[geom][2]);
-            } else if let Some(drawn) = drawn_geom(model, geom, dressed, &mut used) {
-                geoms.push(drawn);
+                continue;
             }
+            let Some(drawn) = drawn_geom(model, geom, dressed) else { continue };
+            if drawn.r#type != "mesh" {
+                geoms.push(drawn);
+                continue;
+            }
+            // A mesh is drawn by as many shapes as it has parts.
+            let parts = parts.entry(model.geom_dataid()[geom]).or_insert_with(|| {
+                let first = meshes.len();
+                meshes.extend(drawn_mesh(model, model.geom_dataid()[geom] as usize));
+                first..meshes.len()
+            });
+            geoms.extend(parts.clone().map(|mesh| DrawnGeom { mesh: Some(mesh), ..drawn.clone() }));
         }
-        let mut meshes: Vec<_> = used.into_iter().collect();
-        meshes.sort_by_key(|(_, place)| *place);
         Drawing {
             bodies: (0..model.nbody() as usize).map(|body| drawn_body(model, body)).collect(),
             geoms,
             floor,
             camera: camera(model, is_builtin, from),
             start: start(model),
-            meshes: meshes.into_iter().map(|(mesh, _)| drawn_mesh(model, mesh)).collect(),
+            meshes,
         }
     }
 }
@@ -173,11 +188,12 @@ fn drawn_body(model: &MjModel, body: usize) -> DrawnBody {
 fn is_floor(model: &MjModel, geom: usize) -> bool {
     let [width, length, _] = model.geom_size()[geom];
     let level = model.geom_quat()[geom][0] > 0.9999 && model.geom_bodyid()[geom] == 0;
-    model.geom_type()[geom] == MjtGeomBase::mjGEOM_PLANE && level && width == 0.0 && length == 0.0
+    let endless = model.geom_type()[geom] == MjtGeomBase::mjGEOM_PLANE && width == 0.0 && length == 0.0;
+    endless && level && model.geom_group()[geom] < HIDDEN
 }
 
 /// Returns a shape, unless it is of a kind that a page does not draw, or hidden.
-fn drawn_geom(model: &MjModel, geom: usize, dressed: bool, used: &mut BTreeMap<usize, usize>) -> Option<DrawnGeom> {
+fn drawn_geom(model: &MjModel, geom: usize, dressed: bool) -> Option<DrawnGeom> {
     let kind = match model.geom_type()[geom] {
         MjtGeomBase::mjGEOM_PLANE => "plane",
         MjtGeomBase::mjGEOM_SPHERE => "sphere",
@@ -197,32 +213,37 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: bool, used: &mut BTreeMap<u
     }
     let material = usize::try_from(model.geom_matid()[geom]).ok();
     let shine = |of: &[f32]| material.map_or(0.5, |material| of[material]);
-    let mesh = (kind == "mesh").then(|| {
-        let next = used.len();
-        *used.entry(model.geom_dataid()[geom] as usize).or_insert(next)
-    });
+    // As MuJoCo draws it: a colour of the shape's own goes before the material's.
+    let own = model.geom_rgba()[geom];
+    let of_material = material.filter(|_| own == UNCOLOURED).map(|material| model.mat_rgba()[material]);
     Some(DrawnGeom {
         r#type: kind,
         body,
         size: model.geom_size()[geom],
         pos: model.geom_pos()[geom],
         quat: model.geom_quat()[geom],
-        rgba: material.map_or(model.geom_rgba()[geom], |material| model.mat_rgba()[material]),
+        rgba: of_material.unwrap_or(own),
         specular: shine(model.mat_specular()),
         shininess: shine(model.mat_shininess()),
-        mesh,
+        mesh: None,
         fine: dressed && kind == "mesh",
         plain,
     })
 }
 
-/// Returns a mesh with one corner for each pair of point and normal that a triangle uses, in the order of their first use.
-fn drawn_mesh(model: &MjModel, mesh: usize) -> DrawnMesh {
+/// Returns the parts of a mesh, with one corner for each pair of point and normal that a triangle uses, in the order of their first
+/// use.
+fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     let [first, points, normals] =
         [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
-    let (mut places, mut corners, mut triangles) = (BTreeMap::new(), Vec::new(), Vec::new());
+    let (mut places, mut parts) = (BTreeMap::new(), vec![DrawnMesh::default()]);
     for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
+        if parts.last().is_some_and(|part| part.corners.len() + 3 > MOST_CORNERS) {
+            parts.push(DrawnMesh::default());
+            places.clear();
+        }
+        let Some(DrawnMesh { corners, triangles }) = parts.last_mut() else { continue };
         triangles.push([0, 1, 2].map(|corner| {
             let point = model.mesh_vert()[(points + face[corner]) as usize];
             let normal = model.mesh_normal()[(normals + directions[corner]) as usize];
@@ -234,8 +255,10 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> DrawnMesh {
             })
         }));
     }
-    triangles.retain(|[a, b, c]| a != b && b != c && a != c);
-    DrawnMesh { corners, triangles }
+    for part in &mut parts {
+        part.triangles.retain(|[a, b, c]| a != b && b != c && a != c);
+    }
+    parts
 }
 
 fn camera(model: &MjModel, is_builtin: bool, from: Option<Camera>) -> DrawnCamera {

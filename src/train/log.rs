@@ -16,10 +16,10 @@ pub(super) struct Ended {
 }
 
 impl Ended {
-    /// Computes the scores of `episodes`, in a training with or without randomised ones.
-    pub(super) fn new(episodes: &[EpisodeStats], randomizes: bool) -> Self {
+    /// Computes the scores of `episodes` with control steps of `ctrl_dt` seconds, in a training with or without randomised ones.
+    pub(super) fn new(episodes: &[EpisodeStats], ctrl_dt: f64, randomizes: bool) -> Self {
         let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
-        Self { nominal: Score::of(&nominal), randomized: randomizes.then(|| Score::of(&drawn)) }
+        Self { nominal: Score::of(&nominal, ctrl_dt), randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)) }
     }
 
     /// Returns the score to show: that of the task as it is, where such episodes ended.
@@ -55,7 +55,7 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
 /// Returns the names of the values of any iteration, in a training with or without randomised episodes.
 pub(super) fn tags(randomizes: bool) -> Vec<String> {
     let traffic = Exchange::alone(1).take_traffic();
-    let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], randomizes));
+    let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], 0.0, randomizes));
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -135,13 +135,16 @@ mod tests {
             ..Default::default()
         };
         let other = EpisodeStats { randomized: true, ..episode(TaskReward::default(), 200, 8) };
-        let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], randomizes);
-        let evaluation = Score::of(&[episode(TaskReward::default(), 1000, 5), episode(reward, 50, 0)]);
+        let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], 0.01, randomizes);
+        let whole = EpisodeStats { turned: 16.8, ..episode(TaskReward::default(), 1000, 5) };
+        let evaluation = Score::of(&[whole, episode(TaskReward::default(), 200, 1), episode(reward, 50, 0)], 0.01);
         let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, episode/drop_rate 1, \
             episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
             reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, \
             training/drop 27, training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, \
-            training/drop_reward 0, training/randomized 0, eval/goals 2.5, eval/drop_rate 0.5, eval/rot_dist 1.5, eval/return 55, \
+            training/drop_reward 0, training/randomized 0, eval/goals 2, eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, eval/return 36.666666666666664, \
+            eval/success_rate 0.6666666666666666, eval/success_rate_5 0.3333333333333333, eval/seconds_per_goal 2.0833333333333335, \
+            eval/turned 1.344, \
             loss/policy 1, loss/value 2, policy/entropy 4, policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, \
             policy/std 10, policy/excess 3, value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, \
             time/collect_s 13, time/update_s 17, time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
@@ -162,7 +165,8 @@ mod tests {
         let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
         assert_eq!(row(true), expected);
         assert_eq!(tags(true), names(&expected));
-        let shown = [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, true).shown().goals);
+        let shown =
+            [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, 0.01, true).shown().goals);
         assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }
 }

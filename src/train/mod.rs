@@ -24,7 +24,7 @@ use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::Evaluation;
 use crate::ranks::{self, Exchange};
 use crate::repose::{Repose, Score, StepSums, divergence};
-use crate::run::{Media, Report};
+use crate::run::{Hparams, Media, Report};
 use crate::schedule::panic_message;
 #[cfg(feature = "video")]
 use films::film;
@@ -116,6 +116,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
             saver.save_or_warn(report);
         }
     }
+    report.end(true);
     saver.save_at_last(report)?;
     saver.held.folder.mark_finished(true);
     os::say(&format!("finished: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
@@ -190,8 +191,9 @@ impl Session {
 
     /// Plays the evaluation episodes, if that is due, and reports their score; returns `None` if a stop was requested meanwhile.
     fn evaluate(&self, requests: &Requests, mut lead: Option<&mut Lead>) -> Result<Option<Score>> {
+        let ctrl_dt = self.task.config().ctrl_dt;
         if !evaluates(self.agent.iteration, self.config.run.eval_every) {
-            return Ok(Some(Score::of(&[])));
+            return Ok(Some(Score::of(&[], ctrl_dt)));
         }
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
         let trial =
@@ -200,7 +202,7 @@ impl Session {
             lead.iter_mut().for_each(|lead| lead.save_if_asked(requests));
             Ok(())
         })?;
-        let Some(score) = played.map(|played| Score::of(&played)) else { return Ok(None) };
+        let Some(score) = played.map(|played| Score::of(&played, ctrl_dt)) else { return Ok(None) };
         if let Some(Lead { report, .. }) = lead {
             report.say(&format!(
                 "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
@@ -216,7 +218,7 @@ impl Session {
 
     fn report(&mut self, report: &mut Report, outcome: &Outcome) {
         let Outcome { iteration, steps, evaluation, media, .. } = outcome;
-        let ended = Ended::new(&outcome.ended, self.config.randomization.happens());
+        let ended = Ended::new(&outcome.ended, self.config.env.ctrl_dt, self.config.randomization.happens());
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
         let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
@@ -265,7 +267,10 @@ fn evaluates(iteration: u64, every: u64) -> bool {
 fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(session.config.randomization.happens());
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
-    Report::new(saver.held.folder.path(), &tags, progress).described(described(&tags), session.config.to_text())
+    let config = &session.config;
+    let settings = if config.run.all_hparams { config.dotted() } else { config.unlike_default() };
+    let hparams = Hparams { settings, goals: session.best.map(|best| best.goals) };
+    Report::new(saver.held.folder.path(), &tags, progress).described(described(&tags), config.to_text(), hparams)
 }
 
 /// Saves the state at the end of the last complete iteration after a request to stop, and returns the exit code.
@@ -283,6 +288,7 @@ fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, reason: &str) -> 
 
 /// Saves the state at the end of the last complete iteration after a failure, and returns the error.
 fn give_up(error: Error, mut saver: Saver, report: &mut Report) -> Error {
+    report.end(false);
     match saver.save_at_last(report) {
         Ok(()) if saver.held.wrote => os::say(&format!("saved the state after {}", saver.held.steps_made())),
         Ok(()) => os::say("the run folder was not changed"),

@@ -171,7 +171,7 @@ fn a_file_holds_what_the_trace_holds_and_the_page_makes_the_poses_of_mujoco_of_i
         succeeded(program(folder, &[&again[..], sets].concat()));
         let from_trace = File::read(&folder.join("y.html"));
         from_trace.expect_trace(&folder.join("t.jsonl"));
-        for key in ["seed", "settings", "dt", "hold", "tolerance", "terms"] {
+        for key in ["title", "seed", "settings", "dt", "hold", "tolerance", "terms"] {
             assert_eq!(from_trace.meta[key], file.meta[key], "{key}");
         }
         assert_eq!(from_trace.scene, file.scene);
@@ -228,16 +228,21 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
     };
     let other = lines[2].replacen("\"qpos\":[", "\"qpos\":[0.5,", 1);
     let large = lines[2].replacen("\"qpos\":[", "\"qpos\":[1e300],\"old\":[", 1);
+    let steps = lines[2].replacen("\"step\":1", "\"step\":40000", 1);
+    let older = lines[0].replacen("\"settings\"", "\"others\"", 1);
     for (text, sets, part) in [
         (String::new(), &[][..], "header of a trace"),
         ("{\"a\":1}\n".to_owned(), &[], "header of a trace"),
         (lines[0].to_owned(), &[], "it has no records"),
-        (changed(&[(2, "")]), &[], "line 2"),
+        (changed(&[(2, "")]), &[], "line 3: it is not the first record of an episode"),
         (changed(&[(2, lines[2])]), &[], "line 2: it is not the first record of an episode"),
         (changed(&[(3, &other)]), &[], "line 3: `qpos` is not a list of 31 numbers"),
         (changed(&[(3, &large)]), &[], "line 3: `qpos`"),
+        (changed(&[(3, &steps)]), &[], "line 3: `step` is not a count up to 32767"),
+        (changed(&[(1, &older)]), &[], "an older version wrote it"),
+        (text.clone(), &["--set", "env.ctrl_dt=0.02"], "a trace has its own settings"),
         (fs::read_to_string(folder.join("own.jsonl")).unwrap(), &[], "add --set env.model=joints.xml"),
-        (text.clone(), &["--set", "env.model=joints.xml"], "line 2: `qpos`"),
+        (text.clone(), &["--set", "env.model=joints.xml"], "it is of another hand, with other joints"),
     ] {
         fs::write(folder.join("bad.jsonl"), text).unwrap();
         let output = program(folder, &[&["play", "--html", "x.html", "--from-trace", "bad.jsonl"], sets].concat());
@@ -474,7 +479,7 @@ fn a_server_answers_what_is_no_request_of_its_page_and_serves_others_meanwhile()
     let live = Live::start(folder.path(), &["play", "--policy", "zero", "--web", "0", "--plain"]);
     let port = live.port;
     let taken = program(folder.path(), &["play", "--policy", "zero", "--web", &port.to_string()]);
-    assert!(taken.status.code() == Some(1) && stderr(&taken).contains("name another one"), "{}", stderr(&taken));
+    assert!(taken.status.code() == Some(1) && stderr(&taken).contains("choose another one"), "{}", stderr(&taken));
     // Half a request, and one that never reads.
     let half: Vec<TcpStream> = (0..3)
         .map(|_| {
@@ -549,4 +554,31 @@ fn a_training_is_followed_by_its_newest_policy_and_is_not_changed() {
     }
     let alone = program(folder, &["play", "--ckpt", "builtin", "--web", "0", "--follow"]);
     assert!(alone.status.code() == Some(1) && stderr(&alone).contains("--follow needs a run"), "{}", stderr(&alone));
+}
+
+#[test]
+fn options_of_a_page_that_do_not_go_together_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for (args, part) in [
+        (&["play", "--html", "x.html", "--episodes", "21"][..], "--html shows at most 20 episodes"),
+        (
+            &["play", "--html", "x.html", "--episodes", "20", "--set", "env.max_episode_seconds=100"],
+            "at most 60000 steps",
+        ),
+        (&["play", "--html", "x.html", "--set", "env.max_episode_seconds=1000"], "episodes of at most 32767 steps"),
+        (&["play", "--html", "x.html", "--hands", "4"], "--hands applies only with --web"),
+        (&["play", "--html", "x.html", "--follow"], "--follow applies only with --web"),
+        (&["play", "--html", "x.html", "--quality", "high"], "--quality applies only to a film"),
+        (&["play", "--web", "--fps", "20"], "--fps applies only with --video"),
+        (&["play", "--web", "--json"], "cannot be used with"),
+        (&["play", "--from-trace", "t.jsonl"], "--html"),
+        (&["play", "--from-trace", "t.jsonl", "--html", "x.html", "--seed", "3"], "cannot be used with"),
+        (&["view", "--web", "--at", "3"], "--at applies only to a picture"),
+        (&["view", "--web", "--screenshot", "x.png"], "cannot be used with"),
+    ] {
+        let output = program(folder.path(), args);
+        let said = stderr(&output);
+        assert!(output.status.code() != Some(0) && said.contains(part), "{args:?}: {part:?} is not in\n{said}");
+        assert!(names(folder.path()).is_empty());
+    }
 }

@@ -162,11 +162,8 @@ fn a_file_stop_that_was_there_before_or_is_not_empty_is_the_users() {
         let output = succeeded(program(folder.path(), &args));
         assert!(stderr(&output).contains("finished: 3 iterations"), "{}", stderr(&output));
         assert_eq!(fs::read_to_string(run.join("stop")).unwrap(), content);
-        names(&run)
-            .iter()
-            .filter(|name| *name != "checkpoints")
-            .for_each(|name| fs::remove_file(run.join(name)).unwrap());
-        fs::remove_dir_all(run.join("checkpoints")).unwrap();
+        fs::remove_dir_all(&run).unwrap();
+        fs::create_dir(&run).unwrap();
     }
     let (mut child, lines) = endless(folder.path(), &[]);
     fs::write(run.join("stop"), "").unwrap();
@@ -300,4 +297,23 @@ fn a_link_that_takes_the_place_of_the_checkpoints_is_not_followed() {
     let (code, said) = ended_by("TERM", child, lines);
     assert!(said.contains("links in a run folder are not followed") && said.contains("is in "), "{said}");
     assert_eq!((code, names(&folder.path().join("victim")).len()), (Some(1), 0));
+}
+
+#[test]
+fn a_run_is_a_row_for_hparams_with_its_best_goals_and_ends_when_all_steps_are_made() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let tags = || -> Vec<String> {
+        let events = crate::support::events(&folder.join("run/hparams"));
+        let values = events.iter().flat_map(|event| event.get_summary().get_value().iter());
+        values.map(|value| value.get_tag().to_owned()).collect()
+    };
+    let metrics = ["best_goals", "drop_rate", "steps_per_s"].map(str::to_owned);
+    let [start, end] = ["start", "end"].map(|part| vec![format!("_hparams_/session_{part}_info")]);
+    succeeded(program(folder, &train(&["--total-steps", "256", "--run-dir", "run"])));
+    assert_eq!(tags(), [&start[..], &metrics, &metrics, &end].concat());
+    // A resumed run is one row, and goes on until it ends again.
+    succeeded(program(folder, &["train", "--resume", "run", "--total-steps", "384"]));
+    assert_eq!(tags(), [&start[..], &metrics, &end].concat());
+    assert_eq!(names(&folder.join("run/hparams")).len(), 1);
 }

@@ -1,0 +1,180 @@
+//! A run as a row of TensorBoard's HPARAMS: some settings, and a few figures as metrics.
+//!
+//! The row has a folder of its own, `hparams` in that of the run, because TensorBoard takes all scalars beside it for its metrics.
+//! No experiment is written, which would name the columns of all rows: no run knows the others, and TensorBoard finds them by itself.
+//! The messages are those of TensorBoard's `plugins/hparams/plugin_data.proto`, which tensorboard-proto does not know.
+
+use std::fs;
+use std::path::Path;
+
+use anyhow::Result;
+use protobuf::{CodedOutputStream, ProtobufResult};
+use tensorboard_proto::summary::{Summary_Value, Summary_Value_oneof_value as Content};
+use tensorboard_proto::tensor::TensorProto;
+use tensorboard_proto::types::DataType;
+use toml::{Table, Value};
+
+use super::events::{EventFile, event_files, now};
+use super::summary::{Descriptions, with_metadata};
+use crate::os::Cannot;
+
+/// The name of the folder.
+pub(super) const HPARAMS: &str = "hparams";
+
+/// The class of data of a tensor (`DataClass` in TensorBoard's summary.proto).
+const TENSOR: u32 = 2;
+
+/// What is known of a run before it goes on.
+#[derive(Clone, Debug, Default)]
+pub struct Hparams {
+    /// The settings to show, by dotted key.
+    pub settings: Table,
+    /// The goals of its best evaluation, if there was one.
+    pub goals: Option<f64>,
+}
+
+/// Begins the row of the run in `folder` anew, at this step.
+///
+/// # Errors
+/// Fails if its file cannot be written.
+pub(super) fn begin(folder: &Path, step: u64, hparams: &Hparams) -> Result<EventFile> {
+    let folder = folder.join(HPARAMS);
+    if !folder.exists() {
+        fs::create_dir(&folder).cannot("create", &folder)?;
+    }
+    // TensorBoard keeps the first row of a folder that it reads.
+    for (_, old) in event_files(&folder)? {
+        fs::remove_file(&old).cannot("remove", &old)?;
+    }
+    let events = EventFile::open(&folder, step, &Descriptions::new())?;
+    events.values(vec![session_value("session_start_info", 3, &start_info(&hparams.settings)?)?], step)?;
+    Ok(events)
+}
+
+/// The end of the row: whether the training has made all its steps, or failed.
+pub(super) fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
+    let status = if succeeded { 1 } else { 2 };
+    let info = message(|out| {
+        out.write_enum(1, status)?;
+        out.write_double(2, now())
+    })?;
+    Ok(vec![session_value("session_end_info", 4, &info)?])
+}
+
+/// Returns the metrics after an evaluation.
+pub(super) fn metrics(best: f64, drop_rate: f64, steps_per_s: f64) -> [(&'static str, f64); 3] {
+    [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", steps_per_s)]
+}
+
+/// Returns the message `SessionStartInfo`.
+fn start_info(settings: &Table) -> Result<Vec<u8>> {
+    let entries: Result<Vec<_>> = settings.iter().map(|(key, value)| entry(key, value)).collect();
+    let entries = entries?;
+    message(|out| {
+        entries.iter().try_for_each(|entry| out.write_bytes(1, entry))?;
+        out.write_double(5, now())
+    })
+}
+
+/// Returns an entry of the map of settings: a key, and a `google.protobuf.Value`.
+fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
+    // A ramp that stays where it is.
+    let constant = value.get("from").filter(|from| value.get("to") == Some(from));
+    let value = message(|out| match constant.unwrap_or(value) {
+        Value::Integer(x) => out.write_double(2, *x as f64),
+        Value::Float(x) => out.write_double(2, *x),
+        Value::Boolean(x) => out.write_bool(4, *x),
+        Value::String(text) => out.write_string(3, text),
+        other => out.write_string(3, &other.to_string()),
+    })?;
+    message(|out| {
+        out.write_string(1, key)?;
+        out.write_bytes(2, &value)
+    })
+}
+
+/// Returns the value that holds a message of the plugin, which is this field of `HParamsPluginData`.
+fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
+    let content = message(|out| out.write_bytes(field, info))?;
+    // The value itself is empty: a list of no numbers.
+    let mut nothing = TensorProto { dtype: DataType::DT_FLOAT, ..TensorProto::default() };
+    nothing.mut_tensor_shape().mut_dim().push_default();
+    let mut value = with_metadata(&format!("_hparams_/{name}"), Content::tensor(nothing), HPARAMS, TENSOR);
+    value.mut_metadata().mut_plugin_data().set_content(content);
+    Ok(value)
+}
+
+fn message(write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let mut out = CodedOutputStream::vec(&mut bytes);
+    write(&mut out)?;
+    out.flush()?;
+    drop(out);
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use protobuf::CodedInputStream;
+    use protobuf::wire_format::WireType;
+
+    use super::*;
+
+    /// Returns the fields of a message: their numbers, and their bytes, or the bytes of a double.
+    fn fields(bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
+        let (mut stream, mut found) = (CodedInputStream::from_bytes(bytes), Vec::new());
+        while !stream.eof().unwrap() {
+            let (field, kind) = stream.read_tag_unpack().unwrap();
+            found.push(match kind {
+                WireType::WireTypeFixed64 => (field, stream.read_double().unwrap().to_le_bytes().to_vec()),
+                WireType::WireTypeVarint => (field, vec![stream.read_uint64().unwrap() as u8]),
+                _ => (field, stream.read_bytes().unwrap()),
+            });
+        }
+        found
+    }
+
+    fn content(value: &Summary_Value) -> (u32, Vec<u8>) {
+        assert_eq!(value.get_metadata().get_plugin_data().get_plugin_name(), "hparams");
+        let mut fields = fields(value.get_metadata().get_plugin_data().get_content());
+        assert_eq!(fields.len(), 1);
+        fields.remove(0)
+    }
+
+    #[test]
+    fn the_start_of_a_row_holds_each_setting_as_a_number_a_truth_or_a_text() {
+        let settings: Table = toml::from_str(
+            "a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 8.0, to = 8.0, steps = 0}\ng = {from = 1, to = 2, steps = 3}",
+        )
+        .unwrap();
+        let value = session_value("session_start_info", 3, &start_info(&settings).unwrap()).unwrap();
+        let (field, info) = content(&value);
+        assert_eq!((value.get_tag(), field), ("_hparams_/session_start_info", 3));
+        let entries = fields(&info).into_iter().filter(|(field, _)| *field == 1);
+        let entries: Vec<_> = entries
+            .map(|(_, entry)| {
+                let [(1, key), (2, value)] = &fields(&entry)[..] else { panic!("{entry:?}") };
+                let (kind, value) = fields(value).remove(0);
+                let shown = match kind {
+                    2 => f64::from_le_bytes(value.try_into().unwrap()).to_string(),
+                    3 => String::from_utf8(value).unwrap(),
+                    4 => format!("{}", value[0] != 0),
+                    other => panic!("kind {other}"),
+                };
+                format!("{} {shown}", String::from_utf8(key.clone()).unwrap())
+            })
+            .collect();
+        let expected = "a 3; b 0.5; c true; d tanh; e [1, 2]; f 8; g { from = 1, to = 2, steps = 3 }";
+        assert_eq!(entries.join("; "), expected);
+    }
+
+    #[test]
+    fn the_end_of_a_row_says_whether_the_run_has_made_its_steps() {
+        for (succeeded, status) in [(true, 1), (false, 2)] {
+            let values = end(succeeded).unwrap();
+            let (field, info) = content(&values[0]);
+            assert_eq!((values[0].get_tag(), field), ("_hparams_/session_end_info", 4));
+            assert_eq!(fields(&info)[0], (1, vec![status]));
+        }
+    }
+}
