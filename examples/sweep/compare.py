@@ -35,10 +35,10 @@ class Log:
         """Returns the mean over the `window` steps up to `at`, or the latest evaluation; NaN if the run is not that far yet."""
         if self.steps[-1] < at:
             return math.nan
-        column = "training/turned" if metric == "turned" else metric
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
         rows = zip(self.steps[:end], self.rows)
-        known = [(steps, float(row[column])) for steps, row in rows if row.get(column) not in ("", "NaN", None)]
+        cells = [(steps, row.get(column(metric))) for steps, row in rows]
+        known = [(steps, float(cell)) for steps, cell in cells if cell not in ("", "NaN", None)]
         if metric.startswith("eval/"):
             return known[-1][1] if known else math.nan
         found = [value for steps, value in known if steps > self.steps[end - 1] - window]
@@ -49,6 +49,10 @@ class Log:
 
     def steps_after(self, seconds):
         return next((made for made, spent in zip(self.steps, self.seconds) if spent >= seconds), math.inf)
+
+
+def column(metric):
+    return "training/turned" if metric == "turned" else metric
 
 
 def fails(rule, pairs, window):

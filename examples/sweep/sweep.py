@@ -40,8 +40,10 @@ class Sweep:
         self.given = read(file)
         self.__dict__.update(dict.fromkeys(OTHERS) | DEFAULTS | self.given)
         # `fork` is relative to the folder of the runs, `config` to the file.
-        self.fork = self.fork and str(folder / self.fork)
+        self.fork = self.fork and os.path.normpath(folder / self.fork)
         self.config = self.config and str(file.resolve().parent / self.config)
+        if self.config and not pathlib.Path(self.config).is_file():
+            sys.exit(f"{self.config}: there is no such file")
         self.expect_rules()
         self.runs, self.threads = share(len(self.seeds) * (1 + len(self.variants)), runs or self.runs, threads or self.threads)
         # The steps at which trainings pause, to apply stop rules or to copy their checkpoint.
@@ -81,6 +83,13 @@ class Sweep:
 
     def logs(self, name):
         return {run.seed: compare.Log(run.path) for run in self.runs_of[name] if run.has_metrics()}
+
+    def expect_columns(self, run):
+        """Exits unless a run that has begun logs the metrics of all stop rules."""
+        header = (run.path / "metrics.csv").read_text().partition("\n")[0].split(",")
+        for rule in self.stop:
+            if compare.column(rule["metric"]) not in header:
+                sys.exit(f"{self.file}: metrics.csv has no column {rule['metric']}; it has {', '.join(header)}")
 
     def begin(self):
         """Prepares the folder, and exits if it is in use. Returns what keeps others from using it."""
@@ -310,6 +319,7 @@ def work(sweep, at_work):
                 run.failed = f"exit code {child.returncode}, {run.beside('log')} ends with:\n{run.last_words()}"
                 say(f"{run.name()} failed, {run.failed}")
             elif run.has_metrics():
+                sweep.expect_columns(run)
                 run.keep_copy()
                 say(f"{run.name()}: {run.position():,} of {run.end:,} steps")
         ready = []
@@ -367,7 +377,7 @@ def main():
     if args.publish:
         compare.publish(sweep, args.publish)
     elif runs:
-        compare.draw(sweep.drawer(), runs, sweep.folder / "picture.svg")
+        compare.draw(sweep.program, runs, sweep.folder / "picture.svg")
     return 0 if whole else 1
 
 
