@@ -108,7 +108,8 @@ class Sweep:
             program.copy(self.program, copy_in(self.folder))
             self.program = copy_in(self.folder)
         threads = f"{self.threads} threads" if self.threads > 1 else "one thread"
-        plan = f"{len(self.all_runs())} trainings, {self.runs} at a time, {threads} each"
+        trainings = f"{len(self.all_runs())} trainings" if len(self.all_runs()) > 1 else "one training"
+        plan = f"{trainings}, {self.runs} at a time, {threads} each"
         (self.folder / "machine.txt").write_text(f"{compare.processor()}, {plan}\n")
         say(plan)
         return lock
