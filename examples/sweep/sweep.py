@@ -1,6 +1,6 @@
 """Trains a base and variants of it under several seeds and compares them: python3 sweep.py FILE.toml DIR
 
-FILE.toml says what to train (sweep.toml in this folder has every key); DIR holds the runs, the tables' picture and a copy of the
+FILE.toml says what to train (sweep.toml in this folder has every key); DIR holds the runs, their picture and a copy of the
 program. After Ctrl-C, a kill or a failure the same command resumes. Needs Linux, Python 3.11 and the program.
 """
 import argparse
@@ -35,10 +35,8 @@ class Sweep:
     """The trainings that a file defines, with their runs in a folder."""
 
     def __init__(self, file, folder, binary, runs, threads):
-        self.file, self.folder = file, folder
-        self.program = binary
-        self.given = read(file)
-        self.__dict__.update(dict.fromkeys(OTHERS) | DEFAULTS | self.given)
+        self.file, self.folder, self.program = file, folder, binary
+        self.__dict__.update(dict.fromkeys(OTHERS) | DEFAULTS | read(file))
         # `fork` is relative to the folder of the runs, `config` to the file.
         self.fork = self.fork and os.path.normpath(folder / self.fork)
         self.config = self.config and str(file.resolve().parent / self.config)
