@@ -110,6 +110,8 @@ fn every_setting_and_option_that_the_documents_name_exists() {
     for command in shadow_repose::cli::command().get_subcommands_mut() {
         help += &command.render_long_help().to_string();
     }
+    // The documents name options of this script beside those of the program.
+    help += include_str!("../../examples/sweep/sweep.py");
     for path in documents().into_iter().filter(|path| !path.ends_with("CHANGELOG.md")) {
         let text = fs::read_to_string(&path).unwrap();
         for word in text.split(|c: char| c.is_whitespace() || "`(),:;|\"'".contains(c)) {

@@ -10,7 +10,6 @@ mod bad_input;
 mod binary;
 mod curves;
 mod docs;
-mod experiment;
 mod export;
 #[cfg(feature = "video")]
 mod fetching;
@@ -34,6 +33,7 @@ mod run_folder;
 mod scene;
 mod support;
 mod survival;
+mod sweep;
 mod task;
 mod training;
 #[cfg(feature = "viewer")]

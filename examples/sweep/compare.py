@@ -1,4 +1,4 @@
-"""Compares the runs of an experiment seed by seed: turning, goals and drops, at equal steps and at equal time."""
+"""Compares the runs of a sweep seed by seed: turning, goals and drops, at equal steps and at equal time."""
 import csv
 import datetime
 import math
@@ -17,7 +17,7 @@ TIMED = 50
 
 
 class Log:
-    """The metrics of a run."""
+    """The metrics of a run that has made an iteration."""
 
     def __init__(self, path):
         with (path / "metrics.csv").open(newline="") as file:
@@ -33,12 +33,12 @@ class Log:
 
     def value(self, metric, at, window):
         """Returns the mean over the `window` steps up to `at`, or the latest evaluation; NaN if the run is not that far yet."""
-        if not self.steps or self.steps[-1] < at:
+        if self.steps[-1] < at:
             return math.nan
-        column = "training/turned" if metric == "turned" else metric
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
         rows = zip(self.steps[:end], self.rows)
-        known = [(steps, float(row[column])) for steps, row in rows if row.get(column) not in ("", "NaN", None)]
+        cells = [(steps, row.get(column(metric))) for steps, row in rows]
+        known = [(steps, float(cell)) for steps, cell in cells if cell not in ("", "NaN", None)]
         if metric.startswith("eval/"):
             return known[-1][1] if known else math.nan
         found = [value for steps, value in known if steps > self.steps[end - 1] - window]
@@ -51,12 +51,18 @@ class Log:
         return next((made for made, spent in zip(self.steps, self.seconds) if spent >= seconds), math.inf)
 
 
-def fails(rule, base, variant, window):
-    """Returns why a rule stops a variant, or None: its metric is below (or above) that fraction of the base's in all seeds."""
-    shared = sorted(set(base) & set(variant))
-    pairs = [[log.value(rule["metric"], rule["at"], window) for log in (base[seed], variant[seed])] for seed in shared]
+def column(metric):
+    return "training/turned" if metric == "turned" else metric
+
+
+def fails(rule, pairs, window):
+    """Returns why a rule stops a variant, or None: its metric is below (or above) that fraction of the base's in all seeds.
+
+    `pairs` holds the logs of the base and of the variant for each seed.
+    """
+    values = [[log.value(rule["metric"], rule["at"], window) for log in pair] for pair in pairs]
     # There is no ratio to a value that is not above zero.
-    ratios = [ours / theirs if theirs > 0 else math.nan for theirs, ours in pairs]
+    ratios = [ours / theirs if theirs > 0 else math.nan for theirs, ours in values]
     if not ratios:
         return None
     below = "below" in rule and all(ratio < rule["below"] for ratio in ratios)
@@ -64,11 +70,12 @@ def fails(rule, base, variant, window):
     if not (below or above):
         return None
     found = ", ".join(f"{ratio:.2f}" for ratio in ratios)
-    return f"{rule['metric']} at {rule['at']:,} steps is {found} of the base's, {'below' if below else 'above'} in all seeds"
+    limit = f"below {rule['below']}" if below else f"above {rule['above']}"
+    return f"{rule['metric']} at {rule['at']:,} steps is {found} of the base's, {limit} in all seeds"
 
 
-def spread(values):
-    return statistics.stdev(values) if len(values) > 1 else math.nan
+def spread(values, digits):
+    return f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
 
 
 def cell(pairs, digits, is_base):
@@ -78,67 +85,75 @@ def cell(pairs, digits, is_base):
         return "-"
     mean = f"{statistics.fmean(ours for _, ours in pairs):.{digits}f}"
     if is_base:
-        return f"{mean} ± {spread([ours for _, ours in pairs]):.{digits}f}"
+        return mean + spread([ours for _, ours in pairs], digits)
     apart = [ours - theirs for theirs, ours in pairs]
     up = sum(difference > 0 for difference in apart)
-    return f"{mean} ({statistics.fmean(apart):+.{digits}f} ± {spread(apart):.{digits}f}, up in {up} of {len(apart)})"
+    return f"{mean} ({statistics.fmean(apart):+.{digits}f}{spread(apart, digits)}, up in {up} of {len(apart)})"
 
 
-def tables(experiment):
+def tables(sweep):
     """Returns Markdown: for each milestone that the base has reached, one table at equal steps and one at equal time."""
-    logs = {name: experiment.logs(name) for name in experiment.runs_of}
+    logs = {name: sweep.logs(name) for name in sweep.runs_of}
     text = ""
-    for at in experiment.milestones:
-        base = {seed: log for seed, log in logs["base"].items() if log.steps and log.steps[-1] >= at}
+    for at in milestones(sweep, logs):
+        base = {seed: log for seed, log in logs["base"].items() if log.steps[-1] >= at}
         if not base:
             continue
-        hours = statistics.fmean(log.seconds_at(at) for log in base.values()) / 3600
+        minutes = statistics.fmean(log.seconds_at(at) for log in base.values()) / 60
         equal = [(f"at {at:,} steps", lambda log, seed: at)]
         if len(logs) > 1:
             time = lambda log, seed: log.steps_after(base[seed].seconds_at(at))
-            equal.append((f"after the time that the base with the same seed took for them, {hours:.2f} hours on average", time))
+            equal.append((f"after the time that the base with the same seed took for them, {minutes:,.1f} minutes on average", time))
         for title, where in equal:
             text += f"\n{title}:\n\n| | {' | '.join(METRICS)} | steps |\n|---|{'---|' * (len(METRICS) + 1)}\n"
             for name, of in logs.items():
                 shared = {seed: where(of[seed], seed) for seed in base if seed in of}
                 cells = []
                 for metric, digits in METRICS.items():
-                    value = lambda log, steps: log.value(metric, steps, experiment.window)
+                    value = lambda log, steps: log.value(metric, steps, sweep.window)
                     pairs = [(value(base[seed], at), value(of[seed], steps)) for seed, steps in shared.items()]
                     cells.append(cell(pairs, digits, name == "base"))
-                made = [steps for seed, steps in shared.items() if of[seed].steps and steps <= of[seed].steps[-1]]
-                steps = f"{statistics.fmean(made) / 1e6:.2f} M" if made else "-"
+                made = [steps for seed, steps in shared.items() if steps <= of[seed].steps[-1]]
+                steps = f"{statistics.fmean(made):,.0f}" if made else "-"
                 text += f"| {name} | {' | '.join(cells)} | {steps} |\n"
-    for name, runs in experiment.runs_of.items():
-        verdict = experiment.verdict(name, max(run.position() for run in runs))
+    for name, runs in sweep.runs_of.items():
+        verdict = sweep.verdict(name, max(run.position() for run in runs))
         text += f"\n{name} is stopped: {verdict}\n" if verdict not in (None, "waits") else ""
     note = "turned: rad per hundred training steps, mean over the last {:,} steps; eval: the latest evaluation until then.\n" \
            "Means over the seeds; for the base ± standard deviation; for a variant, in parentheses, the mean difference\n" \
            "from the base with the same seed ± its standard deviation."
-    return note.format(experiment.window) + "\n" + text if text else "the base has not reached the first milestone yet"
+    return note.format(sweep.window) + "\n" + text if text else "the base has not made an iteration yet"
 
 
-def draw(program, runs, picture, smooth):
+def milestones(sweep, logs):
+    """Returns the steps to compare at: before the base has reached any milestone, those that all have made which have begun."""
+    made = {name: [log.steps[-1] for log in of.values()] for name, of in logs.items()}
+    if made["base"] and max(made["base"]) < sweep.milestones[0]:
+        return [min(steps for of in made.values() for steps in of)]
+    return sweep.milestones
+
+
+def draw(program, runs, picture, more=()):
     metrics = [word for column in ("training/turned", "eval/goals", "eval/drop_rate") for word in ("--metric", column)]
-    subprocess.run([program, "plot", *runs, "--out", picture, "--smooth", str(smooth), *metrics], check=False)
+    subprocess.run([program, "plot", *runs, "--out", picture, *metrics, *more], check=False)
 
 
-def publish(experiment, folder):
+def publish(sweep, folder):
     """Writes the thinned metrics of all runs, the settings, the comparison tables and their picture."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    for run in experiment.all_runs():
-        if (run.path / "metrics.csv").exists():
+    for run in sweep.all_runs():
+        if run.has_metrics():
             found.append(folder / f"{run.variant}-{run.seed}")
             subprocess.run([sys.executable, THIN, run.path, found[-1] / "metrics.csv"], check=True)
-    shutil.copyfile(experiment.file, folder / "experiment.toml")
-    if experiment.config:
-        shutil.copyfile(experiment.config, folder / pathlib.Path(experiment.config).name)
-    draw(experiment.drawer(), found, folder / "picture.svg", smooth=1)
-    version = (experiment.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
-    machine = f"{datetime.date.today()}, {processor()}, {experiment.runs} runs at a time, threads per run: {experiment.threads}"
+    shutil.copyfile(sweep.file, folder / "sweep.toml")
+    if sweep.config:
+        shutil.copyfile(sweep.config, folder / pathlib.Path(sweep.config).name)
+    draw(sweep.program, found, folder / "picture.svg", ["--smooth", "1"])
+    version = (sweep.runs_of["base"][0].path / "version.txt").read_text().replace("\n", ", ").strip(", ")
+    machine = f"{datetime.date.today()}, {(sweep.folder / 'machine.txt').read_text().strip()}"
     facts = f"{machine}.\nProgram: {version}."
-    (folder / "README.md").write_text(f"# {folder.name}\n\n{facts}\n\n{tables(experiment)}\n![curves](picture.svg)\n")
+    (folder / "README.md").write_text(f"# {folder.name}\n\n{facts}\n\n{tables(sweep)}\n![curves](picture.svg)\n")
 
 
 def processor():

@@ -1,0 +1,384 @@
+"""Trains a base and variants of it under several seeds and compares them: python3 sweep.py FILE.toml DIR
+
+FILE.toml says what to train (sweep.toml in this folder has every key); DIR holds the runs, their picture and a copy of the
+program. After Ctrl-C, a kill or a failure the same command resumes. Needs Linux, Python 3.11 and the program.
+"""
+import argparse
+import contextlib
+import ctypes
+import datetime
+import fcntl
+import json
+import os
+import pathlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+if sys.version_info < (3, 11):
+    sys.exit("sweep.py needs Python 3.11 or newer")
+import tomllib
+
+sys.dont_write_bytecode = True
+import compare
+import program
+
+# The keys of the file, with their defaults; of those without a default, with their type.
+DEFAULTS = {"seeds": [0, 1], "set": [], "variants": {}, "stop": [], "keep": [], "table": [], "window": 1_000_000}
+OTHERS = {"steps": int, "config": str, "fork": str, "runs": int, "threads": int}
+
+
+class Sweep:
+    """The trainings that a file defines, with their runs in a folder."""
+
+    def __init__(self, file, folder, binary, runs, threads):
+        self.file, self.folder, self.program = file, folder, binary
+        self.__dict__.update(dict.fromkeys(OTHERS) | DEFAULTS | read(file))
+        # `fork` is relative to the folder of the runs, `config` to the file.
+        self.fork = self.fork and os.path.normpath(folder / self.fork)
+        self.config = self.config and str(file.resolve().parent / self.config)
+        if self.config and not pathlib.Path(self.config).is_file():
+            sys.exit(f"{self.config}: there is no such file")
+        self.expect_rules()
+        self.runs, self.threads = share(len(self.seeds) * (1 + len(self.variants)), runs or self.runs, threads or self.threads)
+        # The steps at which trainings pause, to apply stop rules or to copy their checkpoint.
+        self.pauses = {rule["at"] for rule in self.stop} | set(self.keep)
+        self.runs_of = {name: [Run(self, name, seed) for seed in self.seeds] for name in ["base", *self.variants]}
+        self.milestones = sorted(at for at in self.pauses | set(self.table) | {self.steps} if at <= self.steps)
+        self.verdicts = {}
+
+    def expect_rules(self):
+        """Exits unless there are the checkpoints to fork, and each stop rule is for steps that the base makes."""
+        forks = [pathlib.Path(self.fork.format(seed=seed)) for seed in self.seeds] if self.fork else []
+        if missing := [fork for fork in forks if not fork.is_file()]:
+            sys.exit(f"{missing[0]}: there is no such checkpoint")
+        begun = max(map(steps_of, forks), default=0)
+        for rule in self.stop:
+            if not begun < rule["at"] <= self.steps:
+                sys.exit(f"{self.file}: the base makes the steps from {begun:,} to {self.steps:,}, and this rule is for others: {rule}")
+
+    def all_runs(self):
+        return [run for runs in self.runs_of.values() for run in runs]
+
+    def verdict(self, name, position):
+        """Returns None if a variant may continue from here, why it is stopped, or "waits" while runs to compare are missing."""
+        for rule in sorted(self.stop, key=lambda rule: rule["at"]):
+            if name == "base" or rule["at"] > position:
+                continue
+            key = name, json.dumps(rule)
+            if key not in self.verdicts:
+                pairs = [pair for pair in zip(self.runs_of["base"], self.runs_of[name]) if not any(run.failed for run in pair)]
+                if any(run.position() < rule["at"] for pair in pairs for run in pair):
+                    return "waits"
+                logs = [[compare.Log(run.path) for run in pair] for pair in pairs]
+                self.verdicts[key] = compare.fails(rule, logs, self.window)
+            if self.verdicts[key]:
+                return self.verdicts[key]
+        return None
+
+    def logs(self, name):
+        return {run.seed: compare.Log(run.path) for run in self.runs_of[name] if run.has_metrics()}
+
+    def expect_columns(self, run):
+        """Exits unless a run that has begun logs the metrics of all stop rules."""
+        header = (run.path / "metrics.csv").read_text().partition("\n")[0].split(",")
+        for rule in self.stop:
+            if compare.column(rule["metric"]) not in header:
+                sys.exit(f"{self.file}: metrics.csv has no column {rule['metric']}; it has {', '.join(header)}")
+
+    def begin(self):
+        """Prepares the folder, and exits if it is in use. Returns what keeps others from using it."""
+        for run in self.all_runs():
+            run.expect_settings()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = (self.folder / "lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            sys.exit(f"{self.folder}: another sweep.py is at work here")
+        except OSError:
+            # This file system has no locks. A training refuses a folder that is in use all the same.
+            pass
+        if self.program != copy_in(self.folder):
+            program.copy(self.program, copy_in(self.folder))
+            self.program = copy_in(self.folder)
+        threads = f"{self.threads} threads" if self.threads > 1 else "one thread"
+        trainings = f"{len(self.all_runs())} trainings" if len(self.all_runs()) > 1 else "one training"
+        plan = f"{trainings}, {self.runs} at a time, {threads} each"
+        (self.folder / "machine.txt").write_text(f"{compare.processor()}, {plan}\n")
+        say(plan)
+        return lock
+
+
+class Run:
+    """One training: a variant with one seed."""
+
+    def __init__(self, sweep, variant, seed):
+        self.sweep, self.variant, self.seed = sweep, variant, seed
+        # The legend of the picture shows this name.
+        self.path = sweep.folder / f"{variant}-{seed}"
+        own = sweep.variants.get(variant, {})
+        self.set = sweep.set + own.get("set", [])
+        self.fork = sweep.fork and sweep.fork.format(seed=seed)
+        self.end = own.get("steps", sweep.steps)
+        self.pauses = sorted({at for at in sweep.pauses if at < self.end} | {self.end})
+        self.failed = None
+
+    def name(self):
+        return f"{self.variant}, seed {self.seed}"
+
+    def beside(self, kind):
+        return self.path.with_name(f"{self.path.name}.{kind}")
+
+    def checkpoints(self):
+        return sorted((self.path / "checkpoints").glob("iteration-*.safetensors"))
+
+    def has_metrics(self):
+        """Returns whether it has made an iteration."""
+        table = self.path / "metrics.csv"
+        return table.exists() and table.read_bytes().count(b"\n") > 1
+
+    def position(self):
+        """Returns the control steps of the newest checkpoint, from which the training resumes."""
+        found = self.checkpoints()
+        if found:
+            return steps_of(found[-1])
+        return steps_of(pathlib.Path(self.fork)) if self.fork else 0
+
+    def steps_per_iteration(self):
+        progress = progress_of(self.checkpoints()[-1])
+        begun = progress.get("fork", {"iteration": 0, "env_steps": 0})
+        return (progress["env_steps"] - begun["env_steps"]) // max(progress["iteration"] - begun["iteration"], 1)
+
+    def pause(self):
+        """Returns the steps at which it pauses next, or None at its end."""
+        position = self.position()
+        return next((at for at in self.pauses if at > position), None)
+
+    def command(self):
+        end = ["--threads", self.sweep.threads, "--total-steps", self.pause()]
+        if self.checkpoints():
+            # A scene of the user's is not found by a run itself.
+            scene = tomllib.loads((self.path / "config.toml").read_text())["env"].get("model", "builtin")
+            again = ["--set", f"env.model={scene}"] if scene != "builtin" else []
+            return [self.sweep.program, "train", "--resume", self.path, *again, *end]
+        begin = ["--fork", self.fork] if self.fork else ["--seed", self.seed]
+        config = ["--config", self.sweep.config] if self.sweep.config else []
+        sets = [word for setting in self.set for word in ("--set", setting)]
+        # Each training only begins at first: what is wrong with its settings is found before any has run for hours.
+        return [self.sweep.program, "train", *begin, *config, *sets, *end, "--run-dir", self.path, "--stop-after", "1s"]
+
+    def keep_copy(self):
+        """At a pause, copies the checkpoint if the copy is wanted and does not exist yet."""
+        if not self.checkpoints():
+            return
+        position = self.position()
+        passed = [at for at in self.pauses if at <= position < at + self.steps_per_iteration()]
+        if not passed or passed[-1] not in self.sweep.keep:
+            return
+        copy = self.sweep.folder / "kept" / f"{self.variant}-{self.seed}-{passed[-1]}.safetensors"
+        if not copy.exists():
+            copy.parent.mkdir(exist_ok=True)
+            program.copy_whole(self.checkpoints()[-1], copy)
+
+    def wait_until_free(self):
+        """Waits for a training in this folder to end: those of a killed sweep do so by themselves, but not at once."""
+        lock = self.path / "run.lock"
+        if not lock.exists():
+            return
+        with lock.open() as file, contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+
+    def expect_settings(self):
+        """Exits unless the folder was begun with the same settings; returns the path of their record, and the settings."""
+        of = self.sweep
+        config = pathlib.Path(of.config).read_text() if of.config else None
+        settings = {"fork": self.fork, "config": config, "set": self.set}
+        record = self.beside("json")
+        if self.path.exists() and not record.exists():
+            sys.exit(f"{self.path}: there is a run, but no record of its settings; choose another folder")
+        if self.path.exists() and json.loads(record.read_text()) != settings:
+            sys.exit(f"{record}: {self.name()} was begun with these settings, not with those of {of.file}; choose another folder")
+        return record, settings
+
+    def start(self):
+        record, settings = self.expect_settings()
+        record.write_text(json.dumps(settings, indent=1))
+        self.wait_until_free()
+        with self.beside("log").open("ab") as log:
+            return subprocess.Popen([str(word) for word in self.command()], stdout=log, stderr=log, start_new_session=True,
+                                    preexec_fn=at_low_priority)
+
+    def last_words(self):
+        return "\n".join(self.beside("log").read_text(errors="replace").splitlines()[-5:])
+
+
+def read(file):
+    """Returns what a file says, or exits with what is wrong with it."""
+    try:
+        given = tomllib.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        sys.exit(f"{file}: {error}")
+    types = OTHERS | {key: type(value) for key, value in DEFAULTS.items()}
+    if unknown := set(given) - set(types):
+        sys.exit(f"{file}: unknown: {', '.join(sorted(unknown))}")
+    if wrong := [key for key, value in given.items() if not isinstance(value, types[key])]:
+        sys.exit(f"{file}: {wrong[0]} = {given[wrong[0]]!r} must be of type {types[wrong[0]].__name__}")
+    if "steps" not in given:
+        sys.exit(f"{file}: `steps` is missing")
+    seeds = given.get("seeds", DEFAULTS["seeds"])
+    if not seeds or len(set(seeds)) < len(seeds):
+        sys.exit(f"{file}: seeds = {seeds}: name at least one, and each once")
+    for name, of in given.get("variants", {}).items():
+        if name == "base" or not re.fullmatch(r"[\w.+-]+", name):
+            sys.exit(f"{file}: a variant cannot be called {name!r}: its name is one of a folder, and `base` is what it is compared with")
+        if not isinstance(of, dict) or set(of) - {"set", "steps"} or not isinstance(of.get("set", []), list):
+            sys.exit(f"{file}: a variant may only have `set`, a list, and `steps`: {name}")
+    for rule in given.get("stop", []):
+        if not {"at", "metric"} < set(rule) <= {"at", "metric", "below", "above"}:
+            sys.exit(f"{file}: a stop rule needs `at`, `metric`, and `below` or `above`: {rule}")
+    if "fork" in given and "{seed}" not in given["fork"] and len(seeds) > 1:
+        sys.exit(f"{file}: `fork` must contain {{seed}}, or all seeds would be the same training from one checkpoint")
+    return given
+
+
+def copy_in(folder):
+    """Returns where a sweep has its copy of the program, so that no rebuild or upgrade replaces it in the middle of the sweep."""
+    return folder / "program"
+
+
+def share(trainings, runs, threads):
+    """Returns how many trainings run at once, and the threads of each. By default all do, with an equal share of the cores:
+    many trainings of few threads make more steps together than few of many."""
+    cores = len(os.sched_getaffinity(0))
+    runs = max(1, min(trainings, runs or cores // (threads or 1)))
+    return runs, threads or max(1, cores // runs)
+
+
+def steps_of(checkpoint):
+    """Returns the control steps that a training had made when it wrote this checkpoint."""
+    return progress_of(checkpoint)["env_steps"]
+
+
+def progress_of(checkpoint):
+    with checkpoint.open("rb") as file:
+        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    return json.loads(header["__metadata__"]["progress"])
+
+
+def at_low_priority():
+    """Called in the process of a training: sets the lowest priority, and lets it save and end if this program is killed."""
+    os.nice(19)
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop(number, _):
+    raise Stopped(number)
+
+
+def train(sweep):
+    """Trains all runs until they end or are stopped. Returns whether none failed."""
+    lock = sweep.begin()
+    for run in sweep.all_runs():
+        # It may have reached a pause when this program was killed.
+        run.keep_copy()
+    at_work = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, stop)
+    try:
+        work(sweep, at_work)
+    except Stopped as stopped:
+        for child in at_work.values():
+            child.terminate()
+        for child in at_work.values():
+            child.wait()
+        say("stopped; the same command resumes")
+        sys.exit(128 + stopped.args[0])
+    lock.close()
+    failed = [run.name() for run in sweep.all_runs() if run.failed]
+    if failed:
+        say(f"failed: {'; '.join(failed)}; the same command tries again")
+    return not failed
+
+
+def work(sweep, at_work):
+    """Starts trainings, and looks after those in `at_work`, until there is nothing left to start."""
+    said = set()
+    while True:
+        for run in [run for run, child in at_work.items() if child.poll() is not None]:
+            child = at_work.pop(run)
+            if child.returncode != 0:
+                run.failed = f"exit code {child.returncode}, {run.beside('log')} ends with:\n{run.last_words()}"
+                say(f"{run.name()} failed, {run.failed}")
+            elif run.has_metrics():
+                sweep.expect_columns(run)
+                run.keep_copy()
+                say(f"{run.name()}: {run.position():,} of {run.end:,} steps")
+        ready = []
+        for run in sweep.all_runs():
+            if run in at_work or run.failed or run.pause() is None:
+                continue
+            verdict = sweep.verdict(run.variant, run.position())
+            if verdict is None:
+                ready.append(run)
+            elif verdict != "waits" and run.variant not in said:
+                said.add(run.variant)
+                say(f"{run.variant} is stopped: {verdict}")
+        # Those that have not begun first, then the least advanced, so that all can be compared early; seed by seed.
+        ready.sort(key=lambda run: (len(run.checkpoints()) > 0, run.pause(), sweep.seeds.index(run.seed)))
+        for run in ready[:sweep.runs - len(at_work)]:
+            run.keep_copy()
+            at_work[run] = run.start()
+        if not at_work:
+            return
+        time.sleep(0.5)
+
+
+def say(text):
+    print(f"{datetime.datetime.now():%H:%M:%S} {text}", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=pathlib.Path)
+    parser.add_argument("folder", type=pathlib.Path)
+    parser.add_argument("--runs", type=int, metavar="N", help="trainings at a time; default: all of them, at most one for each core")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of each training; default: its share of the cores")
+    parser.add_argument("--program", metavar="FILE", 
+                        help="program of a new sweep; default: target/release/shadow-repose of this checkout, or that on the PATH")
+    parser.add_argument("--table", action="store_true", help="print how far each training is and the tables so far, without training")
+    parser.add_argument("--publish", type=pathlib.Path, metavar="FOLDER",
+                        help="write thinned metrics, settings and results to FOLDER, without training")
+    args = parser.parse_args()
+    if any(number is not None and number < 1 for number in (args.runs, args.threads)):
+        parser.error("--runs and --threads must be at least 1")
+    folder = args.folder.resolve()
+    binary = copy_in(folder) if copy_in(folder).exists() else program.find(args.program)
+    sweep = Sweep(args.file, folder, binary, args.runs, args.threads)
+    only_looks = args.table or args.publish is not None
+    if only_looks:
+        for run in sweep.all_runs():
+            run.expect_settings()
+            if args.table:
+                print(f"{run.name()}: {run.position():,} of {run.end:,} steps")
+    whole = only_looks or train(sweep)
+    print(compare.tables(sweep))
+    runs = [run.path for run in sweep.all_runs() if run.has_metrics()]
+    if args.publish and not runs:
+        sys.exit("there is nothing to publish yet")
+    if args.publish:
+        compare.publish(sweep, args.publish)
+    elif runs:
+        compare.draw(sweep.program, runs, sweep.folder / "picture.svg")
+    return 0 if whole else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
