@@ -60,15 +60,17 @@ impl News {
 }
 
 impl Server {
-    /// Serves a page on this port of 127.0.0.1 (0: any free one). Without `on_post`, no request changes anything.
+    /// Serves a page on this port of 127.0.0.1 (0: any free one), whose readers get the event `hello` first. Without `on_post`, no
+    /// request changes anything.
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
-    pub fn open(port: u16, page: String, on_post: Option<OnPost>) -> Result<Self> {
+    pub fn open(port: u16, page: String, hello: &str, on_post: Option<OnPost>) -> Result<Self> {
         let cannot = |error| anyhow!("cannot use port {port} of 127.0.0.1: {error}; {OTHER_PORT}");
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
         let port = listener.local_addr().map_err(cannot)?.port();
-        let shared = Arc::new(Shared { page, on_post, news: Mutex::default(), changed: Condvar::new() });
+        let news = Mutex::new(News { hello: hello.into(), ..News::default() });
+        let shared = Arc::new(Shared { page, on_post, news, changed: Condvar::new() });
         let own = shared.clone();
         let accepting = thread::Builder::new().name("server".into());
         accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;

@@ -30,7 +30,10 @@ pub fn shortened(text: &str) -> String {
 
 /// Returns a number with these decimals, or `-` if it is not known (NaN).
 pub fn number(value: f64, decimals: usize) -> String {
-    if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") }
+    let text = if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") };
+    // Not `-0.00`.
+    let is_zero = text.contains('0') && text.chars().all(|c| "-0.".contains(c));
+    if is_zero { text.trim_start_matches('-').to_owned() } else { text }
 }
 
 /// What each line of [`say`] begins with.

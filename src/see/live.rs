@@ -81,21 +81,21 @@ impl Live {
         }
         let page = columns.page(about, more, Vec::new())?;
         let key = page.key();
-        let server = Server::open(port, page.html(), sliders.as_ref().map(Sliders::on_post))?;
+        let seed = about.seed.unwrap_or(0);
+        let episodes = Episodes::scored(seed, usize::MAX);
+        let hand = |episode| {
+            let player = Player::new(task, Episodes { first: episode, ..episodes });
+            Hand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
+        };
+        let hands: Vec<Hand> = (0..hands).map(hand).collect();
+        let hello = hello(&key, seed, &hands, sliders.as_ref());
+        let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
         let (port, machine) = (server.port(), Machine::this().name);
         os::say(&format!(
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
         ));
-        let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
-        let hand = |episode| {
-            let player = Player::new(task, Episodes { first: episode, ..episodes });
-            Hand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
-        };
-        let hands = (0..hands).map(hand).collect();
-        let live = Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands };
-        live.greet();
-        Ok(live)
+        Ok(Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands })
     }
 
     /// Shows the hands for as long as the program runs; `next` says who acts in each further episode.
@@ -134,29 +134,15 @@ impl Live {
         own.player.start(self.episodes, episode);
         (own.acting, own.episode, own.has_ended) = (acting, episode, false);
         own.reward = TaskReward::default();
-        let mut about = self.about(&self.hands[hand]);
+        let mut about = own.about(self.episodes.seed);
         about["hand"] = hand.into();
         // First, so that a viewer who comes in between knows it.
         self.greet();
         self.server.send(&event("episode", &about));
     }
 
-    /// Returns what the page says of the episode of a hand.
-    fn about(&self, hand: &Hand) -> Value {
-        let mut about = json!({ "seed": format!("{}, episode {}", self.episodes.seed, hand.episode) });
-        if let Some(policy) = &hand.acting.policy {
-            about["policy"] = policy.as_str().into();
-        }
-        about
-    }
-
     fn greet(&self) {
-        let episodes: Vec<Value> = self.hands.iter().map(|hand| self.about(hand)).collect();
-        let mut hello = json!({ "key": self.key, "episodes": episodes });
-        if let Some(sliders) = &self.sliders {
-            hello["controls"] = sliders.values();
-        }
-        self.server.greet(&event("hello", &hello));
+        self.server.greet(&hello(&self.key, self.episodes.seed, &self.hands, self.sliders.as_ref()));
     }
 
     /// Returns the row of all hands, as the page reads it.
@@ -171,11 +157,30 @@ impl Live {
 }
 
 impl Hand {
+    /// Returns what the page says of its episode, which is drawn from this seed.
+    fn about(&self, seed: u64) -> Value {
+        let mut about = json!({ "seed": format!("{seed}, episode {}", self.episode) });
+        if let Some(policy) = &self.acting.policy {
+            about["policy"] = policy.as_str().into();
+        }
+        about
+    }
+
     fn step(&mut self) {
         let end = (self.acting.step)(&mut self.player);
         self.has_ended = end.is_some();
         self.reward += self.player.env().last_step().reward;
     }
+}
+
+/// Returns the first event for a viewer: the key of the page, and what is under way.
+fn hello(key: &str, seed: u64, hands: &[Hand], sliders: Option<&Sliders>) -> String {
+    let episodes: Vec<Value> = hands.iter().map(|hand| hand.about(seed)).collect();
+    let mut hello = json!({ "key": key, "episodes": episodes });
+    if let Some(sliders) = sliders {
+        hello["controls"] = sliders.values();
+    }
+    event("hello", &hello)
 }
 
 /// Returns an event as the protocol writes it.

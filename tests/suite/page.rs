@@ -339,7 +339,7 @@ impl Live {
     fn events(&self) -> Events {
         let mut stream = self.connect();
         write!(stream, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
-        let mut events = Events(BufReader::new(stream));
+        let mut events = Events(BufReader::new(stream), Instant::now() + Duration::from_secs(60));
         assert!(events.lines().contains("text/event-stream"));
         events
     }
@@ -352,14 +352,15 @@ impl Drop for Live {
     }
 }
 
-/// A stream of events.
-struct Events(BufReader<TcpStream>);
+/// A stream of events, and when all that is waited for must have come.
+struct Events(BufReader<TcpStream>, Instant);
 
 impl Events {
     /// Returns the lines up to an empty one.
     fn lines(&mut self) -> String {
         let mut lines = String::new();
         while !lines.ends_with("\n\n") && !lines.ends_with("\r\n\r\n") {
+            assert!(Instant::now() < self.1, "what is waited for does not come");
             assert!(self.0.read_line(&mut lines).unwrap() > 0, "the stream ends: {lines}");
         }
         lines
