@@ -114,20 +114,6 @@ impl Config {
         Ok(changed)
     }
 
-    /// Lists the settings that differ in `other`, except those that may change during a run: the total number of steps, the
-    /// number of threads and the path of the scene.
-    pub fn differences(&self, other: &Self) -> Vec<String> {
-        let table = |of: &Self| {
-            let mut same = of.clone();
-            (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, of.shards());
-            same.env.model = BUILTIN_MODEL.into();
-            Table::try_from(same).expect("a configuration is a tree of tables")
-        };
-        let (own, other) = (table(self), table(other));
-        let both = settings(&own).zip(settings(&other)).filter(|((_, own), (_, other))| own != other);
-        both.map(|((key, own), (_, other))| format!("{key} = {other}, not {own}")).collect()
-    }
-
     /// Returns the whole configuration as TOML.
     pub fn to_text(&self) -> String {
         let sections = Table::try_from(self).expect("a configuration is a tree of tables");
@@ -221,7 +207,8 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     }
     // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
     // replaced by its default, so that the other rules can be checked.
-    for (name, default) in settings(&DEFAULTS) {
+    let is_whole = Config::deserialize(Value::Table(merged.clone())).is_ok();
+    for (name, default) in settings(&DEFAULTS).filter(|_| !is_whole) {
         let (section, key) = name.split_once('.').expect("a key is in a section");
         let mut alone = DEFAULTS.clone();
         alone[section][key] = merged[section][key].clone();

@@ -7,6 +7,7 @@
 //! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
 
 mod applicability;
+mod differences;
 mod layers;
 mod overlay;
 mod ramp;
@@ -17,6 +18,7 @@ mod settings;
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
 pub use applicability::expect_used;
+pub use differences::{Difference, short};
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use rules::FARTHEST;

@@ -3,6 +3,7 @@
 mod checkpoints;
 mod events;
 mod folder;
+mod glance;
 mod histogram;
 mod kept;
 mod metrics;
@@ -14,8 +15,9 @@ mod table;
 pub use checkpoints::Checkpoints;
 pub use events::SETTINGS;
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
+pub use glance::{Glance, folders_of_runs};
 pub use histogram::{Histogram, histogram};
 pub use kept::{expect_other_policy, expect_output};
 pub use report::Report;
 pub use summary::{Animation, Descriptions, Media};
-pub use table::{MetricsTable, read_metrics, table_of};
+pub use table::{MetricsTable, read_metrics, table_of, value_at};

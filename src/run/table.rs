@@ -57,25 +57,52 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     }
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
     let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
+    let places: Vec<usize> = columns.keys().copied().collect();
     let mut row = 0;
     while next_row(&mut reader, &mut line).cannot("read", &path)? > 0 {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
-        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
         // Skips incomplete rows: the last row of a run in progress may be one.
-        if cells.len() == names.len() {
-            for (place, column) in &mut columns {
-                let cell = String::from_utf8_lossy(cells[*place]);
-                let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
-                let number: f64 = number
-                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell)))?;
-                column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
-            }
+        let Some(cells) = cells(line.trim_ascii_end(), &places, names.len()) else { continue };
+        for (column, cell) in columns.values_mut().zip(cells) {
+            column.push(number(cell).with_context(|| {
+                let cell = String::from_utf8_lossy(cell);
+                format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell))
+            })?);
         }
     }
     let columns = columns.into_iter().map(|(place, values)| (names[place].to_owned(), values)).collect();
     let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
     Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
+}
+
+/// Returns the cells at these places of a row, in rising order; `None` if it has not this number of cells.
+fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
+    let (mut found, mut begin, mut cell) = (Vec::with_capacity(places.len()), 0, 0);
+    for end in (0..row.len()).filter(|&at| row[at] == b',').chain([row.len()]) {
+        if places.get(found.len()) == Some(&cell) {
+            found.push(&row[begin..end]);
+        }
+        (begin, cell) = (end + 1, cell + 1);
+    }
+    (cell == count).then_some(found)
+}
+
+/// Returns the number in a cell, NaN where there is none or it cannot be drawn.
+fn number(cell: &[u8]) -> Result<f64> {
+    let number: f64 = if cell.is_empty() { f64::NAN } else { str::from_utf8(cell)?.parse()? };
+    Ok(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN })
+}
+
+/// Returns the value at `x` on the straight lines between `points`; `None` outside of them.
+pub fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
+    let after = points.partition_point(|point| point[0] < x);
+    let [right, high] = *points.get(after)?;
+    if right == x {
+        return Some(high);
+    }
+    let [left, low] = *points.get(after.checked_sub(1)?)?;
+    Some(low + (high - low) * (x - left) / (right - left))
 }
 
 #[cfg(test)]
