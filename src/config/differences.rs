@@ -2,7 +2,7 @@
 
 use toml::{Table, Value};
 
-use super::overlay::settings;
+use super::overlay::{brief, is_ramp, settings};
 use super::settings::{BUILTIN_MODEL, Config};
 
 /// A setting by its dotted key, and its values in both configurations.
@@ -44,10 +44,17 @@ pub fn short(value: &Value) -> String {
     let joined = |parts: Vec<String>| parts.join(",");
     match value {
         Value::Array(values) => format!("[{}]", joined(values.iter().map(inner).collect())),
+        // A constant.
+        Value::Table(ramp)
+            if is_ramp(ramp) && ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0) =>
+        {
+            short(&ramp["from"])
+        }
         Value::Table(parts) => {
             format!("{{{}}}", joined(parts.iter().map(|(key, value)| format!("{key}={}", inner(value))).collect()))
         }
         Value::String(text) => text.clone(),
+        Value::Float(x) => brief(*x),
         value => value.to_string(),
     }
 }
@@ -63,8 +70,13 @@ mod tests {
 
     #[test]
     fn what_makes_another_training_is_listed_in_the_form_of_an_option_that_sets_it() {
-        let sets =
-            ["env.num_envs=64", "ppo.hidden=[64, 64]", "env.noise={joint_pos=0.1}", "training.tolerance.to=0.05"];
+        let sets = [
+            "env.num_envs=64",
+            "ppo.hidden=[64, 64]",
+            "env.noise={joint_pos=0.1}",
+            "training.tolerance.to=0.05",
+            "ppo.std=1",
+        ];
         let more = ["run.seed=7", "ppo.precision=bf16-rounded", "run.threads=3", "run.total_steps=7"];
         let sets: Vec<_> = sets.iter().chain(&more).map(|set| set.parse().unwrap()).collect();
         let [default, own] = [&[], &sets[..]].map(|sets| Config::resolve(None, sets).unwrap());
@@ -76,6 +88,7 @@ mod tests {
             "training.tolerance={from=0.4,to=0.05,steps=20000000}",
             "ppo.hidden=[64,64]",
             "ppo.precision=bf16-rounded",
+            "ppo.std=1",
             "run.seed=7",
         ];
         assert_eq!(found, expected);

@@ -47,7 +47,8 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let path = table_of(place);
     let odd = place.is_dir() && path.exists() && !path.is_file();
     ensure!(!odd, "cannot read {}: not a regular file", path.display());
-    let mut reader = BufReader::new(File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE));
+    let file = File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE);
+    let mut reader = BufReader::with_capacity(1 << 16, file);
     let mut line = Vec::new();
     next_row(&mut reader, &mut line).cannot("read", &path)?;
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
@@ -78,14 +79,29 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
 
 /// Returns the cells at these places of a row, in rising order; `None` if it has not this number of cells.
 fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
-    let (mut found, mut begin, mut cell) = (Vec::with_capacity(places.len()), 0, 0);
-    for end in (0..row.len()).filter(|&at| row[at] == b',').chain([row.len()]) {
-        if places.get(found.len()) == Some(&cell) {
-            found.push(&row[begin..end]);
-        }
-        (begin, cell) = (end + 1, cell + 1);
+    let (mut rest, mut first, mut found) = (row, 0, Vec::with_capacity(places.len()));
+    for &place in places {
+        rest = after_commas(rest, place - first)?;
+        first = place;
+        found.push(rest.split(|&byte| byte == b',').next().unwrap_or_default());
     }
-    (cell == count).then_some(found)
+    let left = count.checked_sub(first + 1)?;
+    let is_last = after_commas(rest, left).is_some() && after_commas(rest, left + 1).is_none();
+    is_last.then_some(found)
+}
+
+/// Returns what follows so many commas, if there are as many. Most of a long row is counted in chunks, a few instructions each.
+fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
+    let mut begin = 0;
+    for chunk in row.as_chunks::<32>().0 {
+        let commas: u8 = chunk.iter().map(|&byte| u8::from(byte == b',')).sum();
+        if usize::from(commas) >= count {
+            break;
+        }
+        (begin, count) = (begin + chunk.len(), count - usize::from(commas));
+    }
+    let commas = row[begin..].iter().enumerate().filter(|(_, byte)| **byte == b',').map(|(at, _)| begin + at + 1);
+    [0].into_iter().chain(commas).nth(count).map(|after| &row[after..])
 }
 
 /// Returns the number in a cell, NaN where there is none or it cannot be drawn.
@@ -123,6 +139,24 @@ mod tests {
         assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(), 2);
         let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
         assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
+    }
+
+    #[test]
+    fn cells_are_found_by_their_place_in_rows_of_any_length() {
+        for width in [0, 1, 2, 31, 32, 33] {
+            let of = |place: usize| format!("{place}{}", "x".repeat(width * (place % 3)));
+            let row = (0..70).map(of).collect::<Vec<_>>().join(",");
+            for places in [&[0, 1, 69][..], &[3, 40], &[68], &[]] {
+                let expected: Vec<String> = places.iter().map(|place| of(*place)).collect();
+                assert_eq!(
+                    cells(row.as_bytes(), places, 70).unwrap(),
+                    expected.iter().map(String::as_bytes).collect::<Vec<_>>()
+                );
+                assert!([1, 69, 71].iter().all(|count| cells(row.as_bytes(), places, *count).is_none()), "{places:?}");
+            }
+        }
+        assert_eq!(cells(b"", &[0], 1), Some(vec![&b""[..]]));
+        assert_eq!(cells(b",,", &[0, 2], 3), Some(vec![&b""[..]; 2]));
     }
 
     #[test]

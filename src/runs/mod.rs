@@ -45,8 +45,8 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
             let text = compared.map_or_else(|| json!(all), |compared| compared.as_json(&all));
             return os::print(&(os::harmless(&text.to_string()) + "\n"));
         }
-        if runs.is_empty() {
-            os::say("no runs here");
+        if runs.is_empty() && !args.watch {
+            os::say("there are no runs in this folder");
         }
         let letters = if compared.is_some() { &["A", "B"][..] } else { &[] };
         let mut lines = table(&runs, letters);

@@ -147,7 +147,7 @@ fn damaged_and_foreign_folders_are_told_or_left_out_and_no_link_or_pipe_is_follo
         "noise\u{1b}[2J\u{9b}\n",
         &[("config.toml", "\u{1b}[31m"), ("metrics.csv", "\u{1b}]0;x\u{7}"), ("finished", "")],
     );
-    make("half", &[("run.lock", ": process 1 on elsewhere"), ("metrics.csv", "env_steps,eval/goals\n128,1e999\n256,")]);
+    make("half", &[("run.lock", ": process 1 on elsewhere"), ("metrics.csv", "env_steps,eval/goals\n128,1e999\n25")]);
     make("letters", &[("metrics.csv", "env_steps,eval/goals\n128,many\n")]);
     let sparse = make("sparse", &[]);
     for name in ["config.toml", "metrics.csv", "run.lock"] {
@@ -193,7 +193,7 @@ fn damaged_and_foreign_folders_are_told_or_left_out_and_no_link_or_pipe_is_follo
         assert!(output.status.code() == Some(1) && stderr(&output).contains(reason), "{args:?}: {}", stderr(&output));
     }
     assert!(listed(folder, &["all/half", "all/half"]).contains("the settings of one run are not known"));
-    assert!(stderr(&succeeded(program(folder, &["runs", "all/foreign"]))).contains("no runs"));
+    assert!(stderr(&succeeded(program(folder, &["runs", "all/foreign"]))).contains("there are no runs in this folder"));
 }
 
 #[test]
