@@ -12,7 +12,7 @@
 //!
 //! | module | what it is | imports |
 //! |---|---|---|
-//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, train, view |
+//! | `main` | runs a command, prints errors, sets the exit code | bench, cli, export, manual, os, play, plot, ranks, runs, train, view |
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, see, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
@@ -20,6 +20,7 @@
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
+//! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, run, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
 //! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, run, sim |
@@ -94,6 +95,7 @@ pub mod repose;
 pub mod rng;
 pub mod robustness;
 pub mod run;
+pub mod runs;
 pub mod schedule;
 pub mod see;
 pub mod sim;

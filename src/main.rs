@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use shadow_repose::cli::{self, Command};
 use shadow_repose::os::Requests;
 use shadow_repose::train::train;
-use shadow_repose::{bench, export, manual, os, play, plot, ranks, view};
+use shadow_repose::{bench, export, manual, os, play, plot, ranks, runs, view};
 
 fn main() -> ExitCode {
     let command = match cli::parse() {
@@ -24,6 +24,7 @@ fn main() -> ExitCode {
         Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
         Command::Export(args) => export::export(&args).map(|()| ExitCode::SUCCESS),
         Command::Plot(args) => plot::plot(&args).map(|()| ExitCode::SUCCESS),
+        Command::Runs(args) => runs::runs(&args).map(|()| ExitCode::SUCCESS),
         Command::Bench(args) => bench::bench(&args).map(|()| ExitCode::SUCCESS),
         Command::Completions { shell } => manual::completions(shell).map(|()| ExitCode::SUCCESS),
         Command::Man => manual::man().map(|()| ExitCode::SUCCESS),

@@ -9,7 +9,7 @@ use anyhow::{Result, bail, ensure};
 use crate::cli::{Along, PlotArgs};
 use crate::draw::{self, Chart, Curve, Picture, Subplot};
 use crate::os::{self, OutputFile, similar};
-use crate::run::{self, MetricsTable};
+use crate::run::{self, MetricsTable, value_at};
 use crate::tags::quantity;
 
 /// A metric, and what is drawn instead where no run has its values.
@@ -194,17 +194,6 @@ fn mean_and_band(curves: &[Curve]) -> Curve {
         ]);
     }
     mean
-}
-
-/// Returns the value at `x` on the straight lines between `points`; `None` outside of them.
-fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
-    let after = points.partition_point(|point| point[0] < x);
-    let [right, high] = *points.get(after)?;
-    if right == x {
-        return Some(high);
-    }
-    let [left, low] = *points.get(after.checked_sub(1)?)?;
-    Some(low + (high - low) * (x - left) / (right - left))
 }
 
 /// Returns the numbers of consecutive rows that lie in the same window of so many steps.

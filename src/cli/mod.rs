@@ -1,5 +1,6 @@
 //! The command line: its structure and help texts. What the commands do is elsewhere.
 
+mod results;
 mod values;
 
 use std::path::PathBuf;
@@ -11,6 +12,7 @@ use clap::{ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand, 
 
 use crate::config::{Config, Override};
 use crate::sim::{self, Camera, Quality};
+pub use results::{Along, PlotArgs, RunsArgs};
 use values::{LARGEST, camera, quality, seconds, size, steps, time};
 
 /// Parses a number of threads, within the limits of `run.threads`.
@@ -65,6 +67,9 @@ pub enum Command {
     /// Plot the learning curves of runs as SVG or PNG
     #[command(after_help = examples!("plot runs/shadow-hand-repose/*", "plot RUN --metric eval/goals --out goals.png"))]
     Plot(PlotArgs),
+    /// List runs: state, time left, steps, goals and settings; or compare two
+    #[command(after_help = examples!("runs --watch", "runs RUN RUN"))]
+    Runs(RunsArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
     #[command(after_help = examples!("bench", "bench --only training --threads 4"))]
     Bench(BenchArgs),
@@ -371,43 +376,6 @@ pub enum Baseline {
     Zero,
     /// Uniformly random actions
     Random,
-}
-
-/// The options of `plot`.
-#[derive(Args, Debug)]
-pub struct PlotArgs {
-    /// Run folders or their metrics.csv files
-    #[arg(required = true, value_name = "RUN")]
-    pub runs: Vec<PathBuf>,
-    /// Picture to write, as .svg or .png
-    #[arg(long, value_name = "FILE", default_value = "learning.svg")]
-    pub out: PathBuf,
-    /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, rotation error and
-    /// drop rate in training]
-    #[arg(long, value_name = "COLUMN")]
-    pub metric: Vec<String>,
-    /// Quantity on the x axis: control steps, or hours of collecting and learning
-    #[arg(long, value_enum, default_value_t = Along::Steps)]
-    pub along: Along,
-    /// Iterations averaged into each point, by default up to 50 and a tenth of the shortest run; if runs differ in iteration length,
-    /// the shortest counts
-    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
-    pub smooth: Option<usize>,
-    /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest
-    #[arg(long)]
-    pub seeds: bool,
-    /// Size of the picture in pixels [default: width 800, height 260 per panel]
-    #[arg(long, value_name = "WxH", value_parser = size)]
-    pub size: Option<[u32; 2]>,
-}
-
-/// The quantity on the x axis of a learning curve.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Along {
-    /// Control steps over all environments
-    Steps,
-    /// Hours of collecting and learning, without evaluations and saving
-    Hours,
 }
 
 /// The options of `bench`.

@@ -1,47 +1,55 @@
-//! In what configurations differ: from one another, and from the default one.
+//! In which settings two configurations differ.
 
-use toml::Table;
+use toml::{Table, Value};
 
-use super::overlay::settings;
+use super::overlay::{brief, is_ramp, settings};
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig};
+
+/// A setting by its dotted key, and its values in both configurations.
+pub type Difference = (String, [Value; 2]);
 
 impl Config {
     /// Lists the settings that differ in `other`, except those that may change during a run: the total number of steps, the
     /// number of threads and the path of the scene.
     pub fn differences(&self, other: &Self) -> Vec<String> {
-        let table = |of: &Self| {
-            let mut same = of.clone();
-            (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, of.shards());
+        let differing = differing([self, other].map(|of| {
+            let mut same = of.settled();
             same.env.model = BUILTIN_MODEL.into();
-            Table::try_from(same).expect("a configuration is a tree of tables")
-        };
-        let (own, other) = (table(self), table(other));
-        let both = settings(&own).zip(settings(&other)).filter(|((_, own), (_, other))| own != other);
-        both.map(|((key, own), (_, other))| format!("{key} = {other}, not {own}")).collect()
+            same
+        }));
+        differing.into_iter().map(|(key, [own, other])| format!("{key} = {other}, not {own}")).collect()
     }
 
-    /// Returns all settings by dotted key, except those that only say how the work is shared.
-    ///
-    /// # Panics
-    /// Never panics: a configuration is a tree of tables.
-    pub fn dotted(&self) -> Table {
-        let own = Table::try_from(self).expect("a configuration is a tree of tables");
-        let settings = settings(&own).filter(|(key, _)| !matches!(&**key, "run.shards" | "run.threads"));
-        settings.map(|(key, value)| (key, value.clone())).collect()
+    /// Returns the settings that make `other` another training: all but the total number of steps and the number of threads.
+    pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
+        differing([self, other].map(Self::settled))
     }
 
-    /// Returns the settings that differ from the default ones, by dotted key, as [`Config::dotted`] does.
+    /// Returns the settings that make this another training than the default one, by dotted key.
     ///
     /// # Panics
     /// Never panics: the defaults are valid.
     pub fn unlike_default(&self) -> Table {
-        let default = Self::resolve(None, &[]).expect("the defaults are valid").dotted();
-        self.dotted().into_iter().filter(|(key, value)| default.get(key) != Some(value)).collect()
+        let default = Self::resolve(None, &[]).expect("the defaults are valid");
+        default.compared_with(self).into_iter().map(|(key, [_, own])| (key, own)).collect()
+    }
+
+    /// Returns all settings by dotted key.
+    pub fn dotted(&self) -> Table {
+        let own = Table::try_from(self).expect("a configuration is a tree of tables");
+        settings(&own).map(|(key, value)| (key, value.clone())).collect()
+    }
+
+    /// Returns the same training, whatever the length of its run and the machine.
+    fn settled(&self) -> Self {
+        let mut same = self.clone();
+        (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, self.shards());
+        same
     }
 }
 
 impl EnvConfig {
-    /// Returns the settings that differ from the default ones, by dotted key. The number of hands is none of the task.
+    /// Returns the settings of the task that differ from the default ones, by dotted key.
     ///
     /// # Panics
     /// Never panics: the defaults are valid.
@@ -49,5 +57,69 @@ impl EnvConfig {
         let default = Config::resolve(None, &[]).expect("the defaults are valid");
         let own = Config { env: Self { num_envs: default.env.num_envs, ..self.clone() }, ..default };
         own.unlike_default()
+    }
+}
+
+fn differing(both: [Config; 2]) -> Vec<Difference> {
+    let [own, other] = both.map(|of| Table::try_from(of).expect("a configuration is a tree of tables"));
+    let both = settings(&own).zip(settings(&other)).filter(|((_, own), (_, other))| own != other);
+    both.map(|((key, own), (_, other))| (key, [own.clone(), other.clone()])).collect()
+}
+
+/// Returns a value as `--set` takes it, without spaces.
+pub fn short(value: &Value) -> String {
+    let joined = |parts: Vec<String>| parts.join(",");
+    match value {
+        Value::Array(values) => format!("[{}]", joined(values.iter().map(inner).collect())),
+        // A constant.
+        Value::Table(ramp)
+            if is_ramp(ramp) && ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0) =>
+        {
+            short(&ramp["from"])
+        }
+        Value::Table(parts) => {
+            format!("{{{}}}", joined(parts.iter().map(|(key, value)| format!("{key}={}", inner(value))).collect()))
+        }
+        Value::String(text) => text.clone(),
+        Value::Float(x) => brief(*x),
+        value => value.to_string(),
+    }
+}
+
+/// Returns a value inside of another one, where a text has quotes.
+fn inner(value: &Value) -> String {
+    if value.is_str() { value.to_string() } else { short(value) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_makes_another_training_is_listed_in_the_form_of_an_option_that_sets_it() {
+        let sets = [
+            "env.num_envs=64",
+            "ppo.hidden=[64, 64]",
+            "env.noise={joint_pos=0.1}",
+            "training.tolerance.to=0.05",
+            "ppo.std=1",
+        ];
+        let more = ["run.seed=7", "ppo.precision=bf16-rounded", "run.threads=3", "run.total_steps=7"];
+        let sets: Vec<_> = sets.iter().chain(&more).map(|set| set.parse().unwrap()).collect();
+        let [default, own] = [&[], &sets[..]].map(|sets| Config::resolve(None, sets).unwrap());
+        let found: Vec<String> =
+            default.compared_with(&own).iter().map(|(key, [_, own])| format!("{key}={}", short(own))).collect();
+        let expected = [
+            "env.num_envs=64",
+            "env.noise={joint_pos=0.1}",
+            "training.tolerance={from=0.4,to=0.05,steps=20000000}",
+            "ppo.hidden=[64,64]",
+            "ppo.precision=bf16-rounded",
+            "ppo.std=1",
+            "run.seed=7",
+        ];
+        assert_eq!(found, expected);
+        let again: Vec<_> = found.iter().map(|set| set.parse().unwrap()).collect();
+        assert!(Config::resolve(None, &again).unwrap().compared_with(&own).is_empty());
     }
 }

@@ -193,7 +193,8 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     }
     // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
     // replaced by its default, so that the other rules can be checked.
-    for (name, default) in settings(&DEFAULTS) {
+    let is_whole = Config::deserialize(Value::Table(merged.clone())).is_ok();
+    for (name, default) in settings(&DEFAULTS).filter(|_| !is_whole) {
         let (section, key) = name.split_once('.').expect("a key is in a section");
         let mut alone = DEFAULTS.clone();
         alone[section][key] = merged[section][key].clone();

@@ -18,6 +18,7 @@ mod settings;
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
 pub use applicability::expect_used;
+pub use differences::{Difference, short};
 pub use layers::{Override, PolicyConfig, Source, user_file};
 pub use ramp::Ramp;
 pub use rules::FARTHEST;

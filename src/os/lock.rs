@@ -1,6 +1,9 @@
 //! The lock of a run folder: only one training process at a time may write to it.
 //!
 //! On a file system without locks, the time of the lock file stands in for one: it is renewed as long as the training lives.
+//!
+//! The file names who holds it. A training that ends as it should removes that name, so a name that nobody holds is of one that
+//! has failed or was killed.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Read;
@@ -8,7 +11,7 @@ use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, bail, ensure};
 
@@ -28,6 +31,10 @@ const LAPSED: Duration = Duration::from_secs(60);
 
 /// The time after which a second program that began at the same moment has written its name over this one's.
 const SETTLED: Duration = Duration::from_millis(500);
+
+/// The pauses in which a lock that is taken may become free, and their length: [`Hold::of`] takes one for an instant.
+const PAUSES: usize = 5;
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// The lock on a run folder. The system releases it when the program ends, however it ends.
 #[derive(Debug)]
@@ -55,7 +62,15 @@ impl Locked {
         let path = folder.join(LOCK);
         let open = |()| OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
         let file = fs::create_dir_all(folder).and_then(open).cannot("write", &path)?;
-        let renewal = match file.try_lock() {
+        let taken = |tried: &Result<(), TryLockError>| matches!(tried, Err(TryLockError::WouldBlock));
+        let mut tried = file.try_lock();
+        for _ in 0..PAUSES {
+            if taken(&tried) {
+                thread::sleep(PAUSE);
+                tried = file.try_lock();
+            }
+        }
+        let renewal = match tried {
             Ok(()) => None,
             Err(TryLockError::WouldBlock) => {
                 bail!("{} is being trained in by another program{}", folder.display(), holder(&path));
@@ -83,6 +98,14 @@ impl Locked {
         let said = name();
         let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)
+    }
+
+    /// Gives the lock back and removes the name of this program: the training has ended as it should.
+    pub fn release(self) {
+        // The file may be another's by now.
+        if holder(&self.path) == name() {
+            let _ = self.file.set_len(0);
+        }
     }
 
     /// Whether the folder still has this lock file. It may have been deleted and created again.
@@ -134,9 +157,40 @@ impl Renewal {
 
 impl Drop for Renewal {
     fn drop(&mut self) {
-        // The next one need not wait, unless the file is another's by now.
+        // The next one need not wait, unless the file is another's by now. The name stays, as in a file that was locked.
         if holder(&self.path) == name() {
-            let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_len(0));
+            let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_modified(UNIX_EPOCH));
+        }
+    }
+}
+
+/// What the lock file of a run folder tells those who only look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Hold {
+    /// A training holds it.
+    Held,
+    /// Nobody does, and nobody's name is in it, or it is not there.
+    Released,
+    /// Nobody does, but a name is in it: its training has failed or was killed.
+    Left,
+    /// The same, but the name is of another machine, whose locks may not be seen from here.
+    Elsewhere,
+}
+
+impl Hold {
+    /// Looks at the lock file of a folder, and changes nothing.
+    pub fn of(folder: &Path) -> Self {
+        let path = folder.join(LOCK);
+        // Neither a link nor a pipe, which would be waited for.
+        let Some(facts) = fs::symlink_metadata(&path).ok().filter(fs::Metadata::is_file) else { return Self::Released };
+        let is_renewed = || facts.modified().is_ok_and(|time| time.elapsed().unwrap_or_default() <= LAPSED);
+        let signed = holder(&path);
+        match File::open(&path).map(|file| file.try_lock_shared()) {
+            Ok(Err(TryLockError::WouldBlock)) => Self::Held,
+            Ok(Err(TryLockError::Error(_))) if facts.len() > 0 && is_renewed() => Self::Held,
+            _ if facts.len() == 0 => Self::Released,
+            _ if signed.ends_with(&format!(" on {}", Machine::this().name)) => Self::Left,
+            _ => Self::Elsewhere,
         }
     }
 }
@@ -168,6 +222,32 @@ mod tests {
     }
 
     #[test]
+    fn those_who_look_see_who_trains_and_who_has_ended_in_what_way_and_keep_nobody_out() {
+        let place = tempfile::tempdir().unwrap();
+        let look = || Hold::of(place.path());
+        assert_eq!(look(), Hold::Released);
+        let lock = Locked::acquire(place.path()).unwrap();
+        assert_eq!(look(), Hold::Held, "not signed yet");
+        let lock = lock.sign().unwrap();
+        assert_eq!(look(), Hold::Held);
+        drop(lock);
+        assert_eq!(look(), Hold::Left);
+        Locked::acquire(place.path()).unwrap().sign().unwrap().release();
+        assert_eq!(look(), Hold::Released);
+        fs::write(place.path().join(LOCK), ": process 1 on another").unwrap();
+        assert_eq!(look(), Hold::Elsewhere);
+        // One who looks at this very moment.
+        let seen = File::open(place.path().join(LOCK)).unwrap();
+        seen.try_lock_shared().unwrap();
+        let gone = thread::spawn(move || {
+            thread::sleep(PAUSE);
+            drop(seen);
+        });
+        Locked::acquire(place.path()).unwrap();
+        gone.join().unwrap();
+    }
+
+    #[test]
     fn where_there_are_no_locks_the_name_stays_in_a_lock_file_of_its_own_and_anothers_is_left() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(LOCK);
@@ -177,6 +257,12 @@ mod tests {
         let renewal = Some(Renewal::begin(place.path(), path.clone()).unwrap());
         let lock = Locked { path: path.clone(), file, _renewal: renewal }.sign().unwrap();
         assert_eq!(holder(&path), name());
+        drop(lock);
+        assert_eq!(holder(&path), name(), "it has failed");
+        // The next one need not wait.
+        let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
+        let renewal = Some(Renewal::begin(place.path(), path.clone()).unwrap());
+        let lock = Locked { path: path.clone(), file, _renewal: renewal }.sign().unwrap();
         fs::write(&path, ": process 1 on another").unwrap();
         drop(lock);
         assert_eq!(holder(&path), ": process 1 on another");

@@ -9,6 +9,7 @@ mod meshes;
 mod output;
 mod pip;
 mod progress;
+mod screen;
 mod server;
 mod similar;
 mod terminal;
@@ -16,15 +17,18 @@ mod threads;
 
 pub use file::{Cannot, Stamp, expect_named, read_bytes, read_bytes_if, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
-pub use lock::{LOCK, Locked};
+pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
     OUR_PARTIAL, OutputFile, expect_folder, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder,
     write_whole,
 };
-pub use progress::{Bar, Status, StatusLine, progress_bar};
+pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
+pub use screen::{Screen, aligned, text_of};
 pub use server::{OnPost, Server};
 pub use similar::similar;
-pub use terminal::{called_as, has_display, is_terminal, number, print, quoted, quoted_path, say, shortened, speak_as};
+pub use terminal::{
+    called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say, shortened, speak_as,
+};
 pub use threads::{start_threads, thread_pool};

@@ -50,9 +50,8 @@ impl StatusLine {
     /// Creates the line of a training run that has made `env_steps` of its steps. If `quiet`, no progress is shown.
     pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
         // A line can be redrawn in place on a terminal that is wide enough.
-        let dumb = std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb");
         let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
-        let bar = (!quiet && std::io::stderr().is_terminal() && !dumb && wide).then(|| {
+        let bar = (!quiet && std::io::stderr().is_terminal() && !is_dumb() && wide).then(|| {
             // Cuts off what does not fit, even after the terminal is resized.
             let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
             let bar = ProgressBar::no_length().with_style(style);
@@ -135,7 +134,7 @@ impl Status {
         let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
         let mut parts = vec![
             format!("{:.0} steps/s", self.steps_per_s),
-            format!("ETA {}:{:02}:{:02}", left.as_secs() / 3600, left.as_secs() / 60 % 60, left.as_secs() % 60),
+            format!("ETA {}", clock(left)),
             format!("lesson goals {}", known(self.goals, format!("{:.2}", self.goals))),
             format!("drops {}", known(self.drop_rate, format!("{:.0}%", 100.0 * self.drop_rate))),
         ];
@@ -145,11 +144,7 @@ impl Status {
 
     /// Returns the line with the parts that fit into `width` columns.
     fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
-        let mut line = match total_steps {
-            0..10_000 => format!("{}/{total_steps}", self.env_steps),
-            10_000..1_000_000 => format!("{:.1}/{:.0}k", self.env_steps as f64 / 1e3, total_steps as f64 / 1e3),
-            _ => format!("{:.1}/{:.0}M", self.env_steps as f64 / 1e6, total_steps as f64 / 1e6),
-        };
+        let mut line = steps_of_all(self.env_steps, total_steps);
         for part in self.parts(left) {
             if line.len() + 2 + part.len() > width {
                 break;
@@ -158,6 +153,26 @@ impl Status {
         }
         line
     }
+}
+
+/// Returns the steps that are made of all steps, e.g. `10.0/175M`.
+pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
+    match total_steps {
+        0..10_000 => format!("{env_steps}/{total_steps}"),
+        10_000..1_000_000 => format!("{:.1}/{:.0}k", env_steps as f64 / 1e3, total_steps as f64 / 1e3),
+        _ => format!("{:.1}/{:.0}M", env_steps as f64 / 1e6, total_steps as f64 / 1e6),
+    }
+}
+
+/// Returns a time as hours, minutes and seconds, e.g. `2:05:33`.
+pub fn clock(time: Duration) -> String {
+    let seconds = time.as_secs();
+    format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
+}
+
+/// Whether the terminal is one on which nothing is redrawn.
+pub(super) fn is_dumb() -> bool {
+    std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb")
 }
 
 /// The progress bar of a job with many items.

@@ -11,10 +11,18 @@ use anyhow::{Context, Result};
 /// # Errors
 /// Fails if stdout cannot be written to, e.g. on a full disk.
 pub fn print(text: &str) -> Result<()> {
+    is_read(text).map(drop)
+}
+
+/// Prints text to stdout, and returns whether somebody reads it: a pipe may be closed.
+///
+/// # Errors
+/// Fails as [`print`] does.
+pub(super) fn is_read(text: &str) -> Result<bool> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to stdout"),
-        _ => Ok(()),
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        written => written.map(|()| true).context("cannot write to stdout"),
     }
 }
 
@@ -48,6 +56,21 @@ pub fn speak_as(name: &str) {
 fn is_steering(c: char) -> bool {
     let unseen = matches!(c, '\u{ad}' | '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}');
     c.is_control() || unseen || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
+}
+
+/// Returns a text of one line in which the characters that steer a terminal are escaped as in JSON, so that a text of JSON stays
+/// one.
+pub fn harmless(text: &str) -> String {
+    let mut harmless = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            c if is_steering(c) => {
+                c.encode_utf16(&mut [0; 2]).iter().for_each(|unit| harmless += &format!("\\u{unit:04x}"));
+            }
+            c => harmless.push(c),
+        }
+    }
+    harmless
 }
 
 /// Prints a line to stderr. Characters that steer the terminal are escaped, since the line may quote an untrusted file.
@@ -110,6 +133,15 @@ mod tests {
     use std::os::unix::ffi::OsStrExt;
 
     use super::*;
+
+    #[test]
+    fn what_steers_a_terminal_is_escaped_and_json_stays_the_same_json() {
+        let name = "a\u{1b}[2J\n\u{9b}m\u{202e}\u{e0041}ü";
+        assert_eq!(harmless(name), r"a\u001b[2J\u000a\u009bm\u202e\udb40\udc41ü");
+        let text = harmless(&serde_json::json!([name]).to_string());
+        assert_eq!(serde_json::from_str::<[String; 1]>(&text).unwrap(), [name]);
+        assert!(!text.chars().any(is_steering));
+    }
 
     #[test]
     fn words_with_a_meaning_for_a_shell_are_quoted() {

@@ -13,7 +13,7 @@ use super::hparams::HPARAMS;
 use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
-const RUNS: &str = "runs/shadow-hand-repose";
+pub(super) const RUNS: &str = "runs/shadow-hand-repose";
 
 pub(super) const CONFIG: &str = "config.toml";
 pub(super) const VERSION: &str = "version.txt";

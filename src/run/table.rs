@@ -47,7 +47,8 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let path = table_of(place);
     let odd = place.is_dir() && path.exists() && !path.is_file();
     ensure!(!odd, "cannot read {}: not a regular file", path.display());
-    let mut reader = BufReader::new(File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE));
+    let file = File::open(&path).cannot("read", &path)?.take(LARGEST_TABLE);
+    let mut reader = BufReader::with_capacity(1 << 16, file);
     let mut line = Vec::new();
     next_row(&mut reader, &mut line).cannot("read", &path)?;
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
@@ -57,25 +58,67 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     }
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
     let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
+    let places: Vec<usize> = columns.keys().copied().collect();
     let mut row = 0;
     while next_row(&mut reader, &mut line).cannot("read", &path)? > 0 {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
-        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
         // Skips incomplete rows: the last row of a run in progress may be one.
-        if cells.len() == names.len() {
-            for (place, column) in &mut columns {
-                let cell = String::from_utf8_lossy(cells[*place]);
-                let number = if cell.is_empty() { Ok(f64::NAN) } else { cell.parse() };
-                let number: f64 = number
-                    .with_context(|| format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell)))?;
-                column.push(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN });
-            }
+        let Some(cells) = cells(line.trim_ascii_end(), &places, names.len()) else { continue };
+        for (column, cell) in columns.values_mut().zip(cells) {
+            column.push(number(cell).with_context(|| {
+                let cell = String::from_utf8_lossy(cell);
+                format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell))
+            })?);
         }
     }
     let columns = columns.into_iter().map(|(place, values)| (names[place].to_owned(), values)).collect();
     let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
     Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
+}
+
+/// Returns the cells at these places of a row, in rising order; `None` if it has not this number of cells.
+fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
+    let (mut rest, mut first, mut found) = (row, 0, Vec::with_capacity(places.len()));
+    for &place in places {
+        rest = after_commas(rest, place - first)?;
+        first = place;
+        found.push(rest.split(|&byte| byte == b',').next().unwrap_or_default());
+    }
+    let left = count.checked_sub(first + 1)?;
+    let is_last = after_commas(rest, left).is_some() && after_commas(rest, left + 1).is_none();
+    is_last.then_some(found)
+}
+
+/// Returns what follows so many commas, if there are as many. Most of a long row is counted in chunks, a few instructions each.
+fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
+    let mut begin = 0;
+    for chunk in row.as_chunks::<32>().0 {
+        let commas: u8 = chunk.iter().map(|&byte| u8::from(byte == b',')).sum();
+        if usize::from(commas) >= count {
+            break;
+        }
+        (begin, count) = (begin + chunk.len(), count - usize::from(commas));
+    }
+    let commas = row[begin..].iter().enumerate().filter(|(_, byte)| **byte == b',').map(|(at, _)| begin + at + 1);
+    [0].into_iter().chain(commas).nth(count).map(|after| &row[after..])
+}
+
+/// Returns the number in a cell, NaN where there is none or it cannot be drawn.
+fn number(cell: &[u8]) -> Result<f64> {
+    let number: f64 = if cell.is_empty() { f64::NAN } else { str::from_utf8(cell)?.parse()? };
+    Ok(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN })
+}
+
+/// Returns the value at `x` on the straight lines between `points`; `None` outside of them.
+pub fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
+    let after = points.partition_point(|point| point[0] < x);
+    let [right, high] = *points.get(after)?;
+    if right == x {
+        return Some(high);
+    }
+    let [left, low] = *points.get(after.checked_sub(1)?)?;
+    Some(low + (high - low) * (x - left) / (right - left))
 }
 
 #[cfg(test)]
@@ -96,6 +139,24 @@ mod tests {
         assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(), 2);
         let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
         assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
+    }
+
+    #[test]
+    fn cells_are_found_by_their_place_in_rows_of_any_length() {
+        for width in [0, 1, 2, 31, 32, 33] {
+            let of = |place: usize| format!("{place}{}", "x".repeat(width * (place % 3)));
+            let row = (0..70).map(of).collect::<Vec<_>>().join(",");
+            for places in [&[0, 1, 69][..], &[3, 40], &[68], &[]] {
+                let expected: Vec<String> = places.iter().map(|place| of(*place)).collect();
+                assert_eq!(
+                    cells(row.as_bytes(), places, 70).unwrap(),
+                    expected.iter().map(String::as_bytes).collect::<Vec<_>>()
+                );
+                assert!([1, 69, 71].iter().all(|count| cells(row.as_bytes(), places, *count).is_none()), "{places:?}");
+            }
+        }
+        assert_eq!(cells(b"", &[0], 1), Some(vec![&b""[..]]));
+        assert_eq!(cells(b",,", &[0, 2], 3), Some(vec![&b""[..]; 2]));
     }
 
     #[test]

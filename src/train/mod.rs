@@ -119,6 +119,7 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
     report.end(true);
     saver.save_at_last(report)?;
     saver.held.folder.mark_finished(true);
+    saver.release();
     os::say(&format!("finished: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
     Ok(ExitCode::SUCCESS)
 }
@@ -278,6 +279,7 @@ fn stop(mut saver: Saver, report: &mut Report, code: ExitCode, reason: &str) -> 
     saver.save_at_last(report)?;
     if saver.held.wrote {
         saver.held.folder.mark_finished(reason != STOPPED);
+        saver.release();
         os::say(&format!("{reason} after {}; resume with", saver.held.steps_made()));
         os::say(&format!("  {}", saver.held.how_to_resume(&saver.held.folder)));
     } else {

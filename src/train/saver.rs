@@ -110,6 +110,11 @@ impl Saver {
         Ok(())
     }
 
+    /// Gives the folder back after a training that has ended as it should. Another end leaves its mark in the lock file.
+    pub(super) fn release(&mut self) {
+        self.lock.take().into_iter().for_each(Locked::release);
+    }
+
     /// Clears the folder of a run that could not begin, unless it belongs to another training by now.
     pub(super) fn give_back(&self) {
         if self.lock.as_ref().is_some_and(Locked::holds) {

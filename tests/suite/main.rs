@@ -30,6 +30,7 @@ mod randomization;
 mod ranks;
 mod resume;
 mod run_folder;
+mod runs;
 mod scene;
 mod support;
 mod survival;

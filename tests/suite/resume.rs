@@ -19,7 +19,7 @@ fn run_of_ten(folder: &Path, more: &[&str]) {
 }
 
 /// Returns the inode number and the bytes of every file in a folder and below, by name; two names of one file share the inode.
-fn everything(folder: &Path) -> BTreeMap<String, (u64, Vec<u8>)> {
+pub(crate) fn everything(folder: &Path) -> BTreeMap<String, (u64, Vec<u8>)> {
     let mut found = BTreeMap::new();
     for name in names(folder) {
         let path = folder.join(&name);

@@ -1,0 +1,59 @@
+//! The options of the commands that look at the results of runs.
+
+use std::path::PathBuf;
+
+use clap::builder::RangedU64ValueParser;
+use clap::{Args, ValueEnum};
+
+use super::values::size;
+
+/// The options of `plot`.
+#[derive(Args, Debug)]
+pub struct PlotArgs {
+    /// Run folders or their metrics.csv files
+    #[arg(required = true, value_name = "RUN")]
+    pub runs: Vec<PathBuf>,
+    /// Picture to write, as .svg or .png
+    #[arg(long, value_name = "FILE", default_value = "learning.svg")]
+    pub out: PathBuf,
+    /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, rotation error and
+    /// drop rate in training]
+    #[arg(long, value_name = "COLUMN")]
+    pub metric: Vec<String>,
+    /// Quantity on the x axis: control steps, or hours of collecting and learning
+    #[arg(long, value_enum, default_value_t = Along::Steps)]
+    pub along: Along,
+    /// Iterations averaged into each point, by default up to 50 and a tenth of the shortest run; if runs differ in iteration length,
+    /// the shortest counts
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    pub smooth: Option<usize>,
+    /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest
+    #[arg(long)]
+    pub seeds: bool,
+    /// Size of the picture in pixels [default: width 800, height 260 per panel]
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    pub size: Option<[u32; 2]>,
+}
+
+/// The quantity on the x axis of a learning curve.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Along {
+    /// Control steps over all environments
+    Steps,
+    /// Hours of collecting and learning, without evaluations and saving
+    Hours,
+}
+
+/// The options of `runs`.
+#[derive(Args, Debug)]
+pub struct RunsArgs {
+    /// Folder of runs to list, or a run; two runs are compared, more are listed [default: runs/shadow-hand-repose]
+    #[arg(value_name = "DIR|RUN")]
+    pub places: Vec<PathBuf>,
+    /// Print one JSON array; of two runs that are compared, one object
+    #[arg(long)]
+    pub json: bool,
+    /// Refresh the table every few seconds until Ctrl-C
+    #[arg(long, conflicts_with = "json")]
+    pub watch: bool,
+}

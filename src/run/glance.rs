@@ -1,0 +1,65 @@
+//! What the files of a run tell those who only look. Nothing is changed, no link in a folder is followed, no pipe is waited for.
+
+use std::fs::{self, Metadata};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use anyhow::{Context, Result, bail};
+
+use super::folder::{CONFIG, FINISHED, METRICS, RUNS};
+use crate::os::{Cannot, Hold, LOCK};
+
+/// The files of a run.
+#[derive(Clone, Debug)]
+pub struct Glance {
+    /// When its settings were written or, without settings, when its folder was last changed.
+    pub begun: Option<SystemTime>,
+    /// Who holds its lock.
+    pub hold: Hold,
+    /// Whether it is marked as one that is not to be continued.
+    pub is_marked: bool,
+    /// Its settings, if they are there.
+    pub config: Option<PathBuf>,
+    /// Its table, if it is there.
+    pub metrics: Option<PathBuf>,
+    /// When a row was last written.
+    pub logged: Option<SystemTime>,
+}
+
+impl Glance {
+    /// Looks at a folder; returns `None` if it holds no run.
+    pub fn of(folder: &Path) -> Option<Self> {
+        // Any other kind of file, e.g. a link, is not one of a run.
+        let facts = |name: &str| fs::symlink_metadata(folder.join(name)).ok().filter(Metadata::is_file);
+        let written = |facts: &Option<Metadata>| facts.as_ref().and_then(|facts| facts.modified().ok());
+        let [config, metrics, lock, mark] = [CONFIG, METRICS, LOCK, FINISHED].map(facts);
+        if config.is_none() && metrics.is_none() && lock.is_none() {
+            return None;
+        }
+        let changed = || fs::metadata(folder).and_then(|facts| facts.modified()).ok();
+        Some(Self {
+            begun: written(&config).or_else(changed),
+            hold: Hold::of(folder),
+            // A file with content is the user's.
+            is_marked: mark.is_some_and(|facts| facts.len() == 0),
+            logged: written(&metrics),
+            config: config.map(|_| folder.join(CONFIG)),
+            metrics: metrics.map(|_| folder.join(METRICS)),
+        })
+    }
+}
+
+/// Returns the folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out.
+///
+/// # Errors
+/// Fails if the folder cannot be read.
+pub fn folders_of_runs(folder: Option<&Path>) -> Result<Vec<PathBuf>> {
+    let path = folder.unwrap_or(Path::new(RUNS));
+    if folder.is_none() && !path.exists() {
+        bail!("there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder");
+    }
+    let entries = fs::read_dir(path).cannot("read the folder", path)?;
+    let entries = entries.collect::<std::io::Result<Vec<_>>>().with_context(|| path.display().to_string())?;
+    let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());
+    Ok(entries.into_iter().filter(is_folder).map(|entry| entry.path()).collect())
+}

@@ -1,0 +1,137 @@
+//! Two runs beside each other: the settings in which they differ, and their figures at equal steps.
+
+use anyhow::{Context, Result};
+use serde_json::{Map, Value, json};
+
+use super::found::Run;
+use crate::config::{Difference, short};
+use crate::os::{aligned, harmless, number};
+use crate::run::{read_metrics, value_at};
+
+/// The most steps at which figures are compared.
+const MOST_MARKS: usize = 12;
+
+/// A figure: its key in JSON, its column, its head, the factor in the table, and its decimals.
+type Figure = (&'static str, &'static str, &'static str, f64, usize);
+
+const FIGURES: [Figure; 4] = [
+    ("goals", "eval/goals", "goals", 1.0, 2),
+    ("drop_rate", "eval/drop_rate", "drops, %", 100.0, 0),
+    ("rot_dist", "eval/rot_dist", "error, rad", 1.0, 2),
+    ("turned", "training/turned", "turned", 1.0, 2),
+];
+
+/// The figures of evaluations; the others are those of every iteration.
+const OF_EVALUATIONS: usize = 3;
+
+/// Two runs, A and B.
+pub(super) struct Comparison {
+    /// The settings in which they differ; `None` if those of one are not known.
+    settings: Option<Vec<Difference>>,
+    /// Steps, and the figures of both there.
+    rows: Vec<(f64, [[f64; 2]; FIGURES.len()])>,
+}
+
+/// The points of each figure of a run, over control steps.
+type Curves = [Vec<[f64; 2]>; FIGURES.len()];
+
+impl Comparison {
+    /// Compares two runs.
+    ///
+    /// # Errors
+    /// Fails if the table of one cannot be read.
+    pub(super) fn of(a: &Run, b: &Run) -> Result<Self> {
+        let configs = a.config.as_ref().zip(b.config.as_ref());
+        let curves = [curves(a)?, curves(b)?];
+        let mut begin = f64::NEG_INFINITY;
+        let row = |step| {
+            let figures = std::array::from_fn(|figure| {
+                [&curves[0], &curves[1]].map(|of| match figure {
+                    0..OF_EVALUATIONS => value_at(&of[figure], step).unwrap_or(f64::NAN),
+                    _ => mean_between(&of[figure], begin, step),
+                })
+            });
+            begin = step;
+            (step, figures)
+        };
+        let rows = marks(&curves).into_iter().map(row).collect();
+        Ok(Self { settings: configs.map(|(a, b)| a.compared_with(b)), rows })
+    }
+
+    /// Returns it as lines that follow the table of both runs.
+    pub(super) fn lines(&self) -> Vec<String> {
+        let words = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<String>>();
+        let settings = match self.settings.as_deref() {
+            None => vec![words(&["the settings of one run are not known"])],
+            Some([]) => vec![words(&["the settings are the same"])],
+            Some(all) => {
+                let row = |(key, both): &Difference| [key.clone()].into_iter().chain(both.iter().map(short)).collect();
+                [words(&["setting", "A", "B"])].into_iter().chain(all.iter().map(row)).collect()
+            }
+        };
+        let settings = settings.into_iter().map(|row| row.iter().map(|cell| harmless(cell)).collect());
+        let settings: Vec<Vec<String>> = settings.collect();
+        let heads = FIGURES.iter().flat_map(|(_, _, head, ..)| [format!("{head} A"), "B".to_owned()]);
+        let heads = ["steps".to_owned()].into_iter().chain(heads).collect();
+        let figures = self.rows.iter().map(|(step, figures)| {
+            let both = |((.., factor, decimals), both): (&Figure, &[f64; 2])| {
+                both.map(|value| number(factor * value, *decimals))
+            };
+            let cells = FIGURES.iter().zip(figures).flat_map(both);
+            [format!("{step:.0}")].into_iter().chain(cells).collect()
+        });
+        let figures = if self.rows.is_empty() {
+            vec!["there are no steps up to which both were evaluated".into()]
+        } else {
+            aligned(&[heads].into_iter().chain(figures).collect::<Vec<_>>(), 0)
+        };
+        [vec![String::new()], aligned(&settings, 2), vec![String::new()], figures].concat()
+    }
+
+    /// Returns it as an object of JSON, with these objects of both runs.
+    pub(super) fn as_json(&self, runs: &[Value]) -> Value {
+        let settings = self.settings.as_ref().map(|all| {
+            let both = all.iter().map(|(key, both)| (key.clone(), json!(both)));
+            both.collect::<Map<String, Value>>()
+        });
+        let row = |(step, figures): &(f64, [[f64; 2]; FIGURES.len()])| {
+            let figures = FIGURES.iter().zip(figures).map(|((key, ..), both)| ((*key).to_owned(), json!(both)));
+            let steps = ("env_steps".to_owned(), json!(*step as u64));
+            Value::Object([steps].into_iter().chain(figures).collect())
+        };
+        json!({
+            "runs": runs,
+            "settings": settings,
+            "at_equal_steps": self.rows.iter().map(row).collect::<Vec<Value>>(),
+        })
+    }
+}
+
+/// Reads the curves of a run. One without a table has none.
+fn curves(run: &Run) -> Result<Curves> {
+    if !run.has_table() {
+        return Ok(Curves::default());
+    }
+    let columns = FIGURES.map(|(_, column, ..)| column);
+    let table = read_metrics(&run.path, &["env_steps"], &columns).context("cannot compare")?;
+    let steps = &table.columns["env_steps"];
+    Ok(columns.map(|column| {
+        let values = table.columns.get(column).map_or(&[][..], |values| values);
+        let points = steps.iter().zip(values).map(|(step, value)| [*step, *value]);
+        points.filter(|point| point.iter().all(|x| !x.is_nan())).collect()
+    }))
+}
+
+/// Returns the steps at which A was evaluated while B was, too: the last one, and others evenly before it.
+fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
+    let common: Vec<f64> = a[0].iter().map(|[step, _]| *step).filter(|step| value_at(&b[0], *step).is_some()).collect();
+    let count = common.len().min(MOST_MARKS);
+    (1..=count).map(|mark| common[mark * common.len() / count - 1]).collect()
+}
+
+/// Returns the mean of the values after `begin` up to `end`; NaN if there are none.
+fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
+    let inside = points.iter().filter(|[step, _]| *step > begin && *step <= end).map(|[_, value]| *value);
+    let (sum, count) = inside.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
+    sum / count
+}

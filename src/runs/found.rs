@@ -1,0 +1,246 @@
+//! What is found in the folder of a run: its state, its figures, and its settings.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use anyhow::Result;
+use serde_json::{Map, Value, json};
+
+use crate::config::{Config, Difference, short};
+use crate::os::{self, Hold, Stamp, clock, harmless, number, steps_of_all};
+use crate::run::{Glance, read_metrics};
+
+/// The last rows of a table over which its speed is averaged.
+const LAST: usize = 20;
+
+/// The age from which the last row says that nobody trains, where a lock cannot be seen. An evaluation or a film takes less.
+const SILENT: Duration = Duration::from_secs(120);
+
+/// The most characters of a name in the table.
+const LONGEST_NAME: usize = 40;
+
+/// Where a run stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// A training writes into it.
+    Training,
+    /// All steps are made.
+    Finished,
+    /// It was stopped by a signal, by `--stop-after` or by a file `stop`.
+    Stopped,
+    /// It ended by an error, or was killed.
+    Failed,
+}
+
+/// A run as it is shown.
+#[derive(Clone, Debug)]
+pub(super) struct Run {
+    pub(super) path: PathBuf,
+    pub(super) name: String,
+    state: State,
+    total_steps: Option<u64>,
+    pub(super) figures: Figures,
+    pub(super) config: Option<Config>,
+    /// How its settings differ from the default.
+    changed: Vec<Difference>,
+    /// Why files of it cannot be read.
+    problems: Vec<String>,
+}
+
+/// The figures in the table of a run; NaN where it has none.
+#[derive(Clone, Debug)]
+pub(super) struct Figures {
+    /// What of the table they were read from.
+    stamp: Option<Stamp>,
+    env_steps: Option<u64>,
+    steps_per_s: f64,
+    /// Goals of the last evaluation and of the best one.
+    goals: f64,
+    best_goals: f64,
+    problem: Option<String>,
+}
+
+impl Run {
+    /// Reads what a run tells at the time `now`. Figures that are `known` are read again only if the table has changed.
+    pub(super) fn of(
+        path: &Path,
+        glance: &Glance,
+        default: &Config,
+        known: Option<&&Figures>,
+        now: SystemTime,
+    ) -> Self {
+        let config = glance.config.as_ref().map(|path| {
+            let text = os::read_text(path)?;
+            Config::from_text(path, &text, &[])
+        });
+        let (config, problem) = match config.transpose() {
+            Ok(config) => (config, None),
+            Err(error) => (None, Some(format!("config.toml is not one of this version: {error:#}"))),
+        };
+        let stamp = glance.metrics.as_deref().and_then(Stamp::of);
+        let figures = match known.filter(|known| known.stamp == stamp) {
+            Some(known) => (*known).clone(),
+            None => Figures { stamp, ..Figures::of(path, glance.metrics.is_some()) },
+        };
+        let total_steps = config.as_ref().map(|config| config.run.total_steps);
+        let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        Self {
+            name: whole.file_name().unwrap_or(whole.as_os_str()).to_string_lossy().into_owned(),
+            state: State::of(glance, figures.env_steps, total_steps, now),
+            total_steps,
+            changed: config.as_ref().map_or(Vec::new(), |config| default.compared_with(config)),
+            problems: problem.into_iter().chain(figures.problem.clone()).collect(),
+            path: path.to_owned(),
+            figures,
+            config,
+        }
+    }
+
+    /// Whether it has a table of figures.
+    pub(super) fn has_table(&self) -> bool {
+        self.figures.stamp.is_some()
+    }
+
+    /// Returns the time that its steps take at its present speed, if it trains.
+    fn left(&self) -> Option<Duration> {
+        let steps = self.total_steps?.saturating_sub(self.figures.env_steps?);
+        let left = Duration::try_from_secs_f64(steps as f64 / self.figures.steps_per_s).ok();
+        left.filter(|_| self.state == State::Training)
+    }
+
+    /// Returns it as the cells of a row.
+    pub(super) fn cells(&self) -> Vec<String> {
+        let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
+        let steps = match (env_steps, self.total_steps) {
+            (Some(made), Some(all)) => steps_of_all(made, all),
+            (Some(made), None) => made.to_string(),
+            (None, _) => "-".into(),
+        };
+        let settings = match (&self.problems[..], &self.config) {
+            ([], None) => "no config.toml".into(),
+            ([], _) => {
+                self.changed.iter().map(|(key, [_, own])| format!("{key}={}", short(own))).collect::<Vec<_>>().join(" ")
+            }
+            (problems, _) => problems.join("; ").lines().map(str::trim).collect::<Vec<_>>().join(" "),
+        };
+        let name = match self.name.char_indices().nth(LONGEST_NAME) {
+            Some((end, _)) => format!("{}…", &self.name[..end]),
+            None => self.name.clone(),
+        };
+        vec![
+            harmless(&name),
+            self.state.name().into(),
+            self.left().map_or("-".into(), clock),
+            steps,
+            number(steps_per_s, 0),
+            number(goals, 2),
+            number(best_goals, 2),
+            harmless(&settings),
+        ]
+    }
+
+    /// Returns it as an object of JSON.
+    pub(super) fn as_json(&self) -> Value {
+        let changed = self.changed.iter().map(|(key, [_, own])| (key.clone(), json!(own)));
+        let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
+        json!({
+            "name": self.name,
+            "path": self.path.to_string_lossy(),
+            "state": self.state.name(),
+            "seconds_left": self.left().map(|left| left.as_secs()),
+            "env_steps": env_steps,
+            "total_steps": self.total_steps,
+            "steps_per_s": steps_per_s,
+            "goals": goals,
+            "best_goals": best_goals,
+            "changed": self.config.is_some().then(|| changed.collect::<Map<String, Value>>()),
+            "problems": self.problems,
+        })
+    }
+}
+
+impl Figures {
+    /// Reads the table of a run, if it has one.
+    fn of(run: &Path, has_table: bool) -> Self {
+        let unknown = f64::NAN;
+        let none = Self {
+            stamp: None,
+            env_steps: None,
+            steps_per_s: unknown,
+            goals: unknown,
+            best_goals: unknown,
+            problem: None,
+        };
+        if !has_table {
+            return none;
+        }
+        let read = || -> Result<Self> {
+            let names = ["env_steps", "time/steps_per_s", "eval/goals"];
+            let table = read_metrics(run, &names[..1], &names[1..])?;
+            let [steps, speeds, goals] = names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
+            let known = |values: &[f64]| values.iter().copied().filter(|value| !value.is_nan()).collect::<Vec<f64>>();
+            let (speeds, goals) = (known(&speeds[speeds.len().saturating_sub(LAST)..]), known(goals));
+            Ok(Self {
+                env_steps: Some(steps.last().map_or(0, |steps| *steps as u64)),
+                steps_per_s: speeds.iter().sum::<f64>() / speeds.len() as f64,
+                goals: goals.last().copied().unwrap_or(unknown),
+                best_goals: goals.into_iter().fold(unknown, f64::max),
+                ..none.clone()
+            })
+        };
+        read().unwrap_or_else(|error| Self { problem: Some(format!("{error:#}")), ..none })
+    }
+}
+
+impl State {
+    /// Returns the state of a run with these files and steps.
+    fn of(glance: &Glance, env_steps: Option<u64>, total_steps: Option<u64>, now: SystemTime) -> Self {
+        let all = env_steps.zip(total_steps).map(|(made, all)| made >= all);
+        let age = glance.logged.map(|logged| now.duration_since(logged).unwrap_or_default());
+        match glance.hold {
+            Hold::Held => Self::Training,
+            _ if all.unwrap_or(glance.is_marked) => Self::Finished,
+            _ if glance.is_marked => Self::Stopped,
+            Hold::Elsewhere if age.is_some_and(|age| age < SILENT) => Self::Training,
+            Hold::Released => Self::Stopped,
+            Hold::Left | Hold::Elsewhere => Self::Failed,
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Training => "training",
+            Self::Finished => "finished",
+            Self::Stopped => "stopped",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_state_follows_from_the_lock_the_mark_the_steps_and_where_no_lock_is_seen_from_the_age() {
+        let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1000);
+        let state = |hold, is_marked, made: Option<u64>, age| {
+            let logged = Some(now - Duration::from_secs(age));
+            let glance = Glance { begun: None, hold, is_marked, config: None, metrics: None, logged };
+            State::of(&glance, made, Some(9), now)
+        };
+        use Hold::{Elsewhere, Held, Left, Released};
+        assert_eq!(
+            state(Held, true, Some(9), 500),
+            State::Training,
+            "resumed with more steps, before its first iteration"
+        );
+        assert_eq!(state(Left, false, Some(9), 500), State::Finished);
+        assert_eq!(state(Released, true, None, 500), State::Finished, "a table that cannot be read");
+        assert_eq!(state(Released, true, Some(5), 500), State::Stopped, "by a file");
+        assert_eq!(state(Released, false, Some(5), 500), State::Stopped);
+        assert_eq!([state(Left, false, Some(5), 3), state(Left, false, None, 3)], [State::Failed; 2]);
+        assert_eq!(state(Elsewhere, false, Some(5), 3), State::Training);
+        assert_eq!(state(Elsewhere, false, Some(5), 500), State::Failed);
+    }
+}

@@ -1,0 +1,101 @@
+//! A table of run folders, newest first, and the comparison of two runs. All is found from their files, which are only read.
+
+mod comparison;
+mod found;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, SystemTime};
+
+use anyhow::{Context, Result, ensure};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+
+use crate::cli::RunsArgs;
+use crate::config::Config;
+use crate::os::{self, Screen, aligned, text_of};
+use crate::run::{self, Glance};
+use comparison::Comparison;
+use found::{Figures, Run};
+
+/// The time between two tables of `--watch`.
+const EVERY: Duration = Duration::from_secs(5);
+
+/// The heads of the columns; words are in the first [`WORDS`].
+const HEADS: [&str; 8] = ["run", "state", "left", "steps", "steps/s", "goals", "best", "differs from the default in"];
+const WORDS: usize = 2;
+
+/// Prints the runs in a folder or, of two runs, their comparison; with `--watch` again and again.
+///
+/// # Errors
+/// Fails if the folder cannot be read, if a folder that is named holds no run, or if stdout cannot be written to.
+pub fn runs(args: &RunsArgs) -> Result<()> {
+    os::start_threads(0)?;
+    let default = Config::resolve(None, &[])?;
+    let (mut screen, mut before) = (Screen::default(), Vec::new());
+    loop {
+        let runs = read(&args.places, &default, &before)?;
+        let compared = match &runs[..] {
+            [a, b] if args.places.len() == 2 => Some(Comparison::of(a, b)?),
+            _ => None,
+        };
+        if args.json {
+            let all: Vec<Value> = runs.iter().map(Run::as_json).collect();
+            let text = compared.map_or_else(|| json!(all), |compared| compared.as_json(&all));
+            return os::print(&(os::harmless(&text.to_string()) + "\n"));
+        }
+        if runs.is_empty() && !args.watch {
+            os::say("there are no runs in this folder");
+        }
+        let letters = if compared.is_some() { &["A", "B"][..] } else { &[] };
+        let mut lines = table(&runs, letters);
+        lines.extend(compared.iter().flat_map(Comparison::lines));
+        if !args.watch {
+            return os::print(&text_of(&lines));
+        }
+        if !screen.show(lines)? {
+            return Ok(());
+        }
+        before = runs;
+        thread::sleep(EVERY);
+    }
+}
+
+/// Reads the runs at these places: one folder of runs, or runs themselves. Those of a folder come newest first. What was read
+/// `before` of a table that has not changed is not read again.
+fn read(places: &[PathBuf], default: &Config, before: &[Run]) -> Result<Vec<Run>> {
+    let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
+    let mut found: Vec<(PathBuf, Glance)> = match places {
+        [] => run::folders_of_runs(None)?.into_iter().filter_map(seen).collect(),
+        [place] if Glance::of(place).is_none() => {
+            run::folders_of_runs(Some(place))?.into_iter().filter_map(seen).collect()
+        }
+        places => {
+            let runs = places.iter().map(|place| {
+                ensure!(place.exists(), "{}: no such folder", place.display());
+                let no_run = || format!("{} holds no run; a folder of runs is named alone", place.display());
+                seen(place.clone()).with_context(no_run)
+            });
+            runs.collect::<Result<_>>()?
+        }
+    };
+    if places.len() < 2 {
+        found.sort_by(|(a, of_a), (b, of_b)| (of_b.begun, b).cmp(&(of_a.begun, a)));
+    }
+    let known: HashMap<&Path, &Figures> = before.iter().map(|run| (&*run.path, &run.figures)).collect();
+    let now = SystemTime::now();
+    Ok(found.into_par_iter().map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now)).collect())
+}
+
+/// Returns the runs as lines, each with its letter if they have some.
+fn table(runs: &[Run], letters: &[&str]) -> Vec<String> {
+    let heads = HEADS.map(String::from).to_vec();
+    let rows = [heads].into_iter().chain(runs.iter().map(Run::cells));
+    let marks = [""].iter().chain(letters).map(|letter| vec![(*letter).to_owned()]);
+    let rows: Vec<Vec<String>> = match letters.len() {
+        0 => rows.collect(),
+        _ => marks.zip(rows).map(|(mark, row)| [mark, row].concat()).collect(),
+    };
+    aligned(&rows, WORDS + usize::from(!letters.is_empty()))
+}
