@@ -17,7 +17,7 @@ pub fn print(text: &str) -> Result<()> {
 /// Prints text to stdout, and returns whether somebody reads it: a pipe may be closed.
 ///
 /// # Errors
-/// Fails as [`print`] does.
+/// Fails as [`print()`] does.
 pub(super) fn is_read(text: &str) -> Result<bool> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {

@@ -18,7 +18,7 @@ use serde_json::{Map, Value, json};
 use self::actors::{actor_of, baseline};
 use self::browser::Followed;
 use self::files::Files;
-use crate::cli::{Baseline, PlayArgs, Shot, usage_error};
+use crate::cli::{PlayArgs, Shot, usage_error};
 use crate::config::{Config, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
@@ -184,14 +184,14 @@ fn leaves_open(args: &PlayArgs) -> bool {
 #[cfg(feature = "viewer")]
 fn show(args: &PlayArgs, task: &Task, loaded: Option<&Loaded>) -> Result<bool> {
     let task = see::task_for_display(task, &args.shot, [1280, 720], crate::sim::Quality::High)?;
-    let (names, actors, first) = match (loaded, args.policy) {
-        (Some(loaded), _) => {
+    let (names, actors, first) = match loaded {
+        Some(loaded) => {
             let policy = &loaded.policy;
             let actors = vec![Actor::Mean(policy.freeze()), Actor::Stochastic(policy.freeze())];
             (vec!["deterministic", "stochastic"], actors, usize::from(args.stochastic))
         }
-        (None, policy) => {
-            let first = usize::from(policy == Some(Baseline::Random));
+        None => {
+            let first = usize::from(matches!(baseline(args), Actor::Random));
             (vec!["zero", "random"], vec![Actor::Zero, Actor::Random], first)
         }
     };
