@@ -96,8 +96,14 @@ impl Lane {
 
     fn start(&mut self, episodes: Episodes, episode: usize, observation: &mut [f32]) {
         self.env.reset(rng::stream(episodes.seed, episodes.purpose, episode as u64), observation);
+        self.env.take_sums();
         self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
         self.running = true;
+    }
+
+    /// Returns the record of the episode, once.
+    fn episode(&mut self) -> EpisodeStats {
+        EpisodeStats { turned: self.env.take_sums().turned, ..self.env.episode() }
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Option<End> {
@@ -236,7 +242,7 @@ impl Trial<'_> {
                     lane.running = lane.end.is_none();
                 }
             }
-            results.extend((first..).zip(lanes[..started].iter().map(|lane| lane.env.episode())));
+            results.extend((first..).zip(lanes[..started].iter_mut().map(Lane::episode)));
         }
         Ok(Some(results))
     }

@@ -34,10 +34,14 @@ impl Config {
         default.compared_with(self).into_iter().map(|(key, [_, own])| (key, own)).collect()
     }
 
-    /// Returns all settings by dotted key.
+    /// Returns all settings by dotted key, but for those that only divide the work.
+    ///
+    /// # Panics
+    /// Never panics: a configuration is a tree of tables.
     pub fn dotted(&self) -> Table {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
-        settings(&own).map(|(key, value)| (key, value.clone())).collect()
+        let of_training = settings(&own).filter(|(key, _)| !matches!(&**key, "run.threads" | "run.shards"));
+        of_training.map(|(key, value)| (key, value.clone())).collect()
     }
 
     /// Returns the same training, whatever the length of its run and the machine.

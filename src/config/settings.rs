@@ -225,7 +225,6 @@ pub struct RunConfig {
     pub eval_every: u64,
     pub eval_episodes: usize,
     pub film_every: u64,
-    pub all_hparams: bool,
     pub seed: u64,
     pub shards: usize,
     pub threads: usize,

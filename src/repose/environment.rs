@@ -350,7 +350,6 @@ impl Env for Repose {
             self.sums.task += reward;
             self.sums.training += added;
             self.sums.turned += rot_dist_before - self.now.rot_dist;
-            self.episode.turned += rot_dist_before - self.now.rot_dist;
             reached = self.hold(self.now.within);
         }
         let Step { rot_dist, goal_dist, .. } = self.now;

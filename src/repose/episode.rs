@@ -28,8 +28,7 @@ pub struct EpisodeStats {
     pub diverged: bool,
     /// Whether it was randomised. Not written by `save`; the environment stores it beside the episode.
     pub randomized: bool,
-    /// Sum of the rotation towards the goal, rad; negative away from it. Not written by `save`: only evaluations use it, which
-    /// play episodes whole.
+    /// Sum of the rotation towards the goal, rad; negative away from it. Only known of an episode that was played for a score.
     pub turned: f64,
 }
 

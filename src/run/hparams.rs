@@ -1,4 +1,5 @@
-//! A run as a row of TensorBoard's HPARAMS: some settings, and a few figures as metrics.
+//! A run as a row of TensorBoard's HPARAMS: its settings, and a few figures as metrics. TensorBoard puts the settings in front in
+//! which runs differ, and draws only runs that have a value for each of them: so all settings are in each row.
 //!
 //! The row has a folder of its own, `hparams` in that of the run, because TensorBoard takes all scalars beside it for its metrics.
 //! No experiment is written, which would name the columns of all rows: no run knows the others, and TensorBoard finds them by itself.

@@ -269,8 +269,7 @@ fn new_report(session: &Session, saver: &Saver, quiet: bool) -> Report {
     let tags = tags(session.config.randomization.happens());
     let progress = StatusLine::new(session.agent.env_steps, session.config.run.total_steps, quiet);
     let config = &session.config;
-    let settings = if config.run.all_hparams { config.dotted() } else { config.unlike_default() };
-    let hparams = Hparams { settings, goals: session.best.map(|best| best.goals) };
+    let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
     Report::new(saver.held.folder.path(), &tags, progress).described(described(&tags), config.to_text(), hparams)
 }
 

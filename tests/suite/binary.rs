@@ -32,8 +32,16 @@ fn a_training_leaves_its_files_and_nothing_else() {
     let run = folder.path().join("run");
     let found = names(&run);
     assert!(found[2].starts_with("events.out.tfevents."), "{found:?}");
-    let expected =
-        ["checkpoints", "config.toml", "finished", "metrics.csv", "policy.safetensors", "run.lock", "version.txt"];
+    let expected = [
+        "checkpoints",
+        "config.toml",
+        "finished",
+        "hparams",
+        "metrics.csv",
+        "policy.safetensors",
+        "run.lock",
+        "version.txt",
+    ];
     assert_eq!([&found[..2], &found[3..]].concat(), expected);
     let checkpoints =
         ["best", "iteration-00000000", "iteration-00000002", "latest"].map(|name| format!("{name}.safetensors"));
