@@ -28,5 +28,5 @@ pub use window::Window;
 pub const NO_FILMS: &str = "this build cannot make films or pictures: it was built without the feature `video`";
 
 /// The message of a build without windows.
-pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`; use `play --headless` to \
-    score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw";
+pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`; use `--web` for a browser, \
+    `play --headless` to score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw";

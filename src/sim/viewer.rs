@@ -14,7 +14,8 @@ use super::{Controls, Readout, Scene, Simulation};
 const HELP: &str = "
   A window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL.
   On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0
-  Without a window: `play --headless` to score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw.";
+  Without a window: `--web` for a browser, `play --headless` to score, `play --video film.mp4` to film, \
+     `view --screenshot picture.png` to draw.";
 
 /// An open window.
 pub struct Viewer {
