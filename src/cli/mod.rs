@@ -311,7 +311,8 @@ pub struct ViewArgs {
     pub screenshot: Option<PathBuf>,
     /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free one) [default port:
     /// 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot", help_heading = PICTURE)]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot",
+        help_heading = PICTURE)]
     pub web: Option<u16>,
     /// Time of the picture in the episode, in seconds [default: 0.5]
     #[arg(long, value_name = "SECONDS", requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]

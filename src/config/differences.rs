@@ -25,23 +25,14 @@ impl Config {
         differing([self, other].map(Self::settled))
     }
 
-    /// Returns the settings that make this another training than the default one, by dotted key.
-    ///
-    /// # Panics
-    /// Never panics: the defaults are valid.
-    pub fn unlike_default(&self) -> Table {
-        let default = Self::resolve(None, &[]).expect("the defaults are valid");
-        default.compared_with(self).into_iter().map(|(key, [_, own])| (key, own)).collect()
-    }
-
-    /// Returns all settings by dotted key, but for those that only divide the work.
+    /// Returns all settings by dotted key, but for those that only divide the work. A ramp that stays where it is is a number.
     ///
     /// # Panics
     /// Never panics: a configuration is a tree of tables.
     pub fn dotted(&self) -> Table {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
         let of_training = settings(&own).filter(|(key, _)| !matches!(&**key, "run.threads" | "run.shards"));
-        of_training.map(|(key, value)| (key, value.clone())).collect()
+        of_training.map(|(key, value)| (key, constant(value).unwrap_or(value).clone())).collect()
     }
 
     /// Returns the same training, whatever the length of its run and the machine.
@@ -59,8 +50,8 @@ impl EnvConfig {
     /// Never panics: the defaults are valid.
     pub fn unlike_default(&self) -> Table {
         let default = Config::resolve(None, &[]).expect("the defaults are valid");
-        let own = Config { env: Self { num_envs: default.env.num_envs, ..self.clone() }, ..default };
-        own.unlike_default()
+        let own = Config { env: Self { num_envs: default.env.num_envs, ..self.clone() }, ..default.clone() };
+        default.compared_with(&own).into_iter().map(|(key, [_, own])| (key, own)).collect()
     }
 }
 
@@ -70,17 +61,17 @@ fn differing(both: [Config; 2]) -> Vec<Difference> {
     both.map(|((key, own), (_, other))| (key, [own.clone(), other.clone()])).collect()
 }
 
+/// Returns the value of a ramp that stays where it is.
+fn constant(value: &Value) -> Option<&Value> {
+    let ramp = value.as_table().filter(|table| is_ramp(table))?;
+    (ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0)).then_some(&ramp["from"])
+}
+
 /// Returns a value as `--set` takes it, without spaces.
 pub fn short(value: &Value) -> String {
     let joined = |parts: Vec<String>| parts.join(",");
-    match value {
+    match constant(value).unwrap_or(value) {
         Value::Array(values) => format!("[{}]", joined(values.iter().map(inner).collect())),
-        // A constant.
-        Value::Table(ramp)
-            if is_ramp(ramp) && ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0) =>
-        {
-            short(&ramp["from"])
-        }
         Value::Table(parts) => {
             format!("{{{}}}", joined(parts.iter().map(|(key, value)| format!("{key}={}", inner(value))).collect()))
         }

@@ -161,6 +161,17 @@ mod tests {
             assert!(text.is_ascii(), "{:?}", text.chars().find(|c| !c.is_ascii()));
             assert!(!text.contains("://") && !text.contains("src="), "it loads something");
         }
+        for text in CODE.into_iter().chain([STYLE]) {
+            assert!(!["</script", "</style", "<!--"].iter().any(|end| text.contains(end)), "it would end early");
+        }
+    }
+
+    #[test]
+    fn the_example_in_the_documents_has_the_code_and_the_style_of_today() {
+        let example = include_str!("../../docs/hand.html");
+        for text in CODE.into_iter().chain([STYLE]) {
+            assert!(example.contains(&lean(text)), "write it anew, as CONTRIBUTING.md says");
+        }
     }
 
     #[test]

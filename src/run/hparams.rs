@@ -79,9 +79,7 @@ fn start_info(settings: &Table) -> Result<Vec<u8>> {
 
 /// Returns an entry of the map of settings: a key, and a `google.protobuf.Value`.
 fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
-    // A ramp that stays where it is.
-    let constant = value.get("from").filter(|from| value.get("to") == Some(from));
-    let value = message(|out| match constant.unwrap_or(value) {
+    let value = message(|out| match value {
         Value::Integer(x) => out.write_double(2, *x as f64),
         Value::Float(x) => out.write_double(2, *x),
         Value::Boolean(x) => out.write_bool(4, *x),
@@ -144,10 +142,9 @@ mod tests {
 
     #[test]
     fn the_start_of_a_row_holds_each_setting_as_a_number_a_truth_or_a_text() {
-        let settings: Table = toml::from_str(
-            "a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 8.0, to = 8.0, steps = 0}\ng = {from = 1, to = 2, steps = 3}",
-        )
-        .unwrap();
+        let settings: Table =
+            toml::from_str("a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 1, to = 2, steps = 3}")
+                .unwrap();
         let value = session_value("session_start_info", 3, &start_info(&settings).unwrap()).unwrap();
         let (field, info) = content(&value);
         assert_eq!((value.get_tag(), field), ("_hparams_/session_start_info", 3));
@@ -165,7 +162,7 @@ mod tests {
                 format!("{} {shown}", String::from_utf8(key.clone()).unwrap())
             })
             .collect();
-        let expected = "a 3; b 0.5; c true; d tanh; e [1, 2]; f 8; g { from = 1, to = 2, steps = 3 }";
+        let expected = "a 3; b 0.5; c true; d tanh; e [1, 2]; f { from = 1, to = 2, steps = 3 }";
         assert_eq!(entries.join("; "), expected);
     }
 
