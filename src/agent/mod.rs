@@ -173,7 +173,7 @@ impl<E: Resumable> Agent<E> {
     /// that exchange call it together.
     pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
-        let progress = Progress { iteration, env_steps, best, fork };
+        let progress = Progress { iteration, env_steps, best, fork, rise: None };
         let mut checkpoint = self.ppo.checkpoint(config, progress);
         let EnvState { numbers, counters } = EnvState::joined(self.exchange.all_gather(self.pool.save()));
         let rows = self.exchange.of_all(self.pool.count());

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::BASE;
-use super::overlay::{DEFAULTS, lookup, overlay, settings, table_of};
+use super::overlay::{DEFAULTS, lookup, number, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use crate::os;
@@ -16,6 +16,10 @@ use crate::sim::Parts;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
+
+/// The setting of the task that changes in the course of a training, and the ramp that it follows there.
+const SMOOTHING: &str = "env.act_moving_average";
+const TRAINED_SMOOTHING: &str = "training.act_moving_average";
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -184,6 +188,11 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     let mut named = BTreeSet::new();
     let mut lay = |table: &Table, merged: &mut Table| {
         named.extend(settings(table).map(|(key, _)| key));
+        // A smoothing that is named alone is the one of the whole training.
+        let smoothing = lookup(table, SMOOTHING).filter(|_| lookup(table, TRAINED_SMOOTHING).is_none());
+        if let Some(constant) = smoothing.filter(|value| number(value).is_some()) {
+            overlay(merged, &table_of(TRAINED_SMOOTHING, &constant.to_string(), merged), &DEFAULTS, "", &mut problems);
+        }
         overlay(merged, table, &DEFAULTS, "", &mut problems);
     };
     [Some(under), given].iter().flatten().for_each(|table| lay(table, &mut merged));
@@ -206,6 +215,10 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     }
     let mut config = Config::deserialize(Value::Table(merged))?;
     let env = &mut config.env;
+    env.act_moving_average = config.training.act_moving_average.by_equal_steps(0);
+    if env.model_file().is_some() && !named.contains("randomization.cube_size") {
+        config.randomization.cube_size = [1.0; 2];
+    }
     env.goal_position.named = named.contains("env.goal_position");
     env.num_hand_dofs.named = named.contains("env.num_hand_dofs");
     env.num_actuators.named = named.contains("env.num_actuators");

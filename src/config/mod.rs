@@ -29,12 +29,14 @@ pub use settings::{
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use toml::{Table, Value};
 
     use super::*;
 
     fn shipped(text: &str) -> Config {
-        Config::resolve(Some(&Source { path: "x.toml".into(), text: text.into() }), &[]).unwrap()
+        Config::resolve(Some(&source(text)), &[]).unwrap()
     }
 
     #[test]
@@ -59,27 +61,80 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_less_smoothing_and_less_noise() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends() {
         let default = Config::resolve(None, &[]).unwrap();
-        let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
-        let (drop_reward, tolerance, hold) = (training.drop_reward, training.tolerance, training.hold);
-        let [drop_reward, tolerance, hold] = [drop_reward, tolerance, hold].map(ended);
-        assert_eq!(continuing.training, TrainingConfig { drop_reward, tolerance, hold, ..training });
-        let share = ended(default.randomization.share);
-        assert_eq!(continuing.randomization, RandomizationConfig { share, ..default.randomization });
+        let TrainingConfig { act_moving_average, drop_reward, tolerance, hold, .. } = training;
+        let [act_moving_average, drop_reward, tolerance, hold] =
+            [act_moving_average, drop_reward, tolerance, hold].map(ended);
+        let trained = TrainingConfig { act_moving_average, drop_reward, tolerance, hold, ..training };
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
-        let [horizon, desired_kl] = [ppo.horizon, ppo.desired_kl].map(ended);
-        let PpoConfig { std, away_std, learning_rate, .. } = continuing.ppo;
-        assert!(std.from == std.to && std.to < ppo.std.to && away_std < ppo.away_std);
-        let expected = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate, ..ppo };
-        assert_eq!(continuing.ppo, expected, "only noise and the first learning rate are its own");
-        let act_moving_average = continuing.env.act_moving_average;
-        assert!(act_moving_average > default.env.act_moving_average);
-        assert_eq!(continuing.env, EnvConfig { act_moving_average, ..default.env });
+        let [horizon, desired_kl, std, away_std] = [ppo.horizon, ppo.desired_kl, ppo.std, ppo.away_std].map(ended);
+        let learnt = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };
+        let tuning = shipped(include_str!("../../configs/finetune.toml"));
         let robust = shipped(include_str!("../../configs/repose-robust.toml"));
-        assert_eq!((&robust.env, &robust.ppo), (&continuing.env, &continuing.ppo));
-        assert_eq!(robust.training, TrainingConfig { drop_reward: robust.training.drop_reward, ..continuing.training });
+        let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
+        let priced = TrainingConfig { drop_reward: robust.training.drop_reward, ..trained.clone() };
+        let slower = PpoConfig { critic_first: tuning.ppo.critic_first, ..learnt.clone() };
+        for (found, training, ppo) in
+            [(&continuing, &trained, &learnt), (&tuning, &trained, &slower), (&robust, &priced, &learnt)]
+        {
+            assert_eq!((&found.training, &found.ppo), (training, ppo));
+            let act_moving_average = act_moving_average.to;
+            assert_eq!(found.env, EnvConfig { act_moving_average, ..default.env.clone() });
+        }
+    }
+
+    fn source(text: &str) -> Source {
+        Source { path: "x.toml".into(), text: text.into() }
+    }
+
+    fn set(text: &str) -> Override {
+        text.parse().unwrap()
+    }
+
+    fn errors(text: &str) -> String {
+        Config::resolve(None, &[set(text)]).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_smoothing_that_is_set_alone_holds_for_the_whole_training_and_a_ramp_begins_with_the_one_of_the_task() {
+        let both = |text: &str, sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            let config = Config::resolve(Some(&source(text)), &sets).unwrap();
+            (config.env.act_moving_average, config.training.act_moving_average)
+        };
+        let ramp = Ramp { from: 0.25, to: 0.5, steps: 40_000_000, after: 40_000_000 };
+        let alone = "[env]\nact_moving_average = 1";
+        assert_eq!(both("", &[]), (0.25, ramp));
+        assert_eq!(both("", &["env.act_moving_average=0.6"]), (0.6, Ramp::constant(0.6)));
+        assert_eq!(both(alone, &[]), (1.0, Ramp::constant(1.0)));
+        assert_eq!(both("", &["training.act_moving_average.from=0.3"]), (0.3, Ramp { from: 0.3, ..ramp }));
+        assert_eq!(both(alone, &["training.act_moving_average={from=0.2,to=0.7,steps=9}"]).0, 0.2);
+        assert!(errors("env.act_moving_average=1.5").contains("env.act_moving_average = 1.5: must lie in [0, 1]"));
+        assert!(errors("env.act_moving_average=much").contains("env.act_moving_average = \"much\": must be a number"));
+    }
+
+    #[test]
+    fn what_is_stored_in_the_middle_of_a_training_has_the_smoothing_of_its_moment_and_resumes_with_the_first_one() {
+        let config = Config::resolve(None, &[]).unwrap();
+        let stored = config.at(60_000_000).to_text();
+        let path = Path::new("x.safetensors");
+        assert_eq!(PolicyConfig::from_text(path, &stored, &[]).unwrap().env.act_moving_average, 0.375);
+        let played = PolicyConfig::from_text(path, &stored, &[set("env.act_moving_average=0.6")]).unwrap();
+        assert_eq!(played.env.act_moving_average, 0.6);
+        assert_eq!(Config::from_text(path, &stored, &[]).unwrap(), config);
+    }
+
+    #[test]
+    fn an_own_scene_keeps_the_size_of_its_object_unless_others_are_named() {
+        let sizes = |sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            Config::resolve(None, &sets).unwrap().randomization.cube_size
+        };
+        assert_eq!(sizes(&[]), [0.8, 1.2]);
+        assert_eq!(sizes(&["env.model=own.xml"]), [1.0, 1.0]);
+        assert_eq!(sizes(&["env.model=own.xml", "randomization.cube_size=[0.9,1.1]"]), [0.9, 1.1]);
     }
 }

@@ -13,7 +13,7 @@ use crate::sim::Parts;
 
 /// Settings that must be above 0.
 const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_eps env.success_tolerance \
-    env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
+    env.fall_dist training.act_moving_average training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
 
 /// Settings that must be at least 0.
 const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
@@ -26,7 +26,8 @@ const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.ho
     randomization.push_steps run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
 
 /// Settings that must be from 0 to 1.
-const SHARES: &str = "env.act_moving_average randomization.share randomization.each ppo.gamma ppo.lambda";
+const SHARES: &str =
+    "env.act_moving_average training.act_moving_average randomization.share randomization.each ppo.gamma ppo.lambda";
 
 /// The largest valid values of settings.
 const AT_MOST: &[(&str, f64)] = &[

@@ -115,6 +115,7 @@ pub enum SuccessHold {
 /// Settings that only training uses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainingConfig {
+    pub act_moving_average: Ramp,
     pub task_reward: Ramp,
     pub progress_reward: f64,
     pub approach_reward: f64,
@@ -149,6 +150,7 @@ pub struct RandomizationConfig {
 /// The learner.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PpoConfig {
+    pub critic_first: u64,
     pub horizon: Ramp,
     pub epochs: usize,
     pub minibatches: usize,
@@ -170,7 +172,7 @@ pub struct PpoConfig {
     pub max_grad_norm: f64,
     pub reward_scale: f64,
     pub std: Ramp,
-    pub away_std: f64,
+    pub away_std: Ramp,
     pub away_range: [f64; 2],
 }
 
@@ -224,6 +226,7 @@ pub struct RunConfig {
     pub checkpoint_every: u64,
     pub eval_every: u64,
     pub eval_episodes: usize,
+    pub patience: u32,
     pub film_every: u64,
     pub seed: u64,
     pub shards: usize,
@@ -261,6 +264,15 @@ impl Config {
     /// Returns whether environments and minibatches can be divided evenly into `shards`.
     pub(super) fn divides(&self, shards: usize) -> bool {
         self.env.num_envs.is_multiple_of(shards) && self.samples_per_minibatch().is_multiple_of(shards)
+    }
+}
+
+impl Config {
+    /// Returns the settings as they are after `env_steps` control steps of the run: its task has the smoothing that is trained then.
+    pub fn at(&self, env_steps: u64) -> Self {
+        let mut now = self.clone();
+        now.env.act_moving_average = self.training.act_moving_average.by_equal_steps(env_steps);
+        now
     }
 }
 

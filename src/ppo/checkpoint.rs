@@ -284,7 +284,7 @@ impl Ppo {
 mod tests {
     use super::*;
     use crate::config::{Backend, Config, PpoConfig, Symmetry};
-    use crate::ppo::{Evaluation, Rollout};
+    use crate::ppo::{Evaluation, Rollout, Stage};
     use crate::ranks::Exchange;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
@@ -300,7 +300,13 @@ mod tests {
     }
 
     fn progress() -> Progress {
-        Progress { iteration: 7, env_steps: 99, best: Some(Evaluation { goals: 1.5, rot_dist: 0.25 }), fork: None }
+        Progress {
+            iteration: 7,
+            env_steps: 99,
+            best: Some(Evaluation { goals: 1.5, rot_dist: 0.25 }),
+            fork: None,
+            rise: None,
+        }
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
@@ -320,7 +326,7 @@ mod tests {
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
-        ppo.minibatch_step(&rollout, &Exchange::alone(1).minibatch(&samples), true).unwrap();
+        ppo.minibatch_step(&rollout, &Exchange::alone(1).minibatch(&samples), Stage::First).unwrap();
         ppo
     }
 

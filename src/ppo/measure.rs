@@ -6,7 +6,7 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::kernels::{Matrix, Multiplier, ROWS};
-use super::{Policy, Ppo, Rollout};
+use super::{Policy, Ppo, Rollout, Stage};
 
 /// Seconds after which no further gradient step is timed, once three have been.
 const LIMIT: f64 = 5.0;
@@ -28,7 +28,7 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
         let taken = rayon::scope(|_| {
             let start = Instant::now();
             let minibatch = ppo.exchange.minibatch(&minibatch);
-            ppo.minibatch_step(rollout, &minibatch, false).map(|_| start.elapsed())
+            ppo.minibatch_step(rollout, &minibatch, Stage::Later).map(|_| start.elapsed())
         });
         seconds.push(taken?.as_secs_f64());
     }

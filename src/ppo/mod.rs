@@ -42,7 +42,7 @@ pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
 pub use perception::{CLIP, InputTransform, Perception};
 pub use policy::{FixedPolicy, FrozenPolicy, GROUP, Policy};
-pub use progress::{Evaluation, Fork, Progress};
+pub use progress::{Evaluation, Fork, Progress, Rise};
 pub use rollout::{Rollout, RolloutBlock};
 
 use crate::config::{Backend, PpoConfig};
@@ -67,11 +67,24 @@ pub struct Ppo {
     adam: Adam,
     /// The learning rate of the next step.
     learning_rate: f64,
+    /// The standard deviation of the actions far from the goal, if larger.
+    away_std: f32,
     /// The desired KL divergence of an iteration, nats; 0: the learning rate is fixed.
     desired_kl: f64,
     exchange: Exchange,
     /// The parameters that are moved here.
     slices: Slices,
+}
+
+/// Where a gradient step stands among those that move the policy. The learning rate follows how far they have moved it.
+#[derive(Clone, Copy, Debug)]
+enum Stage {
+    /// Before all of them: the actor rests.
+    CriticAlone,
+    /// The first one of an update: the policy is still the one that acted.
+    First,
+    /// Any other.
+    Later,
 }
 
 /// Statistics of an update: means over its minibatches unless stated otherwise.
@@ -128,6 +141,7 @@ impl Ppo {
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
+        let away_std = config.away_std.by_equal_steps(0) as f32;
         let slices = exchange.slices(&norm_chunks(&policy.layout.nets()));
         Ok(Self {
             config: config.clone(),
@@ -138,6 +152,7 @@ impl Ppo {
             gradient,
             adam,
             learning_rate,
+            away_std,
             desired_kl,
             exchange,
             slices,
@@ -161,7 +176,7 @@ impl Ppo {
         Rollout::new(self.config.first_horizon(), block_sizes, &self.policy.spaces)
     }
 
-    /// Sets the standard deviation of the actions, the desired KL divergence and the horizon of the rollout to where their
+    /// Sets the standard deviations of the actions, the desired KL divergence and the horizon of the rollout to where their
     /// ramps are after `env_steps` control steps of the run.
     pub fn follow_ramps(&mut self, env_steps: u64, rollout: &mut Rollout) {
         let horizon = self.config.horizon_at(env_steps);
@@ -169,6 +184,7 @@ impl Ppo {
             rollout.resize(horizon, &self.policy.spaces);
         }
         self.desired_kl = self.config.desired_kl.by_equal_factors(env_steps);
+        self.away_std = self.config.away_std.by_equal_steps(env_steps) as f32;
         self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
     }
 
@@ -180,7 +196,7 @@ impl Ppo {
     /// Returns the policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
         let policy = self.policy.freeze_for(self.arithmetic);
-        let away_scale = (self.config.away_std as f32 / policy.std()).max(1.0);
+        let away_scale = (self.away_std / policy.std()).max(1.0);
         Acting { policy, config: &self.config, away_scale }
     }
 
@@ -211,7 +227,14 @@ impl Ppo {
                     if stop.load(Ordering::Relaxed) {
                         return Ok(None);
                     }
-                    let step = self.minibatch_step(rollout, &minibatch, steps.is_empty());
+                    let stage = if iteration <= self.config.critic_first {
+                        Stage::CriticAlone
+                    } else if steps.is_empty() {
+                        Stage::First
+                    } else {
+                        Stage::Later
+                    };
+                    let step = self.minibatch_step(rollout, &minibatch, stage);
                     steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
                 }
             }
@@ -265,10 +288,13 @@ impl Ppo {
         (mean, sum(&|x| (x - mean).powi(2)) / count)
     }
 
-    /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient. In the `first` step of an
-    /// update, the policy is still the one that acted.
-    fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, first: bool) -> Result<(Losses, f64)> {
+    /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient.
+    fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, stage: Stage) -> Result<(Losses, f64)> {
         let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
+        if let Stage::CriticAlone = stage {
+            let [actor, _] = self.policy.layout.nets();
+            self.gradient[actor].fill(0.0);
+        }
         self.slices.reduce_scatter(&mut self.gradient);
         let losses = self.losses(&sums, minibatch.count);
         let squares = self.slices.of_chunks(|chunk| sum_of_squares(&self.gradient[chunk.clone()]));
@@ -276,7 +302,7 @@ impl Ppo {
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
             ensure!(value.is_finite(), "{what} is {value}: the training has failed and stops here");
         }
-        if !first {
+        if let Stage::Later = stage {
             let range = self.config.learning_rate_range;
             self.learning_rate = learning_rate::adapted(self.learning_rate, losses.kl, self.desired_kl, range);
         }

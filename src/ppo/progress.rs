@@ -15,6 +15,33 @@ pub struct Progress {
     /// The checkpoint that it was forked from, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fork: Option<Fork>,
+    /// How evaluations have risen, if the run ends when they no longer do.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rise: Option<Rise>,
+}
+
+/// How far the evaluations of a run have risen.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rise {
+    /// Goals per episode, rotation error (rad) and share of drops before the first iteration.
+    pub before: [f64; 3],
+    /// The same of the best evaluation.
+    pub best: [f64; 3],
+    /// The evaluations since then.
+    pub since: u32,
+}
+
+impl Rise {
+    /// Begins with the evaluation before the first iteration.
+    pub fn new(before: [f64; 3]) -> Self {
+        Self { before, best: before, since: 0 }
+    }
+
+    /// Takes down another evaluation, which may be the best so far.
+    pub fn add(&mut self, figures: [f64; 3], is_best: bool) {
+        (self.best, self.since) = if is_best { (figures, 0) } else { (self.best, self.since.saturating_add(1)) };
+    }
 }
 
 /// The scores that evaluations are compared by; in a file, an array of both.

@@ -7,6 +7,8 @@ use crate::config::{Config, EnvConfig};
 /// The task as trained at a given step: when a goal is reached, how long goals stay, and what is rewarded.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Lesson {
+    /// The weight of the new target in the smoothed one.
+    pub act_moving_average: f64,
     /// Rotation error that counts as being at the goal, rad.
     pub tolerance: f64,
     /// Steps within the tolerance that reach a goal.
@@ -28,6 +30,7 @@ impl Lesson {
     /// Returns the lesson that is the task itself, as played and scored.
     pub fn task(env: &EnvConfig) -> Self {
         Self {
+            act_moving_average: env.act_moving_average,
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
             redirect_chance: 0.0,
@@ -42,6 +45,7 @@ impl Lesson {
     pub fn at(env_steps: u64, config: &Config) -> Self {
         let training = &config.training;
         Self {
+            act_moving_average: training.act_moving_average.by_equal_steps(env_steps),
             // By equal factors: halving the error is equally hard at any size.
             tolerance: training.tolerance.by_equal_factors(env_steps),
             hold: training.hold.by_equal_steps(env_steps).round() as u32,
@@ -54,14 +58,16 @@ impl Lesson {
     }
 
     fn described(&self) -> Vec<(Description, f64)> {
-        let Self { tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
+        let Self { act_moving_average, tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
         let mut all = vec![
             (Description("tolerance", "The rotation error, rad, up to which a goal counts in training."), tolerance),
             (Description("hold", "The steps within the tolerance that reach a goal in training."), f64::from(hold)),
             (Description("task_reward", "The weight of the task's reward in training."), task_reward),
         ];
         all.extend(ramped(weights));
+        let smoothing = Description("act_moving_average", "The weight of the new target in the smoothed one.");
         all.push((Description("randomized", "Probability that an episode that begins is randomised."), randomized));
+        all.push((smoothing, act_moving_average));
         all
     }
 

@@ -97,6 +97,11 @@ impl Task {
         Ok(Arc::new(Self { scene, hand, ..self.clone() }))
     }
 
+    /// Returns the same task with this smoothing of the actions.
+    pub fn smoothed(&self, act_moving_average: f64) -> Arc<Self> {
+        Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
+    }
+
     /// Returns the settings.
     pub fn config(&self) -> &EnvConfig {
         &self.config

@@ -133,13 +133,14 @@ impl EpisodeFilms {
         Ok(Self { task, frames })
     }
 
-    /// Plays the first of `episodes` as an evaluation does and returns its first 20 s; `None` if `stop` was set meanwhile. Calls
-    /// `meanwhile` in each step.
+    /// Plays the first of `episodes` as an evaluation of `task` does, which may only smooth actions differently, and returns its first
+    /// 20 s; `None` if `stop` was set meanwhile. Calls `meanwhile` in each step.
     ///
     /// # Errors
     /// Fails if OpenGL does.
     pub fn film(
         &mut self,
+        task: &Task,
         actor: &Actor,
         episodes: Episodes,
         stop: &AtomicBool,
@@ -151,7 +152,8 @@ impl EpisodeFilms {
             self.frames.draw_due(&moment, |frame| frames.push(frame))
         };
         let one = Episodes { count: 1, ..episodes };
-        let played = Trial { task: &self.task, actor, episodes: one, stop }.play(&mut observe)?;
+        let task = self.task.smoothed(task.config().act_moving_average);
+        let played = Trial { task: &task, actor, episodes: one, stop }.play(&mut observe)?;
         played.map(|_| Ok(Animation { size: ANIMATION.size, gif: gif_of(frames, ANIMATION)? })).transpose()
     }
 }

@@ -20,18 +20,17 @@ pub(super) fn films(task: &Task, config: &Config) -> Option<EpisodeFilms> {
     films.inspect_err(|error| os::say(&format!("warning: {}", absent(error)))).ok()
 }
 
-/// Films the first of `episodes` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if a stop
+/// Films the first of `episodes` of `task` with the mean actions of `policy`. Returns `None` if that failed, after a warning, or if a stop
 /// was requested meanwhile. After a failure there are no more films.
 pub(super) fn film(
     films: &mut Option<EpisodeFilms>,
-    policy: &Policy,
-    episodes: Episodes,
+    (task, policy, episodes): (&Task, &Policy, Episodes),
     requests: &Requests,
     lead: &mut Lead,
 ) -> Option<Animation> {
     let filming = films.as_mut()?;
     let mut meanwhile = || lead.save_if_asked(requests);
-    let film = || filming.film(&Actor::Mean(policy.freeze()), episodes, requests.stop(), &mut meanwhile);
+    let film = || filming.film(task, &Actor::Mean(policy.freeze()), episodes, requests.stop(), &mut meanwhile);
     // A film that fails must not end the training, even by a panic.
     let made = catch_unwind(AssertUnwindSafe(film));
     let made = made.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));

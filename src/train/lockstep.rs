@@ -48,6 +48,8 @@ pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCod
     requests.wait_for_end();
     // The state that the saver begins with.
     session.checkpoint();
+    session.begin(requests, None)?;
+    session.checkpoint();
     while !session.finished() {
         let done = session.iterate(requests, None)?.context("a stop comes between iterations")?;
         if done.decision.hand_over {

@@ -14,6 +14,7 @@ mod start;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, anyhow};
 
@@ -21,9 +22,9 @@ use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Requests, Status, StatusLine};
-use crate::ppo::Evaluation;
+use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
-use crate::repose::{Repose, Score, StepSums, divergence};
+use crate::repose::{Repose, Score, StepSums, Task, divergence};
 use crate::run::{Hparams, Media, Report};
 use crate::schedule::panic_message;
 #[cfg(feature = "video")]
@@ -54,7 +55,11 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     let (mut session, mut saver) = Session::lead(args, exchange)?;
     let place = saver.held.folder.path().display().to_string();
     if session.finished() {
-        os::say(&format!("{place} is finished: {}; a larger --total-steps continues it", saver.held.steps_made()));
+        let advice = match session.is_flat() {
+            true => "its evaluations no longer rise; --fork continues it",
+            false => "a larger --total-steps continues it",
+        };
+        os::say(&format!("{place} is finished: {}; {advice}", saver.held.steps_made()));
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(limit) = args.stop_after {
@@ -89,6 +94,11 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
 
 /// Iterates until all steps are made or a stop is requested, and returns the exit code.
 fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &Requests) -> Result<ExitCode> {
+    match session.begin(requests, Some(Lead { report, saver: &mut saver })) {
+        Ok(true) => saver.keep(session.checkpoint()),
+        Ok(false) => return stop(saver, report, os::exit_code(requests.signal()), STOPPED),
+        Err(error) => return Err(give_up(error, saver, report)),
+    }
     while !session.finished() {
         let outcome = match session.iterate(requests, Some(Lead { report, saver: &mut saver })) {
             Ok(Some(outcome)) => outcome,
@@ -120,7 +130,9 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
     saver.save_at_last(report)?;
     saver.held.folder.mark_finished(true);
     saver.release();
-    os::say(&format!("finished: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
+    let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
+    os::say(&format!("{why}: {}; {}", saver.held.steps_made(), saver.held.folder.path().display()));
+    session.rise.iter().for_each(|rise| os::say(&before_and_after(rise, session.config.run.eval_episodes)));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -141,11 +153,10 @@ impl Session {
             self.agent.exchange.take_traffic();
             let Some(iteration) = self.agent.iterate(now.stop())? else { return Ok(None) };
             let traffic = self.agent.exchange.take_traffic();
-            let Some(evaluation) = self.evaluate(now, lead.as_mut())? else { return Ok(None) };
+            let due = evaluates(self.agent.iteration, self.config.run.eval_every);
+            let Some(evaluation) = self.evaluate(due, now, lead.as_mut())? else { return Ok(None) };
             let Some(media) = self.media(now, lead.as_mut()) else { return Ok(None) };
-            let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
-            let improved = found.beats(self.best);
-            self.best = if improved { Some(found) } else { self.best };
+            let improved = self.take_down(&evaluation);
             let (pool, exchange) = (&mut self.agent.pool, &self.agent.exchange);
             let ended = exchange.all_gather(pool.take_finished()).concat();
             let sums: Vec<StepSums> = pool.envs_mut().map(Repose::take_sums).collect();
@@ -176,7 +187,8 @@ impl Session {
         #[cfg(feature = "video")]
         if self.films.is_some() && self.agent.iteration.is_multiple_of(self.config.run.film_every) {
             let episodes = self.evaluation_episodes();
-            let film = film(&mut self.films, self.agent.ppo.policy(), episodes, requests, lead);
+            let task = self.task_now();
+            let film = film(&mut self.films, (&task, self.agent.ppo.policy(), episodes), requests, lead);
             if requests.stop().load(std::sync::atomic::Ordering::Relaxed) {
                 return None;
             }
@@ -185,20 +197,52 @@ impl Session {
         Some(media)
     }
 
+    /// Returns the task as it is played now.
+    fn task_now(&self) -> Arc<Task> {
+        self.task.smoothed(self.config.at(self.agent.env_steps).env.act_moving_average)
+    }
+
     fn evaluation_episodes(&self) -> Episodes {
         let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
         Episodes { seed, purpose: "evaluation", first: 0, count }
     }
 
-    /// Plays the evaluation episodes, if that is due, and reports their score; returns `None` if a stop was requested meanwhile.
-    fn evaluate(&self, requests: &Requests, mut lead: Option<&mut Lead>) -> Result<Option<Score>> {
+    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Returns whether it can go on: no stop
+    /// was requested meanwhile.
+    ///
+    /// # Errors
+    /// Fails as an evaluation does.
+    fn begin(&mut self, requests: &Requests, mut lead: Option<Lead>) -> Result<bool> {
+        if self.config.run.patience == 0 || self.rise.is_some() {
+            return Ok(true);
+        }
+        let never = Requests::none();
+        let now = if self.agent.exchange.is_alone() { requests } else { &never };
+        let Some(before) = self.evaluate(true, now, lead.as_mut())? else { return Ok(false) };
+        self.rise = Some(Rise::new(figures(&before)));
+        self.take_down(&before);
+        Ok(true)
+    }
+
+    /// Takes down an evaluation, if the score is one, and returns whether it is the best so far.
+    fn take_down(&mut self, evaluation: &Score) -> bool {
+        let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
+        let improved = found.beats(self.best);
+        self.best = if improved { Some(found) } else { self.best };
+        if evaluation.episodes > 0 {
+            self.rise.iter_mut().for_each(|rise| rise.add(figures(evaluation), improved));
+        }
+        improved
+    }
+
+    /// Plays the evaluation episodes, if they are `due`, and reports their score; returns `None` if a stop was requested meanwhile.
+    fn evaluate(&self, due: bool, requests: &Requests, mut lead: Option<&mut Lead>) -> Result<Option<Score>> {
         let ctrl_dt = self.task.config().ctrl_dt;
-        if !evaluates(self.agent.iteration, self.config.run.eval_every) {
+        if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
         }
-        let actor = Actor::Mean(self.agent.ppo.policy().freeze());
-        let trial =
-            Trial { task: &self.task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
+        let (task, actor) = (self.task_now(), Actor::Mean(self.agent.ppo.policy().freeze()));
+        let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
             lead.iter_mut().for_each(|lead| lead.save_if_asked(requests));
             Ok(())
@@ -248,6 +292,22 @@ fn say_what_next(run: &Path) {
     let (program, run_word) = (os::called_as(), os::quoted_path(run));
     let all = os::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
     os::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
+}
+
+/// Returns the figures by which a run that ends when evaluations no longer rise is compared with its start.
+fn figures(score: &Score) -> [f64; 3] {
+    [score.goals, score.rot_dist, score.drop_rate]
+}
+
+/// Returns a table of the first evaluation and the best one.
+fn before_and_after(rise: &Rise, episodes: usize) -> String {
+    let row = |what: &str, of: fn(&[f64; 3]) -> String| {
+        format!("\n  {what:<20} {:>8} {:>8}", of(&rise.before), of(&rise.best))
+    };
+    let mut table = format!("  {:<20} {:>8} {:>8}", format!("{episodes} episodes"), "before", "best");
+    table += &row("goals per episode", |[goals, ..]| format!("{goals:.2}"));
+    table += &row("drops", |[.., drops]| format!("{:.1} %", 100.0 * drops));
+    table + &row("rotation error", |[_, error, _]| format!("{error:.2} rad"))
 }
 
 /// The iteration after which there is an early evaluation where the next one would come much later.

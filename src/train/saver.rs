@@ -34,6 +34,8 @@ pub(super) struct Held {
     /// The run folder.
     pub folder: RunFolder,
     keep: usize,
+    /// The settings of the run, as at its beginning (TOML).
+    settings: String,
     /// The options with which this training is resumed.
     options: String,
     /// The state at the end of the last complete iteration.
@@ -62,7 +64,8 @@ impl Saver {
         let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
         let initial = Arc::new(initial);
         let last = initial.clone();
-        let held = Held { folder, keep, options, last, wrote: false, best: None, best_is_saved: true };
+        let settings = config.to_text();
+        let held = Held { folder, keep, settings, options, last, wrote: false, best: None, best_is_saved: true };
         let saver = Self { held, lock: Some(lock), initial, from_newest };
         saver.save_before_fatal_errors();
         saver
@@ -128,7 +131,7 @@ impl Saver {
             self.held.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
                 format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
             });
-        self.held.folder.describe(&format!("{fork}{}", self.held.last.config), &version())
+        self.held.folder.describe(&format!("{fork}{}", self.held.settings), &version())
     }
 
     /// Writes the logs, the best policy and the checkpoint, each before anything that refers to it.

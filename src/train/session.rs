@@ -14,7 +14,7 @@ use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{expect_finite_actions, expect_finite_values};
 use crate::os;
-use crate::ppo::{Checkpoint, Evaluation};
+use crate::ppo::{Checkpoint, Evaluation, Rise};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
 use crate::run::{self, RunFolder};
@@ -31,6 +31,8 @@ pub(super) struct Session {
     pub agent: Agent<Repose>,
     /// The best evaluation so far.
     pub best: Option<Evaluation>,
+    /// How far evaluations have risen, if the run ends when they no longer do.
+    pub rise: Option<Rise>,
     /// What films evaluation episodes, as long as that works.
     #[cfg(feature = "video")]
     pub films: Option<EpisodeFilms>,
@@ -99,6 +101,7 @@ impl Session {
                 task,
                 agent,
                 best,
+                rise: None,
                 #[cfg(feature = "video")]
                 films,
                 diverged: 0,
@@ -125,7 +128,10 @@ impl Session {
         if let Takes::Fork = takes {
             let parent = Config::from_text(Path::new("the checkpoint"), &checkpoint.config, &[])?;
             agent.ppo.reconcile_learning_rate(&parent.ppo);
-        } else if !checkpoint.is_of_scene(&self.scene) && agent.exchange.is_first() {
+            return checkpoint.finish();
+        }
+        self.rise = checkpoint.progress.rise;
+        if !checkpoint.is_of_scene(&self.scene) && agent.exchange.is_first() {
             os::say("warning: the scene is not the one of the checkpoint: the resumed run is a different training");
         }
         checkpoint.finish()
@@ -133,14 +139,20 @@ impl Session {
 
     /// Returns the complete state at the end of the last iteration.
     pub(super) fn checkpoint(&self) -> Checkpoint {
-        let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
+        let mut checkpoint = self.agent.checkpoint(&self.config.at(self.agent.env_steps).to_text(), self.best);
+        checkpoint.progress.rise = self.rise;
         checkpoint.scene = Some(self.scene.clone());
         checkpoint.hand = Some(self.hand.to_text());
         checkpoint
     }
 
-    /// Returns whether all steps are made.
+    /// Returns whether all steps are made, or evaluations no longer rise.
     pub(super) fn finished(&self) -> bool {
-        self.agent.env_steps >= self.config.run.total_steps
+        self.agent.env_steps >= self.config.run.total_steps || self.is_flat()
+    }
+
+    /// Returns whether the run ends because evaluations no longer rise.
+    pub(super) fn is_flat(&self) -> bool {
+        self.rise.is_some_and(|rise| rise.since >= self.config.run.patience)
     }
 }

@@ -163,6 +163,27 @@ fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
 }
 
 #[test]
+fn while_the_critic_learns_alone_the_policy_stands_still() {
+    for backend in [Backend::Fused, Backend::Candle] {
+        let mut agent = agent(&PpoConfig { backend, critic_first: 2, ..settings() }, 3);
+        let nets = |agent: &Agent<PointMass>| {
+            let policy = agent.ppo.policy();
+            policy.layout.nets().map(|net| policy.parameters[net].to_vec())
+        };
+        let [actor, mut critic] = nets(&agent);
+        for iteration in 1..=3 {
+            let stats = agent.iterate(&NEVER).unwrap().expect("nothing stops it").update;
+            let [acts, values] = nets(&agent);
+            let alone = iteration <= 2;
+            assert_eq!(acts == actor, alone, "iteration {iteration}");
+            assert!(values != critic, "iteration {iteration}");
+            assert_eq!(stats.learning_rate == settings().learning_rate, alone, "no divergence leads the rate then");
+            critic = values;
+        }
+    }
+}
+
+#[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     for backend in [Backend::Fused, Backend::Candle] {
         let mut agent = agent(&PpoConfig { backend, ..settings() }, 3);

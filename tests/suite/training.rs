@@ -1,11 +1,12 @@
 //! Lessons, which only training uses, the symmetry of the cube, and the noise of the actions.
 
+use std::fs;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
 use shadow_repose::config::Symmetry;
 use shadow_repose::env::{End, Env, EnvPool};
-use shadow_repose::ppo::Perception;
+use shadow_repose::ppo::{Checkpoint, Perception};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, Repose};
@@ -319,4 +320,30 @@ fn a_policy_that_moves_far_more_than_it_should_for_twenty_iterations_is_warned_o
         said.matches("warning: policy/kl has been more than 10 times ppo.desired_kl").count()
     };
     assert_eq!([19, 50].map(warnings), [0, 1]);
+}
+
+#[test]
+fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_rose() {
+    let folder = tempfile::tempdir().unwrap();
+    let sets = ["--set", "run.patience=2", "--set", "run.eval_every=1", "--set", "run.eval_episodes=2"];
+    let run = |more: &[&str]| program(folder.path(), &train(&[&sets[..], more].concat()));
+    let said = stderr(&succeeded(run(&["--run-dir", "whole", "--total-steps", "64000"])));
+    let (_, end) = said.split_once("evaluations no longer rise: ").expect(&said);
+    let table: Vec<&str> = end.lines().skip(1).take(4).map(str::trim).collect();
+    for (line, first) in table.iter().zip(["2 episodes", "goals per episode", "drops", "rotation error"]) {
+        assert!(line.starts_with(first), "{said}");
+    }
+    let iterations = |text: &str| text.split_once(" iterations").unwrap().0.rsplit(' ').next().unwrap().to_owned();
+    let best = folder.path().join("whole/checkpoints/best.safetensors");
+    let best = Checkpoint::parse(&fs::read(best).unwrap()).unwrap().progress;
+    let rise = best.rise.expect("the best checkpoint tells it");
+    assert_eq!((rise.since, Some(rise.best[0])), (0, best.best.map(|best| best.goals)));
+    assert_eq!(iterations(end).parse::<u64>().unwrap(), best.iteration + 2);
+    let again = program(folder.path(), &["train", "--resume", "whole", "--total-steps", "128000"]);
+    assert!(stderr(&succeeded(again)).contains("is finished: "), "nothing is trained");
+    // Evaluations before and after a stop count together.
+    succeeded(run(&["--run-dir", "halves", "--total-steps", "128"]));
+    let rest = program(folder.path(), &["train", "--resume", "halves", "--total-steps", "64000"]);
+    let rest = stderr(&succeeded(rest));
+    assert_eq!(iterations(rest.split_once("no longer rise: ").expect(&rest).1), iterations(end));
 }

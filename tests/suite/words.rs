@@ -38,7 +38,7 @@ fn no_help_shows_what_its_command_does_not_do() {
         let output = program(folder.path(), args);
         assert!(output.status.code() == Some(2) && stderr(&output).contains("--size applies only to"), "{args:?}");
     }
-    assert!(stdout(&["train", "--help"]).contains("[default: 175000000]"));
+    assert!(stdout(&["train", "--help"]).contains("[default: 200000000]"));
 }
 
 #[test]
