@@ -69,6 +69,14 @@ pub fn angle_between(a: Quat, b: Quat) -> f64 {
     2.0 * (x * x + y * y + z * z).sqrt().min(1.0).asin()
 }
 
+/// Returns the axis of a rotation times its angle in rad, which is at most π.
+pub fn rotation_vector(q: Quat) -> [f64; 3] {
+    let [w, axis @ ..] = canonical(q);
+    let sine = axis.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let factor = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
+    axis.map(|x| factor * x)
+}
+
 /// Returns a uniformly distributed rotation, given three uniform numbers in [0, 1).
 ///
 /// K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
@@ -134,5 +142,14 @@ mod tests {
         // The angle of a uniform rotation has the density (1 - cos a) / π, so its mean is π/2 + 2/π.
         let mean = angles.iter().sum::<f64>() / angles.len() as f64;
         assert!((mean - (PI / 2.0 + 2.0 / PI)).abs() < 0.02, "mean angle {mean}");
+    }
+
+    #[test]
+    fn a_rotation_vector_is_the_axis_times_the_shorter_angle() {
+        assert!(close(&rotation_vector(ABOUT_Z_90), &[0.0, 0.0, PI / 2.0]));
+        assert!(close(&rotation_vector(ABOUT_Z_90.map(|x| -x)), &[0.0, 0.0, PI / 2.0]));
+        let (cos, sin) = (1e-15, 1.0);
+        assert!(close(&rotation_vector([-cos, sin, 0.0, 0.0]), &[-PI, 0.0, 0.0]));
+        assert!(close(&rotation_vector([1.0, 0.0, 0.0, 0.0]), &[0.0; 3]));
     }
 }

@@ -65,10 +65,10 @@ mod tests {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
-        let TrainingConfig { act_moving_average, drop_reward, tolerance, hold, .. } = training;
-        let [act_moving_average, drop_reward, tolerance, hold] =
-            [act_moving_average, drop_reward, tolerance, hold].map(ended);
-        let trained = TrainingConfig { act_moving_average, drop_reward, tolerance, hold, ..training };
+        let TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, .. } = training;
+        let [act_moving_average, assist, drop_reward, tolerance, hold] =
+            [act_moving_average, assist, drop_reward, tolerance, hold].map(ended);
+        let trained = TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, ..training };
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
         let [horizon, desired_kl, std, away_std] = [ppo.horizon, ppo.desired_kl, ppo.std, ppo.away_std].map(ended);
         let learnt = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };

@@ -18,7 +18,7 @@ const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_ep
 /// Settings that must be at least 0.
 const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
     env.noise env.bias randomization.noise randomization.bias \
-    randomization.cube_com randomization.gravity randomization.push training.task_reward \
+    randomization.cube_com randomization.gravity randomization.push training.task_reward training.assist \
     ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.away_std";
 
 /// Settings that must be at least 1.

@@ -121,6 +121,7 @@ pub struct TrainingConfig {
     pub approach_reward: f64,
     pub hold_reward: f64,
     pub drop_reward: Ramp,
+    pub assist: Ramp,
     pub tolerance: Ramp,
     pub hold: Ramp,
     pub goal_lifetime: u64,

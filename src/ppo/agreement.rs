@@ -54,13 +54,15 @@ mod tests {
 
     /// Takes one gradient step with a learning rate of 1e-3, without clipping.
     fn step(ppo: &mut Ppo) {
-        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), 1e-3, 1.0);
+        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), (1e-3, 1.0), &ppo.clock);
     }
 
     /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         let minibatch = ppo.exchange.minibatch(samples);
-        let sums = ppo.backend.gradient(&ppo.policy, rollout, &minibatch, &mut ppo.gradient).unwrap();
+        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch, &ppo.clock).unwrap();
+        let add_up = |parameters, out: &mut [f32]| ppo.backend.add_up(parameters, out);
+        ppo.slices.reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
         ppo.losses(&sums, minibatch.count)
     }
 

@@ -1,10 +1,11 @@
 //! The interface for computing gradients, implemented by our own kernels and by candle's tensors, their reference.
 
-use std::ops::Add;
+use std::ops::{Add, Range};
 
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 
+use super::clock::Clock;
 use super::{Policy, Rollout};
 use crate::config::PpoConfig;
 use crate::ranks::Minibatch;
@@ -54,14 +55,17 @@ impl Losses {
 }
 
 /// A way to compute gradients.
-pub(super) trait GradientBackend: Send {
+pub(super) trait GradientBackend: Send + Sync {
     /// Prepares for the minibatches of a rollout, before any step on it: `policy` is the one that collected it.
     fn begin(&mut self, _policy: &Policy, _rollout: &Rollout) {}
 
-    /// Writes the gradient of the losses of this minibatch with respect to the parameters of the policy, in their
-    /// order, added over the groups as a tree. Returns the sums of each group.
+    /// Computes the gradients of the losses of each group of this minibatch with respect to the parameters of the policy. Returns
+    /// the sums of each group.
     ///
     /// # Errors
     /// Fails if the underlying library fails.
-    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>>;
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, clock: &Clock) -> Result<Vec<Losses>>;
+
+    /// Writes the sum of the gradients of all groups for these parameters of one net. They are added as a tree.
+    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]);
 }

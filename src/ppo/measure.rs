@@ -6,7 +6,7 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::kernels::{Matrix, Multiplier, ROWS};
-use super::{Policy, Ppo, Rollout, Stage};
+use super::{Part, Policy, Ppo, Rollout, Stage};
 
 /// Seconds after which no further gradient step is timed, once three have been.
 const LIMIT: f64 = 5.0;
@@ -33,6 +33,25 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
         seconds.push(taken?.as_secs_f64());
     }
     Ok(seconds)
+}
+
+/// Takes `repeats` more gradient steps as [`time_gradient_steps`] does, and returns the share of the time that threads wait in each
+/// part of a step, and while one thread works between the parts.
+///
+/// # Errors
+/// Fails as [`time_gradient_steps`] does.
+pub fn shares_of_waiting(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<(&'static str, f64)>> {
+    ppo.clock.start();
+    let all: f64 = time_gradient_steps(ppo, rollout, repeats)?.iter().sum();
+    let threads = rayon::current_num_threads() as f64;
+    let mut between = all;
+    let share = |(&(_, name), [elapsed, worked]): (&(Part, &'static str), [f64; 2])| {
+        between -= elapsed;
+        (name, (elapsed - worked / threads) / all)
+    };
+    let mut shares: Vec<_> = Part::ALL.iter().zip(ppo.clock.seconds()).map(share).collect();
+    shares.push(("between", between / all * (1.0 - 1.0 / threads)));
+    Ok(shares)
 }
 
 /// Returns the matrix products of one forward and backward pass: the sizes of the weights `[outputs, inputs]`, and

@@ -10,6 +10,7 @@ mod adam;
 mod backend;
 mod candle;
 mod checkpoint;
+mod clock;
 mod format;
 mod gae;
 mod growth;
@@ -26,7 +27,7 @@ mod widest;
 
 use std::f64::consts::{E, TAU};
 use std::iter::repeat_n;
-use std::ops::Add;
+use std::ops::{Add, Range};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
@@ -37,7 +38,7 @@ pub use backend::Losses;
 pub use checkpoint::Checkpoint;
 pub use format::{Array, Damaged, expect_safetensors, sealed};
 pub use kernels::Workspace;
-pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
+pub use measure::{flops_per_sample, matmul_gflops, shares_of_waiting, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, Layout, View};
 pub use perception::{CLIP, InputTransform, Perception};
@@ -52,6 +53,7 @@ use crate::spaces::Spaces;
 use adam::{Adam, norm, norm_chunks, sum_of_squares};
 use backend::GradientBackend;
 use candle::Reference;
+use clock::{Clock, Part};
 use gae::gae;
 use kernels::{Arithmetic, Kernels};
 
@@ -74,6 +76,8 @@ pub struct Ppo {
     exchange: Exchange,
     /// The parameters that are moved here.
     slices: Slices,
+    /// What measures where threads wait.
+    clock: Clock,
 }
 
 /// Where a gradient step stands among those that move the policy. The learning rate follows how far they have moved it.
@@ -137,7 +141,7 @@ impl Ppo {
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference(config.clone())),
+            Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
         let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
@@ -156,6 +160,7 @@ impl Ppo {
             desired_kl,
             exchange,
             slices,
+            clock: Clock::default(),
         })
     }
 
@@ -290,15 +295,16 @@ impl Ppo {
 
     /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient.
     fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, stage: Stage) -> Result<(Losses, f64)> {
-        let sums = self.backend.gradient(&self.policy, rollout, minibatch, &mut self.gradient)?;
-        if let Stage::CriticAlone = stage {
-            let [actor, _] = self.policy.layout.nets();
-            self.gradient[actor].fill(0.0);
-        }
-        self.slices.reduce_scatter(&mut self.gradient);
+        let (nets, clock) = (self.policy.layout.nets(), &self.clock);
+        let sums = self.backend.gradients(&self.policy, rollout, minibatch, clock)?;
+        let sum = |parameters: Range<usize>, out: &mut [f32]| match stage {
+            Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
+            _ => clock.work(Part::Sums, || self.backend.add_up(parameters, out)),
+        };
+        let square = |chunk: &[f32]| clock.work(Part::Sums, || sum_of_squares(chunk));
+        let squares = clock.part(Part::Sums, || self.slices.reduce_scatter(&mut self.gradient, sum, square));
+        let grad_norm = norm(&squares, &nets);
         let losses = self.losses(&sums, minibatch.count);
-        let squares = self.slices.of_chunks(|chunk| sum_of_squares(&self.gradient[chunk.clone()]));
-        let grad_norm = norm(&squares, &self.policy.layout.nets());
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
             ensure!(value.is_finite(), "{what} is {value}: the training has failed and stops here");
         }
@@ -309,7 +315,9 @@ impl Ppo {
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
         let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
-        self.adam.step(parameters, &self.gradient, own, self.learning_rate, scale);
+        clock.part(Part::Adam, || {
+            self.adam.step(parameters, &self.gradient, own, (self.learning_rate, scale), clock);
+        });
         self.slices.all_gather(parameters);
         Ok((losses, grad_norm))
     }
@@ -317,7 +325,8 @@ impl Ppo {
     /// Returns the mean losses of a minibatch of `count` samples, given the sums of each group here.
     fn losses(&self, sums: &[Losses], count: usize) -> Losses {
         let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
-        self.exchange.sum(sums, of_shard, |sum: &mut Losses, more| *sum = *sum + more).means(count)
+        let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();
+        self.exchange.in_order(own, |sum: &mut Losses, more| *sum = *sum + more).means(count)
     }
 
     /// Brings the learning rate of a fork, whose parent had the settings `before`, in line with its own settings.

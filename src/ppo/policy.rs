@@ -7,6 +7,7 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::Normalizer;
+use super::clock::Clock;
 use super::kernels::{Arithmetic, Net, Workspace};
 use super::parameters::{Layer, Layout};
 use super::perception::{InputTransform, Perception};
@@ -103,9 +104,11 @@ impl Policy {
     }
 
     /// Returns actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
-    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
+    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool, clock: &Clock) -> [Net<'_>; 2] {
         let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
-        [&self.layout.actor, &self.layout.critic].map(|layers| net(layers).prepared(arithmetic, learning))
+        let mut nets = [&self.layout.actor, &self.layout.critic].map(net);
+        Net::prepare(&mut nets, arithmetic, learning, clock);
+        nets
     }
 
     /// Returns the policy in its current state.
@@ -115,7 +118,7 @@ impl Policy {
 
     /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let [actor, critic] = self.nets(arithmetic, false);
+        let [actor, critic] = self.nets(arithmetic, false, &Clock::default());
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }

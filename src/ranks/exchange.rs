@@ -101,7 +101,11 @@ impl Exchange {
         P: Sync,
         T: Serialize + DeserializeOwned + Send,
     {
-        let own: Vec<T> = parts.par_chunks(parts.len() / self.own_shards().len()).map(of).collect();
+        self.in_order(parts.par_chunks(parts.len() / self.own_shards().len()).map(of).collect(), add)
+    }
+
+    /// Adds the results of all shards, of which this rank has its `own`, in the order of the shards.
+    pub fn in_order<T: Serialize + DeserializeOwned>(&self, own: Vec<T>, add: impl Fn(&mut T, T)) -> T {
         let all = self.all_gather(own).into_iter().flatten();
         all.reduce(|mut sum, next| {
             add(&mut sum, next);
@@ -124,11 +128,10 @@ impl Exchange {
         from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
     }
 
-    /// Sends each rank its slice, and returns the slices that the others have sent, this rank's among them. Returns `None` if there
-    /// are no others.
-    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Option<Vec<f32>> {
-        let ranks = self.ranks.as_ref()?;
-        Some(self.timed(4 * (numbers.len() - own), || ranks.all_to_all(numbers, slices)))
+    /// Sends each rank its slice, and returns the slices that all have sent, this rank's among them.
+    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Vec<f32> {
+        let ranks = self.ranks.as_ref().expect("there are several");
+        self.timed(4 * (numbers.len() - own), || ranks.all_to_all(numbers, slices))
     }
 
     /// Replaces the slices of the other ranks by what these have computed.

@@ -8,15 +8,14 @@ use rayon::prelude::*;
 use super::exchange::{Exchange, part};
 use super::tree_sum;
 
-/// Sums that one task computes.
-const CHUNK: usize = 4096;
-
 /// The slices of an array that the ranks work on: whole chunks, so that what is computed chunk by chunk does not depend on
 /// the number of ranks.
 pub struct Slices {
     exchange: Exchange,
-    /// The chunks of this rank.
+    /// The chunks of all ranks.
     chunks: Vec<Range<usize>>,
+    /// The numbers of those of this rank.
+    dealt: Range<usize>,
     /// For each rank: its values.
     all: Vec<Range<usize>>,
     /// The values of this rank.
@@ -36,8 +35,8 @@ impl Slices {
             |chunk: usize| chunks.get(chunk).map_or_else(|| chunks.last().map_or(0, |last| last.end), |it| it.start);
         let dealt = (0..ranks).map(|rank| part(chunks.len(), rank, ranks));
         let all: Vec<Range<usize>> = dealt.map(|dealt| begin(dealt.start)..begin(dealt.end)).collect();
-        let own = all[rank].clone();
-        Self { exchange, chunks: chunks[part(chunks.len(), rank, ranks)].to_vec(), all, own }
+        let (own, dealt) = (all[rank].clone(), part(chunks.len(), rank, ranks));
+        Self { exchange, chunks: chunks.to_vec(), dealt, all, own }
     }
 
     /// Returns the range of this rank's values.
@@ -45,20 +44,31 @@ impl Slices {
         self.own.clone()
     }
 
-    /// Computes `of` for each chunk of the array, this rank for its own, and returns the results in the order of the chunks.
-    pub fn of_chunks(&self, of: impl Fn(&Range<usize>) -> f64 + Send + Sync) -> Vec<f64> {
-        self.exchange.all_gather(self.chunks.par_iter().map(of).collect::<Vec<f64>>()).concat()
-    }
-
-    /// Replaces this rank's slice of a sum over its shards by the slice of the sum over all ranks, added as a tree.
-    pub fn reduce_scatter(&self, numbers: &mut [f32]) {
-        let Some(parts) = self.exchange.all_to_all(numbers, &self.all, self.own.len()) else { return };
+    /// Writes to `numbers` what all ranks add up: `sum` adds up a chunk over the shards of this rank, and the sums of the ranks are added
+    /// as a tree. Afterwards `numbers` hold this rank's slice. Returns what `of` makes of each chunk, in the order of the chunks.
+    pub fn reduce_scatter(
+        &self,
+        numbers: &mut [f32],
+        sum: impl Fn(Range<usize>, &mut [f32]) + Sync,
+        of: impl Fn(&[f32]) -> f64 + Sync,
+    ) -> Vec<f64> {
+        if self.exchange.is_alone() {
+            let sum_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
+                sum(chunk, out);
+                of(out)
+            };
+            return split(numbers, &self.chunks).into_par_iter().map(sum_and_of).collect();
+        }
+        split(numbers, &self.chunks).into_par_iter().for_each(|(chunk, out)| sum(chunk, out));
+        let parts = self.exchange.all_to_all(numbers, &self.all, self.own.len());
         let parts: Vec<&[f32]> = if self.own.is_empty() { Vec::new() } else { parts.chunks(self.own.len()).collect() };
-        numbers[self.own()].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
-            let range = i * CHUNK..i * CHUNK + out.len();
-            let of_ranks: Vec<&[f32]> = parts.iter().map(|part| &part[range.clone()]).collect();
-            tree_sum(out, &of_ranks);
-        });
+        let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
+            let own = chunk.start - self.own.start..chunk.end - self.own.start;
+            tree_sum(out, &parts.iter().map(|part| &part[own.clone()]).collect::<Vec<_>>());
+            of(out)
+        };
+        let own = split(&mut numbers[self.own()], &self.chunks[self.dealt.clone()]);
+        self.exchange.all_gather(own.into_par_iter().map(add_and_of).collect::<Vec<f64>>()).concat()
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
@@ -74,6 +84,12 @@ impl Slices {
         }
         numbers
     }
+}
+
+/// Splits numbers into the chunks, which follow one another.
+fn split<'a>(mut numbers: &'a mut [f32], chunks: &[Range<usize>]) -> Vec<(Range<usize>, &'a mut [f32])> {
+    let mut next = |chunk: &Range<usize>| (chunk.clone(), numbers.split_off_mut(..chunk.len()).expect("room for all"));
+    chunks.iter().map(&mut next).collect()
 }
 
 #[cfg(test)]
@@ -92,7 +108,8 @@ mod tests {
             let slices: Vec<Slices> =
                 (0..ranks).map(|rank| Slices::new(Exchange::alone(1), &chunks, (rank, ranks))).collect();
             assert_eq!(slices[0].all, expected, "{ranks} ranks");
-            let dealt: Vec<Range<usize>> = slices.into_iter().flat_map(|slices| slices.chunks).collect();
+            let dealt: Vec<Range<usize>> =
+                slices.into_iter().flat_map(|slices| slices.chunks[slices.dealt].to_vec()).collect();
             assert_eq!(dealt, chunks);
         }
     }

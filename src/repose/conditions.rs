@@ -13,13 +13,15 @@ pub(super) struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
     draw: Option<EpisodePhysics>,
+    /// The part of the largest assistance that the episode gets; nothing in half of them.
+    assisted: f64,
     /// What is added to the values of every observation of the episode, in the order of the values.
     bias: Vec<(usize, f32)>,
 }
 
 impl Conditions {
     pub(super) fn new(randomization: Option<&Arc<Randomization>>) -> Self {
-        Self { randomization: randomization.cloned(), draw: None, bias: Vec::new() }
+        Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, bias: Vec::new() }
     }
 
     /// Returns the scene of the episodes that are not randomised.
@@ -32,6 +34,7 @@ impl Conditions {
     pub(super) fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
         self.draw =
             self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
+        self.assisted = (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {
@@ -64,6 +67,16 @@ impl Conditions {
         let force = self.randomization.as_ref()?.push(self.draw.as_ref()?, rng, step)?;
         sim.push(task.hand.cube.body, force);
         Some(force)
+    }
+
+    /// Applies the torque that helps to turn the cube by the rotation vector `left`, where an episode that gets all of the assistance
+    /// has an angular acceleration of `most` for each rad. Returns it, N m, if the episode is assisted.
+    pub(super) fn assist(&self, most: f64, left: [f64; 3], sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+        let torque = left.map(|angle| self.assisted * most * task.hand.cube.inertia * angle);
+        (self.assisted > 0.0).then(|| {
+            sim.twist(task.hand.cube.body, torque);
+            torque
+        })
     }
 
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.

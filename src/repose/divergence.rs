@@ -21,7 +21,8 @@ pub struct Diverged {
 impl Diverged {
     /// Returns one object: `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step, `ctrl` the controls
     /// of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes, `randomization`
-    /// is what this one has drawn (null if nothing), on top of the settings, and `pushes` the force on the cube in each step.
+    /// is what this one has drawn (null if nothing), on top of the settings, and `pushes` the force on the cube in each step. In an
+    /// episode that is assisted, `torques` are those on the cube in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
         let actions: Vec<&[f32]> = tail.actions.chunks_exact(tail.width).collect();
@@ -41,6 +42,7 @@ impl Diverged {
         add_settings(config, &mut dump);
         dump["randomization"] = self.draw.as_ref().map_or(Value::Null, |draw| draw.physics.as_json());
         dump["pushes"] = json!(tail.pushes);
+        dump["torques"] = json!(tail.torques);
         format!("{dump}\n")
     }
 }
@@ -71,6 +73,8 @@ pub struct Tail {
     pub width: usize,
     /// The random force on the cube in each step, N; empty where there is none.
     pub pushes: Vec<[f64; 3]>,
+    /// The torque on the cube in each step, N m; empty where there is none.
+    pub torques: Vec<[f64; 3]>,
 }
 
 /// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
@@ -87,16 +91,30 @@ impl Recorder {
     }
 
     /// Records a step that is about to be taken, after its controls have been set.
-    pub(super) fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>) {
+    pub(super) fn record(
+        &mut self,
+        sim: &Simulation,
+        action: &[f32],
+        push: Option<[f64; 3]>,
+        torque: Option<[f64; 3]>,
+    ) {
         let width = action.len();
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
             let (controls, actions) = (Vec::with_capacity(STEPS * width), Vec::with_capacity(STEPS * width));
-            self.before = self.now.replace(Tail { start: sim.state(), controls, actions, width, pushes: Vec::new() });
+            self.before = self.now.replace(Tail {
+                start: sim.state(),
+                controls,
+                actions,
+                width,
+                pushes: Vec::new(),
+                torques: Vec::new(),
+            });
         }
         let tail = self.now.as_mut().expect("just begun");
         tail.controls.extend(sim.ctrl());
         tail.actions.extend(action);
         tail.pushes.extend(push);
+        tail.torques.extend(torque);
     }
 
     /// Returns the recorded steps; `None` before the first step.
@@ -107,6 +125,7 @@ impl Recorder {
             tail.controls.extend(part.controls);
             tail.actions.extend(part.actions);
             tail.pushes.extend(part.pushes);
+            tail.torques.extend(part.torques);
         }
         Some(tail)
     }

@@ -323,7 +323,9 @@ impl Env for Repose {
         let rot_dist_before = self.rot_dist();
         self.actuate(action);
         let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
-        self.recorder.record(&self.sim, action, push);
+        let left = quat::rotation_vector(quat::mul(self.goal, quat::conj(self.cube().orientation)));
+        let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
+        self.recorder.record(&self.sim, action, push, torque);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls; restore what was sent for anyone who reads them.
@@ -412,6 +414,7 @@ impl Resumable for Repose {
         self.sim.restore(state.numbers_but(fixed + under_way * actuators)?)?;
         // A fork may also have no forces on the cube, but its parent's state has one.
         self.sim.push(self.task.hand.cube.body, [0.0; 3]);
+        self.sim.twist(self.task.hand.cube.body, [0.0; 3]);
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);

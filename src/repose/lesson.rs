@@ -9,6 +9,8 @@ use crate::config::{Config, EnvConfig};
 pub struct Lesson {
     /// The weight of the new target in the smoothed one.
     pub act_moving_average: f64,
+    /// The largest angular acceleration of the object towards its goal for each rad of error, 1/s².
+    pub assist: f64,
     /// Rotation error that counts as being at the goal, rad.
     pub tolerance: f64,
     /// Steps within the tolerance that reach a goal.
@@ -31,6 +33,7 @@ impl Lesson {
     pub fn task(env: &EnvConfig) -> Self {
         Self {
             act_moving_average: env.act_moving_average,
+            assist: 0.0,
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
             redirect_chance: 0.0,
@@ -46,6 +49,7 @@ impl Lesson {
         let training = &config.training;
         Self {
             act_moving_average: training.act_moving_average.by_equal_steps(env_steps),
+            assist: training.assist.by_equal_steps(env_steps),
             // By equal factors: halving the error is equally hard at any size.
             tolerance: training.tolerance.by_equal_factors(env_steps),
             hold: training.hold.by_equal_steps(env_steps).round() as u32,
@@ -58,7 +62,7 @@ impl Lesson {
     }
 
     fn described(&self) -> Vec<(Description, f64)> {
-        let Self { act_moving_average, tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
+        let Self { act_moving_average, assist, tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
         let mut all = vec![
             (Description("tolerance", "The rotation error, rad, up to which a goal counts in training."), tolerance),
             (Description("hold", "The steps within the tolerance that reach a goal in training."), f64::from(hold)),
@@ -68,6 +72,10 @@ impl Lesson {
         let smoothing = Description("act_moving_average", "The weight of the new target in the smoothed one.");
         all.push((Description("randomized", "Probability that an episode that begins is randomised."), randomized));
         all.push((smoothing, act_moving_average));
+        all.push((
+            Description("assist", "The largest angular acceleration towards the goal for each rad of error, 1/s²."),
+            assist,
+        ));
         all
     }
 

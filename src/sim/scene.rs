@@ -51,6 +51,8 @@ pub struct FreeJoint {
     pub qpos: usize,
     /// Index of the first of its six values in `qvel`.
     pub dof: usize,
+    /// The moment of inertia of what it moves, kg m²: the mean over its axes.
+    pub inertia: f64,
 }
 
 /// A body.
@@ -193,7 +195,8 @@ impl Scene {
         let joint = self.free_joint(body.0);
         let joint = joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
         let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
-        Ok(FreeJoint { body, qpos, dof })
+        let inertia = self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0;
+        Ok(FreeJoint { body, qpos, dof, inertia })
     }
 
     /// Returns the number of the first joint of a body if it is a free joint.

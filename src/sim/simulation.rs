@@ -197,8 +197,13 @@ impl Simulation {
     }
 
     /// Applies a force (N, world frame) to the centre of mass of a body in all steps until it is replaced or the state is reset.
-    pub fn push(&mut self, Body(id): Body, [x, y, z]: [f64; 3]) {
-        self.data.xfrc_applied_mut()[id] = [x, y, z, 0.0, 0.0, 0.0];
+    pub fn push(&mut self, Body(id): Body, force: [f64; 3]) {
+        self.data.xfrc_applied_mut()[id][..3].copy_from_slice(&force);
+    }
+
+    /// Applies a torque (N m, world frame) to a body in all steps until it is replaced or the state is reset.
+    pub fn twist(&mut self, Body(id): Body, torque: [f64; 3]) {
+        self.data.xfrc_applied_mut()[id][3..].copy_from_slice(&torque);
     }
 
     /// Sets the pose of a mocap body.

@@ -142,7 +142,7 @@ mod tests {
             episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
             reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, \
             training/drop 27, training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, \
-            training/drop_reward 0, training/randomized 0, training/act_moving_average 0.25, eval/goals 2, eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, \
+            training/drop_reward 0, training/randomized 0, training/act_moving_average 0.25, training/assist 0, eval/goals 2, eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, \
             eval/return 36.666666666666664, \
             eval/success_rate 0.6666666666666666, eval/success_rate_5 0.3333333333333333, eval/seconds_per_goal 2.0833333333333335, \
             eval/turned 1.344, \

@@ -222,7 +222,7 @@ fn baselines_need_no_checkpoint() {
 fn the_same_seed_trains_the_same_policy_on_any_number_of_threads() {
     // Twenty iterations.
     let runs: Vec<_> =
-        ["1", "2", "8"].map(|threads| trained_for("2560", &["--seed", "5", "--threads", threads])).into();
+        ["1", "2", "3", "8"].map(|threads| trained_for("2560", &["--seed", "5", "--threads", threads])).into();
     let other = trained_for("2560", &["--seed", "6"]);
     let latest = |run: &tempfile::TempDir| weights(run.path().join("run/checkpoints/latest.safetensors"));
     for run in &runs[1..] {
@@ -474,6 +474,8 @@ fn bench_prints_every_figure() {
     ] {
         assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
     }
+    let waits = figures["learner_waits"].as_f64().unwrap();
+    assert!((0.0..1.0).contains(&waits), "a share of the time: {waits}");
     assert_eq!((figures["threads"].as_u64(), figures["num_envs"].as_u64()), (Some(2), Some(64)));
     assert_eq!(figures["hidden"], serde_json::json!([16]));
 }

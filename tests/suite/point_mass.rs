@@ -284,7 +284,7 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
         };
         let one = learn(1);
         assert!(one.1.len() >= 3 * envs, "episodes must end during the test");
-        assert!(one == learn(2) && one == learn(8), "{envs} environments");
+        assert!([2, 3, 8].into_iter().all(|threads| one == learn(threads)), "{envs} environments");
     }
 }
 

@@ -264,7 +264,7 @@ fn nothing_of_an_episode_stays_in_the_next() {
         assert_eq!(used.draw(), draw(episode).as_ref());
     }
     // An episode that draws nothing is the task, bit for bit. Without shifts of the centre of mass, which MuJoCo computes otherwise.
-    let (mut env, draw) = randomized(&["randomization.share=0.5", "randomization.cube_com=0"]);
+    let (mut env, draw) = randomized(&["randomization.share=0.5", "randomization.cube_com=0", "training.assist=0"]);
     let mut plain = Repose::new(&task(&[]));
     let nominal = (0..20).filter(|episode| draw(*episode).is_none()).collect::<Vec<u64>>();
     assert!(nominal.len() > 4);
@@ -366,6 +366,8 @@ fn a_dump_of_a_randomised_hand_tells_what_it_has_drawn() {
         assert!((0.5..=1.5).contains(&drawn["cube_mass"].as_f64().unwrap()) && dump["hand_mass_scale"] == 1.25);
         assert_eq!((drawn["gains"].as_array().unwrap().len(), drawn["damping"].as_array().unwrap().len()), (20, 24));
         assert_eq!((steps, dump["pushes"].as_array().unwrap().len()), (steps, steps));
+        let torques = dump["torques"].as_array().unwrap().len();
+        assert!([0, steps].contains(&torques), "an episode is assisted or not: {torques}");
     }
 }
 

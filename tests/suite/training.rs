@@ -22,7 +22,7 @@ fn lesson(env_steps: u64, settings: &[&str]) -> Lesson {
     // Every weight of a reward that training adds.
     let training = toml::Table::try_from(config(&[]).training).unwrap();
     let rewards = training.keys().filter(|key| key.ends_with("_reward")).map(|key| format!("{key}=0"));
-    let task = ["task_reward=1", "tolerance=0.1", "hold=50"].map(String::from);
+    let task = ["task_reward=1", "tolerance=0.1", "hold=50", "assist=0"].map(String::from);
     let task: Vec<String> = rewards.chain(task).map(|setting| format!("training.{setting}")).collect();
     let mut all: Vec<&str> = task.iter().map(String::as_str).collect();
     all.extend(["training.goal_lifetime=0"]);
@@ -346,4 +346,35 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
     let rest = program(folder.path(), &["train", "--resume", "halves", "--total-steps", "64000"]);
     let rest = stderr(&succeeded(rest));
     assert_eq!(iterations(rest.split_once("no longer rise: ").expect(&rest).1), iterations(end));
+}
+
+#[test]
+fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_ramp_lasts() {
+    let still = ["env.reset_position_noise=0", "env.reset_dof_pos_noise=0"];
+    let task = task(&still);
+    let cube = task.hand().cube;
+    // The angular velocity that a falling cube gains in the first step, as a part of the most that is given.
+    let gained = |env_steps: u64, episode: u64| {
+        let mut env = Repose::new(&task);
+        env.set_lesson(lesson(env_steps, &["training.assist={from=100,to=0,steps=1000}"]));
+        let mut observation = start(&mut env, episode);
+        let orientation = env.cube().orientation;
+        let left = quat::rotation_vector(quat::mul(env.goal(), quat::conj(orientation)));
+        let _ = env.step(&[0.0; 20], &mut observation);
+        let spin = *env.simulation().qvel()[cube.dof + 3..].first_chunk().unwrap();
+        let spin = quat::rotate(env.cube().orientation, spin);
+        let most = left.map(|angle| 100.0 * angle * 0.01);
+        let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let part = dot(spin, most) / dot(most, most);
+        assert!(spin.iter().zip(most).all(|(spin, most)| (spin - part * most).abs() < 0.01), "{spin:?} {most:?}");
+        part
+    };
+    let first: Vec<f64> = (0..40).map(|episode| gained(0, episode)).collect();
+    assert!(first.iter().all(|part| (-1e-9..1.0).contains(part)), "{first:?}");
+    assert!((10..30).contains(&first.iter().filter(|part| part.abs() < 1e-9).count()), "{first:?}");
+    assert!(first.iter().any(|part| *part > 0.7), "{first:?}");
+    for (episode, part) in (0..).zip(&first) {
+        assert!((gained(500, episode) - 0.5 * part).abs() < 1e-6, "half of it in the middle of the ramp");
+        assert!(gained(1000, episode).abs() < 1e-9, "nothing after it");
+    }
 }

@@ -11,6 +11,7 @@ use candle_nn::Linear;
 
 use super::Policy;
 use super::backend::{GradientBackend, Losses};
+use super::clock::Clock;
 use super::parameters::Layer;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::{Activation, PpoConfig};
@@ -18,8 +19,19 @@ use crate::ranks::{Minibatch, tree_sum};
 use crate::spaces::Spaces;
 use loss::{Batch, Gaussian};
 
-/// The gradient backend in candle, with these settings.
-pub(super) struct Reference(pub PpoConfig);
+/// The gradient backend in candle.
+pub(super) struct Reference {
+    config: PpoConfig,
+    /// Those of the groups of the last minibatch.
+    gradients: Vec<Vec<f32>>,
+}
+
+impl Reference {
+    /// Creates the backend with these settings.
+    pub(super) fn new(config: &PpoConfig) -> Self {
+        Self { config: config.clone(), gradients: Vec::new() }
+    }
+}
 
 /// Gathers these samples of a rollout.
 fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
@@ -45,27 +57,31 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
     })
 }
 impl GradientBackend for Reference {
-    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
-        let (mut sums, mut gradients) = (Vec::new(), Vec::new());
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, _: &Clock) -> Result<Vec<Losses>> {
+        let mut sums = Vec::new();
+        self.gradients.clear();
         for group in &of.groups {
             let (batch, mut variables) = (gathered(policy, rollout, group)?, Vec::new());
             let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
             let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?.squeeze(1)?;
             let log_std = Tensor::full(policy.log_std, policy.spaces.action_size, &Device::Cpu)?;
             let new = Gaussian { means, log_std, scales: batch.scales.clone() };
-            let (total, losses) = loss::losses(&self.0, &batch, &new, &values)?;
+            let (total, losses) = loss::losses(&self.config, &batch, &new, &values)?;
             sums.push(losses);
             let grads = (total * (group.len() as f64 / of.count as f64))?.backward()?;
-            let mut gradient = vec![0.0; out.len()];
+            let mut gradient = vec![0.0; policy.layout.count()];
             for (range, variable) in variables {
                 if let Some(grad) = grads.get(&variable) {
                     gradient[range].copy_from_slice(&grad.flatten_all()?.to_vec1::<f32>()?);
                 }
             }
-            gradients.push(gradient);
+            self.gradients.push(gradient);
         }
-        tree_sum(out, &gradients.iter().map(|gradient| &gradient[..]).collect::<Vec<_>>());
         Ok(sums)
+    }
+
+    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {
+        tree_sum(out, &self.gradients.iter().map(|gradient| &gradient[parameters.clone()]).collect::<Vec<_>>());
     }
 }
 

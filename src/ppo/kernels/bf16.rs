@@ -122,14 +122,45 @@ impl Packed {
 
     /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
     pub fn pack(&mut self, matrix: Matrix, order: Order) {
+        self.parts(matrix, order).for_each(Part::pack);
+    }
+
+    /// Makes room for a right operand, and returns its parts, each of which is to be packed.
+    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = Part<'a>> {
+        self.parts(rhs.transposed(), Order::Pairs)
+    }
+
+    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = Part<'a>> {
         let [lines, numbers] = matrix.size();
         (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
-        let groups = lines.div_ceil(2 * LINES) * 2;
-        self.tiles.resize(groups * self.depth, Tile([0; LINES * DEPTH]));
+        let (groups, depth) = (lines.div_ceil(2 * LINES) * 2, self.depth);
+        self.tiles.resize(groups * depth, Tile([0; LINES * DEPTH]));
+        let parts = self.tiles.chunks_mut(PART).enumerate();
+        parts.map(move |(i, tiles)| Part { tiles, first: i * PART, depth, matrix, order })
+    }
+}
+
+/// Tiles that are packed together.
+const PART: usize = 32;
+
+/// Some of the tiles of a matrix that is packed.
+pub(super) struct Part<'a> {
+    tiles: &'a mut [Tile],
+    /// The number of the first of them.
+    first: usize,
+    /// The number of tiles along a line.
+    depth: usize,
+    matrix: Matrix<'a>,
+    order: Order,
+}
+
+impl Part<'_> {
+    /// Fills the tiles.
+    pub(super) fn pack(self) {
         widest!({
-            for (i, Tile(tile)) in self.tiles.iter_mut().enumerate() {
+            for (i, Tile(tile)) in (self.first..).zip(self.tiles) {
                 let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
-                pack_tile(tile, matrix, [line, number], order);
+                pack_tile(tile, self.matrix, [line, number], self.order);
             }
         });
     }

@@ -20,6 +20,7 @@ mod net;
 mod product;
 mod units;
 
+use std::ops::Range;
 use std::sync::Mutex;
 
 use anyhow::Result;
@@ -32,6 +33,7 @@ pub(super) use product::Matrix;
 
 use super::Policy;
 use super::backend::{GradientBackend, Losses};
+use super::clock::{Clock, Part};
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 use crate::ranks::{Minibatch, tree_sum};
@@ -40,16 +42,13 @@ use loss::{Loss, Sums};
 /// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
 pub(super) const ROWS: usize = 256;
 
-/// Gradient values that one job adds up.
-const CHUNK: usize = 4096;
-
 /// The gradient backend with custom kernels.
 pub(super) struct Kernels {
     config: PpoConfig,
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
-    /// Results of each group, for actor and critic.
+    /// Results of each group of the last minibatch, for actor and critic.
     parts: Vec<[Partial; 2]>,
     /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
@@ -83,9 +82,7 @@ impl Kernels {
         while self.workspaces.len() < rayon::current_num_threads() {
             self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, true, self.arithmetic)));
         }
-        if self.parts.len() < groups {
-            self.parts.resize_with(groups, Default::default);
-        }
+        self.parts.resize_with(groups, Default::default);
         rows
     }
 }
@@ -100,15 +97,16 @@ impl GradientBackend for Kernels {
         parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
     }
 
-    fn gradient(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, out: &mut [f32]) -> Result<Vec<Losses>> {
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, clock: &Clock) -> Result<Vec<Losses>> {
         let groups = &of.groups;
         let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
-        let (nets, ranges) = (policy.nets(self.arithmetic, true), policy.layout.nets());
+        let (nets, ranges) = (policy.nets(self.arithmetic, true, clock), policy.layout.nets());
         let loss = Loss::new(policy, rollout, of.count, &self.config);
         let parts = groups.iter().zip(&mut self.parts);
-        let jobs =
-            parts.flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)]);
-        jobs.collect::<Vec<_>>().into_par_iter().with_max_len(1).for_each(|(group, role, part)| {
+        let jobs: Vec<_> = parts
+            .flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)])
+            .collect();
+        let pass = |(group, role, part): (&&[u32], Role, &mut Partial)| {
             let net = &nets[role as usize];
             part.gradient.resize(ranges[role as usize].len(), 0.0);
             part.sums = loss.of_none();
@@ -126,16 +124,18 @@ impl GradientBackend for Kernels {
                 }
                 net.backward(block.len(), work, &mut part.gradient, i > 0);
             }
+        };
+        clock.part(Part::Samples, || {
+            jobs.into_par_iter().with_max_len(1).for_each(|job| clock.work(Part::Samples, || pass(job)));
         });
+        Ok(self.parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
+    }
 
-        let parts = &self.parts[..groups.len()];
-        for (net, range) in ranges.into_iter().enumerate() {
-            out[range].par_chunks_mut(CHUNK).enumerate().for_each(|(i, out)| {
-                let own = i * CHUNK..i * CHUNK + out.len();
-                let of_groups: Vec<&[f32]> = parts.iter().map(|nets| &nets[net].gradient[own.clone()]).collect();
-                tree_sum(out, &of_groups);
-            });
-        }
-        Ok(parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
+    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {
+        // The critic's parameters follow the actor's.
+        let actor = self.parts[0][0].gradient.len();
+        let (net, first) = if parameters.start < actor { (Role::Actor, 0) } else { (Role::Critic, actor) };
+        let own = parameters.start - first..parameters.end - first;
+        tree_sum(out, &self.parts.iter().map(|nets| &nets[net as usize].gradient[own.clone()]).collect::<Vec<_>>());
     }
 }

@@ -33,13 +33,9 @@ impl Arithmetic {
         })
     }
 
-    /// Returns a right operand as its products read it, for many products, if it has to be rearranged for them.
-    pub(crate) fn packed(self, rhs: Matrix) -> Option<Packed> {
-        matches!(self, Self::Bf16(_)).then(|| {
-            let mut packed = Packed::default();
-            packed.pack_right(rhs);
-            packed
-        })
+    /// Returns whether right operands have to be rearranged for its products.
+    pub(super) fn packs(self) -> bool {
+        matches!(self, Self::Bf16(_))
     }
 }
 
@@ -56,8 +52,8 @@ impl Multiplier {
         Self { arithmetic, rounded: Default::default(), packed: Default::default() }
     }
 
-    /// Writes the product to `out`, by rows, or adds it if `add` is set. `ready` is what [`Arithmetic::packed`] has made of the
-    /// right operand, if it has.
+    /// Writes the product to `out`, by rows, or adds it if `add` is set. `ready` is the right operand
+    /// as it is packed, if it is.
     ///
     /// # Panics
     /// Panics if the sizes do not match.

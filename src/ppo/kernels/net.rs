@@ -2,9 +2,12 @@
 
 use std::borrow::Cow;
 
+use rayon::prelude::*;
+
+use super::super::clock::{self, Clock};
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
-use super::bf16::Packed;
+use super::bf16::{Packed, Part};
 use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
@@ -85,18 +88,26 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Returns the net with rearranged copies of its weights, which each product would else make anew. They are for forward and
-    /// backward passes if `learning`, else for many forward passes of few rows, where making them would take longer than the
-    /// product. The results are the same, bit for bit.
-    pub(crate) fn prepared(mut self, arithmetic: Arithmetic, learning: bool) -> Self {
-        for layer in &mut self.layers {
+    /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. They are for forward and backward
+    /// passes if `learning`, else for many forward passes of few rows, where making them would take longer than the product. The
+    /// results are the same, bit for bit.
+    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learning: bool, clock: &Clock) {
+        let mut parts = Vec::new();
+        for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
             if !learning {
                 layer.weight_t = Some(layer.transposed().into());
             }
-            let backward = if learning { arithmetic.packed(layer.weight) } else { None };
-            layer.packed = [arithmetic.packed(layer.weight.transposed()), backward];
+            let read = [Some(layer.weight.transposed()), learning.then_some(layer.weight)];
+            for (packed, read) in layer.packed.iter_mut().zip(read).filter(|_| arithmetic.packs()) {
+                if let Some(read) = read {
+                    parts.extend(packed.insert(Packed::default()).parts_of_right(read));
+                }
+            }
         }
-        self
+        if !parts.is_empty() {
+            let pack = |part: Part| clock.work(clock::Part::Packing, || part.pack());
+            clock.part(clock::Part::Packing, || parts.into_par_iter().for_each(pack));
+        }
     }
 
     /// Returns copies of its weights for [`Self::with_copies`].
@@ -104,7 +115,7 @@ impl<'a> Net<'a> {
         self.layers.iter().map(Dense::transposed).collect()
     }
 
-    /// Returns the net with copies of its weights, as [`Self::prepared`] makes them for acting.
+    /// Returns the net with copies of its weights, as [`Self::prepare`] makes them for acting.
     pub(crate) fn with_copies(mut self, copies: &'a [Vec<f32>]) -> Self {
         self.layers.iter_mut().zip(copies).for_each(|(layer, copy)| layer.weight_t = Some(copy.into()));
         self
@@ -201,8 +212,11 @@ mod tests {
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
-                let net = Net::new(&layout.actor, &parameters, Activation::Elu);
-                let net = if packed { net.prepared(arithmetic, true) } else { net };
+                let mut nets = [Net::new(&layout.actor, &parameters, Activation::Elu)];
+                if packed {
+                    Net::prepare(&mut nets, arithmetic, true, &Clock::default());
+                }
+                let [net] = nets;
                 let mut work = Workspace::new(&layout.actor, rows, true, arithmetic);
                 work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
                 let outputs = net.forward(rows, &mut work).to_vec();
@@ -226,7 +240,9 @@ mod tests {
             let net = || Net::new(layers, &parameters, Activation::Elu);
             for rows in [1, 2, 5, 13, 32, 64] {
                 let expected = net().forward(rows, &mut work).to_vec();
-                assert_eq!(net().prepared(Arithmetic::F32, false).forward(rows, &mut work), expected, "{rows} rows");
+                let mut nets = [net()];
+                Net::prepare(&mut nets, Arithmetic::F32, false, &Clock::default());
+                assert_eq!(nets[0].forward(rows, &mut work), expected, "{rows} rows");
             }
         }
     }
