@@ -83,10 +83,12 @@ impl Run {
             None => Figures { stamp, ..Figures::of(path, glance.metrics.is_some()) },
         };
         let total_steps = config.as_ref().map(|config| config.run.total_steps);
+        // A run that waits for evaluations to rise may end before, and its mark says so.
+        let needed = config.as_ref().filter(|config| config.run.patience == 0).and(total_steps);
         let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         Self {
             name: whole.file_name().unwrap_or(whole.as_os_str()).to_string_lossy().into_owned(),
-            state: State::of(glance, figures.env_steps, total_steps, now),
+            state: State::of(glance, figures.env_steps, needed, now),
             total_steps,
             changed: config.as_ref().map_or(Vec::new(), |config| default.compared_with(config)),
             problems: problem.into_iter().chain(figures.problem.clone()).collect(),

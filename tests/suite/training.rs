@@ -341,6 +341,8 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
     assert_eq!(iterations(end).parse::<u64>().unwrap(), best.iteration + 2);
     let again = program(folder.path(), &["train", "--resume", "whole", "--total-steps", "128000"]);
     assert!(stderr(&succeeded(again)).contains("is finished: "), "nothing is trained");
+    let listed = succeeded(program(folder.path(), &["runs", "whole", "--json"]));
+    assert!(String::from_utf8(listed.stdout).unwrap().contains("\"finished\""), "runs says so");
     // Evaluations before and after a stop count together.
     succeeded(run(&["--run-dir", "halves", "--total-steps", "128"]));
     let rest = program(folder.path(), &["train", "--resume", "halves", "--total-steps", "64000"]);
