@@ -99,7 +99,9 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     device, n, kept = torch.device(args.device), args.hands, args.buffer
-    envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed)
+    # Actions are smoothed as in `evaluate` throughout; the program's own training smooths them less and less.
+    same = {"env.act_moving_average": 0.25}
+    envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed, set=same)
     size, width = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     normal, actor, critic = Normal(size), nn.Sequential(mlp(size, 512, 256, 128, width), nn.Tanh()), Twins(size, width)
     nn.init.normal_(actor[0][-1].weight, 0, 0.01)

@@ -84,7 +84,9 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     device, n, steps = torch.device(args.device), args.hands, args.horizon
-    envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed)
+    # Actions are smoothed as in `evaluate` throughout; the program's own training smooths them less and less.
+    same = {"env.act_moving_average": 0.25}
+    envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed, set=same)
     size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     agent = Agent(size, actions).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), 5e-4, eps=1e-5)

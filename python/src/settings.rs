@@ -51,13 +51,18 @@ pub(crate) fn resolve(
     };
     ensure!(config.is_none(), "give config or policy, not both: a policy brings the settings of its task");
     let (loaded, overrides) = (policy.loaded(), policy.with(overrides));
+    let of_task: Vec<Override> = overrides.iter().filter(|set| is_of_task(set)).cloned().collect();
+    let task = loaded.task(&of_task)?;
     let whole = if training {
+        // The hands of a policy that has learnt are smoothed as it has learnt it, and not helped, unless the user says otherwise.
+        let smoothing = task.config().act_moving_average.to_string();
+        let learnt = [("env.act_moving_average", smoothing), ("training.assist", "0".into())];
+        let learnt = learnt.map(|(key, value)| Override { key: key.into(), value });
+        let overrides: Vec<Override> = learnt.into_iter().chain(overrides).collect();
         load::for_training(&loaded.checkpoint, loaded.origin.path(), &overrides)?
     } else {
         Config::resolve(None, &[])?
     };
-    let of_task: Vec<Override> = overrides.into_iter().filter(is_of_task).collect();
-    let task = loaded.task(&of_task)?;
     Ok((Config { env: task.config().clone(), ..whole }, task))
 }
 

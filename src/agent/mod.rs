@@ -189,6 +189,7 @@ impl<E: Resumable> Agent<E> {
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
         let Progress { iteration, env_steps, fork, .. } = &checkpoint.progress;
         (self.iteration, self.env_steps, self.fork) = (*iteration, *env_steps, fork.clone());
+        self.ppo.begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
         let numbers = checkpoint.take_doubles(NUMBERS)?;
         let state = EnvState { numbers, counters: checkpoint.take_counters(COUNTERS)? };

@@ -8,18 +8,15 @@ use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::BASE;
-use super::overlay::{DEFAULTS, lookup, number, overlay, settings, table_of};
+use super::overlay::{DEFAULTS, lookup, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
+use super::smoothing::{expect_one_smoothing, smoothing_named_alone};
 use crate::os;
 use crate::sim::Parts;
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
-
-/// The setting of the task that changes in the course of a training, and the ramp that it follows there.
-const SMOOTHING: &str = "env.act_moving_average";
-const TRAINED_SMOOTHING: &str = "training.act_moving_average";
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,6 +64,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
+        expect_one_smoothing(user)?;
         layered(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
@@ -90,16 +88,18 @@ impl Config {
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let ppo = Value::try_from(net).expect("the structure of a net is a table");
+        expect_one_smoothing(user)?;
         layered(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
-    /// their defaults.
+    /// their defaults. In a checkpoint the smoothing of the task is the one of its moment; here it is the first one again.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
-        Self::resolve(Some(&Source { path: path.into(), text: text.into() }), overrides)
+        let source = Source { path: path.into(), text: text.into() };
+        layered(Table::new(), Some(source.table()?), overrides)
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
@@ -111,6 +111,7 @@ impl Config {
         let mut own = self.clone();
         (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
         let own = Table::try_from(own).expect("a configuration is a tree of tables");
+        expect_one_smoothing(user)?;
         let mut changed = layered(own, user.map(Source::table).transpose()?, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
@@ -167,7 +168,7 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 }
 
 impl Source {
-    fn table(&self) -> Result<(&Path, Table)> {
+    pub(super) fn table(&self) -> Result<(&Path, Table)> {
         // The base itself names nothing.
         if self.text == BASE {
             return Ok((&self.path, Table::new()));
@@ -188,10 +189,8 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     let mut named = BTreeSet::new();
     let mut lay = |table: &Table, merged: &mut Table| {
         named.extend(settings(table).map(|(key, _)| key));
-        // A smoothing that is named alone is the one of the whole training.
-        let smoothing = lookup(table, SMOOTHING).filter(|_| lookup(table, TRAINED_SMOOTHING).is_none());
-        if let Some(constant) = smoothing.filter(|value| number(value).is_some()) {
-            overlay(merged, &table_of(TRAINED_SMOOTHING, &constant.to_string(), merged), &DEFAULTS, "", &mut problems);
+        if let Some(constant) = smoothing_named_alone(table, merged) {
+            overlay(merged, &constant, &DEFAULTS, "", &mut problems);
         }
         overlay(merged, table, &DEFAULTS, "", &mut problems);
     };

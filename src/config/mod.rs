@@ -13,6 +13,7 @@ mod overlay;
 mod ramp;
 mod rules;
 mod settings;
+mod smoothing;
 
 /// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
@@ -112,7 +113,13 @@ mod tests {
         assert_eq!(both(alone, &[]), (1.0, Ramp::constant(1.0)));
         assert_eq!(both("", &["training.act_moving_average.from=0.3"]), (0.3, Ramp { from: 0.3, ..ramp }));
         assert_eq!(both(alone, &["training.act_moving_average={from=0.2,to=0.7,steps=9}"]).0, 0.2);
-        assert!(errors("env.act_moving_average=1.5").contains("env.act_moving_average = 1.5: must lie in [0, 1]"));
+        let two = BASE.replace("act_moving_average = 0.25 ", "act_moving_average = 0.6 ");
+        let refused = Config::resolve(Some(&source(&two)), &[]).unwrap_err().to_string();
+        assert!(refused.contains("begins with 0.25: name one of them"), "{refused}");
+        assert!(
+            errors("env.act_moving_average=1.5")
+                .contains("env.act_moving_average = 1.5: must be above 0 and at most 1")
+        );
         assert!(errors("env.act_moving_average=much").contains("env.act_moving_average = \"much\": must be a number"));
     }
 

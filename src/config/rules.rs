@@ -12,8 +12,8 @@ use crate::sim::Parts;
 // The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule, and so must all values by group.
 
 /// Settings that must be above 0.
-const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.act_moving_average env.rot_eps env.success_tolerance \
-    env.fall_dist training.act_moving_average training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
+const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance \
+    env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
 
 /// Settings that must be at least 0.
 const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
@@ -26,8 +26,7 @@ const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.ho
     randomization.push_steps run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
 
 /// Settings that must be from 0 to 1.
-const SHARES: &str =
-    "env.act_moving_average training.act_moving_average randomization.share randomization.each ppo.gamma ppo.lambda";
+const SHARES: &str = "randomization.share randomization.each ppo.gamma ppo.lambda";
 
 /// The largest valid values of settings.
 const AT_MOST: &[(&str, f64)] = &[
@@ -69,6 +68,9 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     for (key, most) in AT_MOST {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
     }
+    let smoothing = config.training.act_moving_average;
+    let key = if smoothing.from == smoothing.to { "env.act_moving_average" } else { "training.act_moving_average" };
+    rules.number(&table, key, |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1");
     let limited = ["env.", "training.", "randomization."];
     let [least, most] = IN_F32;
     for (key, value) in settings(&table).filter(|(key, _)| key != "training.hold") {

@@ -71,6 +71,8 @@ pub struct Ppo {
     learning_rate: f64,
     /// The standard deviation of the actions far from the goal, if larger.
     away_std: f32,
+    /// The iteration in which the actor begins to learn.
+    actor_from: u64,
     /// The desired KL divergence of an iteration, nats; 0: the learning rate is fixed.
     desired_kl: f64,
     exchange: Exchange,
@@ -157,6 +159,7 @@ impl Ppo {
             adam,
             learning_rate,
             away_std,
+            actor_from: config.critic_first + 1,
             desired_kl,
             exchange,
             slices,
@@ -193,6 +196,16 @@ impl Ppo {
         self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
     }
 
+    /// Begins a run after this iteration of another one, of which it is a fork.
+    pub fn begin_after(&mut self, iteration: u64) {
+        self.actor_from = iteration.saturating_add(self.config.critic_first).saturating_add(1);
+    }
+
+    /// Returns whether the actor rests in this iteration.
+    pub fn is_critic_alone(&self, iteration: u64) -> bool {
+        iteration < self.actor_from
+    }
+
     /// Returns a reusable workspace for acting in blocks of up to `rows` environments.
     pub fn workspace(&self, rows: usize) -> Workspace {
         Workspace::new(&self.policy.layout.actor, rows, false, self.arithmetic)
@@ -222,6 +235,10 @@ impl Ppo {
         rayon::scope(|_| {
             let explained_variance = self.prepare(rollout);
             self.backend.begin(&self.policy, rollout);
+            if iteration == self.actor_from && self.config.critic_first > 0 {
+                // The bias of its moments is corrected by the number of steps, which must be the same for both nets.
+                self.adam = Adam::new(self.policy.layout.count());
+            }
             let samples = rollout.samples();
             let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
             let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
@@ -232,7 +249,7 @@ impl Ppo {
                     if stop.load(Ordering::Relaxed) {
                         return Ok(None);
                     }
-                    let stage = if iteration <= self.config.critic_first {
+                    let stage = if self.is_critic_alone(iteration) {
                         Stage::CriticAlone
                     } else if steps.is_empty() {
                         Stage::First
@@ -244,6 +261,10 @@ impl Ppo {
                 }
             }
             self.check_weights()?;
+            if self.is_critic_alone(iteration) {
+                // The normaliser is part of the policy that stands still.
+                return Ok(Some(self.stats(&steps, explained_variance)));
+            }
             let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
             self.policy.see(&seen, &self.exchange);
             Ok(Some(self.stats(&steps, explained_variance)))
@@ -314,7 +335,10 @@ impl Ppo {
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
-        let (parameters, own) = (&mut self.policy.parameters, self.slices.own());
+        let (parameters, mut own) = (&mut self.policy.parameters, self.slices.own());
+        if let Stage::CriticAlone = stage {
+            own = own.start.max(nets[1].start).min(own.end)..own.end;
+        }
         clock.part(Part::Adam, || {
             self.adam.step(parameters, &self.gradient, own, (self.learning_rate, scale), clock);
         });

@@ -38,8 +38,10 @@ impl Rise {
         Self { before, best: before, since: 0 }
     }
 
-    /// Takes down another evaluation, which may be the best so far.
-    pub fn add(&mut self, figures: [f64; 3], is_best: bool) {
+    /// Takes down another evaluation.
+    pub fn add(&mut self, figures: [f64; 3]) {
+        let of = |[goals, rot_dist, _]: [f64; 3]| Evaluation { goals, rot_dist };
+        let is_best = of(figures).beats(Some(of(self.best)));
         (self.best, self.since) = if is_best { (figures, 0) } else { (self.best, self.since.saturating_add(1)) };
     }
 }

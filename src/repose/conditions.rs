@@ -1,4 +1,4 @@
-//! The conditions of an episode beside the task itself: the physics that it has drawn, forces on the cube, delay and noise.
+//! The conditions of an episode beside the task itself: the physics that it has drawn, forces and help on the object, delay and noise.
 
 use std::sync::Arc;
 
@@ -15,13 +15,15 @@ pub(super) struct Conditions {
     draw: Option<EpisodePhysics>,
     /// The part of the largest assistance that the episode gets; nothing in half of them.
     assisted: f64,
+    /// Whether the last torque was another than none.
+    twisted: bool,
     /// What is added to the values of every observation of the episode, in the order of the values.
     bias: Vec<(usize, f32)>,
 }
 
 impl Conditions {
     pub(super) fn new(randomization: Option<&Arc<Randomization>>) -> Self {
-        Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, bias: Vec::new() }
+        Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, twisted: false, bias: Vec::new() }
     }
 
     /// Returns the scene of the episodes that are not randomised.
@@ -35,6 +37,7 @@ impl Conditions {
         self.draw =
             self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
         self.assisted = (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
+        self.twisted = false;
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         match (&self.randomization, &self.draw) {
@@ -69,14 +72,17 @@ impl Conditions {
         Some(force)
     }
 
-    /// Applies the torque that helps to turn the cube by the rotation vector `left`, where an episode that gets all of the assistance
-    /// has an angular acceleration of `most` for each rad. Returns it, N m, if the episode is assisted.
-    pub(super) fn assist(&self, most: f64, left: [f64; 3], sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
-        let torque = left.map(|angle| self.assisted * most * task.hand.cube.inertia * angle);
-        (self.assisted > 0.0).then(|| {
-            sim.twist(task.hand.cube.body, torque);
-            torque
-        })
+    /// Applies the torque that helps to turn the object by the rotation vector `left`, and returns it, N m, if there is one. For each rad
+    /// an episode that gets all of the assistance turns the nominal object with an angular acceleration of `most`.
+    pub(super) fn assist(&mut self, most: f64, left: [f64; 3], sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+        let factor = self.assisted * most * task.hand.cube.inertia;
+        if factor == 0.0 && !self.twisted {
+            return None;
+        }
+        self.twisted = factor != 0.0;
+        let torque = left.map(|angle| factor * angle);
+        sim.twist(task.hand.cube.body, torque);
+        Some(torque)
     }
 
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.

@@ -48,6 +48,9 @@ pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCod
     requests.wait_for_end();
     // The state that the saver begins with.
     session.checkpoint();
+    if session.finished() {
+        return Ok(ExitCode::SUCCESS);
+    }
     session.begin(requests, None)?;
     session.checkpoint();
     while !session.finished() {

@@ -16,7 +16,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use anyhow::{Context, Error, Result, anyhow};
+use anyhow::{Context, Error, Result, anyhow, ensure};
 
 use crate::cli::TrainArgs;
 use crate::config::Config;
@@ -170,9 +170,7 @@ impl Session {
                 self.decide(requests, lead.is_some_and(|lead| lead.saver.held.folder.take_stop()), improved)?;
             Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, media, decision }))
         };
-        let caught = catch_unwind(AssertUnwindSafe(iterate));
-        let result = caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
-        result.with_context(|| format!("iteration {number}"))
+        caught(iterate).with_context(|| format!("iteration {number}"))
     }
 
     /// Returns the histograms and the film that are due after this iteration; `None` if a stop was requested meanwhile. Only who
@@ -218,9 +216,14 @@ impl Session {
         }
         let never = Requests::none();
         let now = if self.agent.exchange.is_alone() { requests } else { &never };
-        let Some(before) = self.evaluate(true, now, lead.as_mut())? else { return Ok(false) };
-        self.rise = Some(Rise::new(figures(&before)));
+        let Some(before) = caught(|| self.evaluate(true, now, lead.as_mut()))? else { return Ok(false) };
+        let known = figures(&before);
+        ensure!(
+            known.iter().all(|x| x.is_finite()),
+            "run.patience: the physics of every evaluation episode diverges at once"
+        );
         self.take_down(&before);
+        self.rise = Some(Rise::new(known));
         Ok(true)
     }
 
@@ -229,8 +232,9 @@ impl Session {
         let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
         let improved = found.beats(self.best);
         self.best = if improved { Some(found) } else { self.best };
-        if evaluation.episodes > 0 {
-            self.rise.iter_mut().for_each(|rise| rise.add(figures(evaluation), improved));
+        // While the critic learns alone, an evaluation cannot rise.
+        if evaluation.episodes > 0 && !self.agent.ppo.is_critic_alone(self.agent.iteration) {
+            self.rise.iter_mut().for_each(|rise| rise.add(figures(evaluation)));
         }
         improved
     }
@@ -292,6 +296,12 @@ fn say_what_next(run: &Path) {
     let (program, run_word) = (os::called_as(), os::quoted_path(run));
     let all = os::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
     os::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
+}
+
+/// Runs what may panic; a panic is an error.
+fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
+    let caught = catch_unwind(AssertUnwindSafe(run));
+    caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))))
 }
 
 /// Returns the figures by which a run that ends when evaluations no longer rise is compared with its start.

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, NetConfig, Override, PolicyConfig, user_file};
+use crate::config::{Config, NetConfig, Override, PolicyConfig, Source, user_file};
 use crate::load::{self, MODEL, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
@@ -250,7 +250,7 @@ fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result
 fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     let Some((path, text)) = folder.config()? else { return Ok(()) };
     let advice = format!("restore {} or delete it; to change settings, start a new run with --fork", path.display());
-    let found = Config::from_text(&path, &text, &[]).with_context(|| advice.clone())?;
+    let found = Config::resolve(Some(&Source { path: path.clone(), text }), &[]).with_context(|| advice.clone())?;
     let differing = config.differences(&found);
     ensure!(differing.is_empty(), "{} differs from the checkpoint: {}\n{advice}", path.display(), differing.join("; "));
     Ok(())

@@ -184,6 +184,25 @@ fn while_the_critic_learns_alone_the_policy_stands_still() {
 }
 
 #[test]
+fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone() {
+    let moved = |critic_first: u64| {
+        let settings = PpoConfig { critic_first, desired_kl: Ramp::constant(0.0), ..settings() };
+        let mut agent = agent(&settings, 3);
+        (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
+        let actor = |agent: &Agent<PointMass>| {
+            let policy = agent.ppo.policy();
+            let [actor, _] = policy.layout.nets();
+            policy.parameters[actor].to_vec()
+        };
+        let before = actor(&agent);
+        agent.iterate(&NEVER).unwrap();
+        actor(&agent).iter().zip(before).map(|(after, before)| f64::from(after - before).powi(2)).sum::<f64>().sqrt()
+    };
+    let (at_once, later) = (moved(0), moved(20));
+    assert!(later < 1.2 * at_once, "{later} after {at_once}");
+}
+
+#[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     for backend in [Backend::Fused, Backend::Candle] {
         let mut agent = agent(&PpoConfig { backend, ..settings() }, 3);

@@ -380,3 +380,27 @@ fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_r
         assert!(gained(1000, episode).abs() < 1e-9, "nothing after it");
     }
 }
+
+#[test]
+fn the_smoothing_follows_its_ramp_in_training_and_is_stored_with_each_checkpoint() {
+    let task = task(&[]);
+    // How far the first target goes towards the end of the range that is asked for.
+    let moved = |env_steps: u64| {
+        let mut env = Repose::new(&task);
+        env.set_lesson(lesson(env_steps, &["training.act_moving_average={from=0.25,to=0.75,steps=100}"]));
+        let mut observation = start(&mut env, 0);
+        let before = env.simulation().ctrl().to_vec();
+        let _ = env.step(&[1.0; 20], &mut observation);
+        env.simulation().ctrl().iter().zip(before).map(|(after, before)| after - before).sum::<f64>()
+    };
+    assert!((moved(100) / moved(0) - 3.0).abs() < 1e-6 && (moved(50) / moved(0) - 2.0).abs() < 1e-6);
+
+    let folder = tempfile::tempdir().unwrap();
+    let ramp = ["--set", "training.act_moving_average={from=0.2,to=0.8,steps=200}", "--total-steps", "256"];
+    succeeded(program(folder.path(), &train(&[&ramp[..], &["--run-dir", "run"]].concat())));
+    let latest = fs::read(folder.path().join("run/checkpoints/latest.safetensors")).unwrap();
+    let stored = Checkpoint::parse(&latest).unwrap().config;
+    let of = |text: &str| text.parse::<toml::Table>().unwrap()["env"]["act_moving_average"].as_float().unwrap();
+    assert_eq!(of(&stored), 0.8);
+    assert_eq!(of(&fs::read_to_string(folder.path().join("run/config.toml")).unwrap()), 0.2);
+}

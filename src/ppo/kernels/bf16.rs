@@ -122,21 +122,21 @@ impl Packed {
 
     /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
     pub fn pack(&mut self, matrix: Matrix, order: Order) {
-        self.parts(matrix, order).for_each(Part::pack);
+        self.parts(matrix, order).for_each(Tiles::pack);
     }
 
     /// Makes room for a right operand, and returns its parts, each of which is to be packed.
-    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = Part<'a>> {
+    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = Tiles<'a>> {
         self.parts(rhs.transposed(), Order::Pairs)
     }
 
-    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = Part<'a>> {
+    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = Tiles<'a>> {
         let [lines, numbers] = matrix.size();
         (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
         let (groups, depth) = (lines.div_ceil(2 * LINES) * 2, self.depth);
         self.tiles.resize(groups * depth, Tile([0; LINES * DEPTH]));
         let parts = self.tiles.chunks_mut(PART).enumerate();
-        parts.map(move |(i, tiles)| Part { tiles, first: i * PART, depth, matrix, order })
+        parts.map(move |(i, tiles)| Tiles { tiles, first: i * PART, depth, matrix, order })
     }
 }
 
@@ -144,7 +144,7 @@ impl Packed {
 const PART: usize = 32;
 
 /// Some of the tiles of a matrix that is packed.
-pub(super) struct Part<'a> {
+pub(super) struct Tiles<'a> {
     tiles: &'a mut [Tile],
     /// The number of the first of them.
     first: usize,
@@ -154,7 +154,7 @@ pub(super) struct Part<'a> {
     order: Order,
 }
 
-impl Part<'_> {
+impl Tiles<'_> {
     /// Fills the tiles.
     pub(super) fn pack(self) {
         widest!({

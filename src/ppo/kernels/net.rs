@@ -4,10 +4,10 @@ use std::borrow::Cow;
 
 use rayon::prelude::*;
 
-use super::super::clock::{self, Clock};
+use super::super::clock::{Clock, Part};
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
-use super::bf16::{Packed, Part};
+use super::bf16::{Packed, Tiles};
 use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
@@ -105,8 +105,8 @@ impl<'a> Net<'a> {
             }
         }
         if !parts.is_empty() {
-            let pack = |part: Part| clock.work(clock::Part::Packing, || part.pack());
-            clock.part(clock::Part::Packing, || parts.into_par_iter().for_each(pack));
+            let pack = |tiles: Tiles| clock.work(Part::Packing, || tiles.pack());
+            clock.part(Part::Packing, || parts.into_par_iter().for_each(pack));
         }
     }
 
