@@ -64,8 +64,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        expect_one_smoothing(user)?;
-        layered(Table::new(), user.map(Source::table).transpose()?, overrides)
+        layered(Table::new(), checked(user)?, overrides)
     }
 
     /// Returns the settings of a task and of its lesson: as [`Config::resolve`] does, but of the user's file nothing else is used.
@@ -88,8 +87,7 @@ impl Config {
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let ppo = Value::try_from(net).expect("the structure of a net is a table");
-        expect_one_smoothing(user)?;
-        layered(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
+        layered(Table::from_iter([("ppo".into(), ppo)]), checked(user)?, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
@@ -111,8 +109,7 @@ impl Config {
         let mut own = self.clone();
         (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
         let own = Table::try_from(own).expect("a configuration is a tree of tables");
-        expect_one_smoothing(user)?;
-        let mut changed = layered(own, user.map(Source::table).transpose()?, overrides)?;
+        let mut changed = layered(own, checked(user)?, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
         }
@@ -168,7 +165,7 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 }
 
 impl Source {
-    pub(super) fn table(&self) -> Result<(&Path, Table)> {
+    fn table(&self) -> Result<(&Path, Table)> {
         // The base itself names nothing.
         if self.text == BASE {
             return Ok((&self.path, Table::new()));
@@ -179,6 +176,13 @@ impl Source {
         })?;
         Ok((&self.path, table))
     }
+}
+
+/// Returns the table of a file that a user has written.
+fn checked(user: Option<&Source>) -> Result<Option<(&Path, Table)>> {
+    let table = user.map(Source::table).transpose()?;
+    expect_one_smoothing(table.as_ref())?;
+    Ok(table)
 }
 
 /// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error

@@ -1,9 +1,10 @@
 //! The smoothing of actions, a setting of the task that a training replaces by a ramp.
 
+use std::path::Path;
+
 use anyhow::{Result, ensure};
 use toml::Table;
 
-use super::layers::Source;
 use super::overlay::{lookup, number, table_of};
 
 /// The setting of the task, and the ramp that it follows in a training.
@@ -21,10 +22,9 @@ pub(super) fn smoothing_named_alone(table: &Table, merged: &Table) -> Option<Tab
 ///
 /// # Errors
 /// Fails if the one of the task is not the first one of the training.
-pub(super) fn expect_one_smoothing(user: Option<&Source>) -> Result<()> {
-    let Some(source) = user else { return Ok(()) };
-    let (path, table) = source.table()?;
-    let [task, training] = [SMOOTHING, TRAINED].map(|key| lookup(&table, key));
+pub(super) fn expect_one_smoothing(user: Option<&(&Path, Table)>) -> Result<()> {
+    let Some((path, table)) = user else { return Ok(()) };
+    let [task, training] = [SMOOTHING, TRAINED].map(|key| lookup(table, key));
     let first = training.and_then(|ramp| number(ramp.get("from").unwrap_or(ramp)));
     if let (Some(task), Some(first)) = (task.and_then(number), first) {
         let path = path.display();
