@@ -4,7 +4,7 @@
 //! are merged as tables before typing, so that every source goes through the same checks. Nothing here depends on the code
 //! that uses a setting.
 //!
-//! A new training key is written in four places: `configs/repose.toml`, its field in `settings`, its rule in `rules`, its use.
+//! `CONTRIBUTING.md` lists where a new setting is written.
 
 mod applicability;
 mod differences;

@@ -49,9 +49,10 @@ fn the_table_of_the_observation_is_the_one_of_the_program() {
 #[test]
 fn scores_in_the_readme_are_those_of_the_results() {
     let (readme, results) = (read("README.md"), read("docs/RESULTS.md"));
-    let rows = readme.lines().filter(|line| line.starts_with("| ") && line.contains(|c: char| c.is_ascii_digit()));
-    let rows: Vec<&str> = rows.filter(|row| !row.contains("| `")).collect();
-    assert!(rows.len() >= 6, "{rows:?}");
+    let section = readme.split("## ").find(|section| section.starts_with("Results")).unwrap();
+    let rows = section.lines().filter(|line| line.starts_with("| ") && line.contains(|c: char| c.is_ascii_digit()));
+    let rows: Vec<&str> = rows.collect();
+    assert!(rows.len() >= 3, "{rows:?}");
     for row in rows {
         assert!(results.lines().any(|line| line.trim() == row), "docs/RESULTS.md lacks the row {row}");
     }
@@ -60,7 +61,7 @@ fn scores_in_the_readme_are_those_of_the_results() {
 #[test]
 fn the_readme_is_short_and_names_the_test_command() {
     let readme = read("README.md");
-    assert!(readme.lines().count() <= 150);
+    assert!(readme.lines().count() <= 120);
     assert!(readme.contains("cargo test --release"));
     assert!(read("docs/LEARNING.md").lines().count() <= 200);
 }
@@ -125,7 +126,8 @@ fn every_setting_and_option_that_the_documents_name_exists() {
                 assert!(is_known || stands_for_some, "{}: {word}", path.display());
             }
             if word.starts_with("--") && word.len() > 3 && text.contains("shadow-repose") {
-                const OF_OTHERS: [&str; 24] = [
+                const OF_OTHERS: [&str; 25] = [
+                    "--version",
                     "--rm",
                     "--entrypoint",
                     "--ntasks",

@@ -76,6 +76,8 @@ fn several_ranks_come_to_the_bits_of_one_and_resume_on_another_number() {
         assert!(result(folder.path(), "run") == expected, "on {ranks} ranks");
         // The others are silent.
         assert!(said.matches("finished: 20 iterations").count() == 1 && !said.contains("rank "), "{said}");
+        let again = mpi.run(folder.path(), ranks, &["train", "--resume", "run", "--total-steps", &steps(20)]);
+        assert!(stderr(&succeeded(again)).contains("is finished: 20 iterations"), "all of them end");
     }
     for [first, second] in [[4, 1], [1, 4]] {
         let folder = tempfile::tempdir().unwrap();
@@ -84,6 +86,17 @@ fn several_ranks_come_to_the_bits_of_one_and_resume_on_another_number() {
         succeeded(mpi.run(folder.path(), second, &more));
         assert!(result(folder.path(), "run") == expected, "on {first}, then on {second} ranks");
     }
+}
+
+#[test]
+fn evaluations_that_no_longer_rise_end_all_ranks_after_the_same_iteration() {
+    let Some(mpi) = mpi() else { return };
+    let waits = ["--total-steps", &steps(200), "--set=run.patience=1", "--set=run.eval_every=2"];
+    let [alone, together] = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    succeeded(program(alone.path(), &training(&waits)));
+    let said = stderr(&succeeded(mpi.run(together.path(), 2, &training(&waits))));
+    assert!(said.contains("evaluations no longer rise: "), "{said}");
+    assert!(result(together.path(), "run") == result(alone.path(), "run"));
 }
 
 #[test]
