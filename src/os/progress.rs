@@ -132,14 +132,14 @@ impl Status {
     /// Returns the parts of the line, the most important first.
     fn parts(&self, left: Duration) -> Vec<String> {
         let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
-        let mut parts = vec![
+        let evaluated =
+            if self.evaluation.is_nan() { String::new() } else { format!(" (eval {:.2})", self.evaluation) };
+        vec![
             format!("{:.0} steps/s", self.steps_per_s),
             format!("ETA {}", clock(left)),
-            format!("lesson goals {}", known(self.goals, format!("{:.2}", self.goals))),
+            format!("goals {}{evaluated}", known(self.goals, format!("{:.2}", self.goals))),
             format!("drops {}", known(self.drop_rate, format!("{:.0}%", 100.0 * self.drop_rate))),
-        ];
-        parts.extend((!self.evaluation.is_nan()).then(|| format!("eval {:.2}", self.evaluation)));
-        parts
+        ]
     }
 
     /// Returns the line with the parts that fit into `width` columns.
@@ -155,12 +155,12 @@ impl Status {
     }
 }
 
-/// Returns the steps that are made of all steps, e.g. `10.0/175M`.
+/// Returns the steps that are made of all steps, e.g. `10.01/200M`.
 pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
     match total_steps {
         0..10_000 => format!("{env_steps}/{total_steps}"),
         10_000..1_000_000 => format!("{:.1}/{:.0}k", env_steps as f64 / 1e3, total_steps as f64 / 1e3),
-        _ => format!("{:.1}/{:.0}M", env_steps as f64 / 1e6, total_steps as f64 / 1e6),
+        _ => format!("{:.2}/{:.0}M", env_steps as f64 / 1e6, total_steps as f64 / 1e6),
     }
 }
 
@@ -191,17 +191,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_line_has_what_fits_into_60_and_80_columns() {
+    fn the_line_has_what_fits_into_63_and_80_columns() {
         let status =
             Status { env_steps: 10_012_345, steps_per_s: 12_345.6, goals: 0.24, drop_rate: 0.335, evaluation: 5.75 };
         let line = |width| status.line(100_000_000, Duration::from_secs(7533), width);
-        let short = "10.0/100M  12346 steps/s  ETA 2:05:33  lesson goals 0.24";
-        assert_eq!(line(59), short);
-        assert_eq!(line(79), format!("{short}  drops 34%  eval 5.75"));
+        let short = "10.01/100M  12346 steps/s  ETA 2:05:33  goals 0.24 (eval 5.75)";
+        assert_eq!(line(62), short);
+        assert_eq!(line(79), format!("{short}  drops 34%"));
         let k = Status { env_steps: 12_544, goals: 0.0, drop_rate: 1.0, evaluation: 0.0, ..status };
-        let expected = "12.5/26k  12346 steps/s  ETA 0:00:00  lesson goals 0.00  drops 100%  eval 0.00";
+        let expected = "12.5/26k  12346 steps/s  ETA 0:00:00  goals 0.00 (eval 0.00)  drops 100%";
         assert_eq!(k.line(25_600, Duration::ZERO, 79), expected);
         let few = Status { env_steps: 256, evaluation: f64::NAN, goals: f64::NAN, ..status };
-        assert!(few.line(1280, Duration::ZERO, 79).starts_with("256/1280  12346 steps/s  ETA 0:00:00  lesson goals -"));
+        assert!(few.line(1280, Duration::ZERO, 79).starts_with("256/1280  12346 steps/s  ETA 0:00:00  goals -  drops"));
     }
 }

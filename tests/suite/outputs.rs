@@ -235,7 +235,7 @@ fn plain_lines_where_a_line_cannot_be_drawn_again_and_one_that_fits_where_it_can
             eprintln!("not tested: there is no Python to create a terminal");
             return;
         };
-        assert!(said.contains("steps/s") && said.contains("lesson goals"), "{kind} {columns}: {said}");
+        assert!(said.contains("steps/s") && said.contains("goals "), "{kind} {columns}: {said}");
         assert_eq!(said.contains("25600 of 25600 steps"), !drawn, "{kind} {columns}: {said}");
         if *drawn {
             // The text between control sequences that move the cursor.
