@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::randomization::{EpisodePhysics, Randomization};
 use super::sensing;
 use super::task::Task;
+use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
 use crate::sim::{Scene, Simulation};
 
@@ -72,15 +73,15 @@ impl Conditions {
         Some(force)
     }
 
-    /// Applies the torque that helps to turn the object by the rotation vector `left`, and returns it, N m, if there is one. For each rad
-    /// an episode that gets all of the assistance turns the nominal object with an angular acceleration of `most`.
-    pub(super) fn assist(&mut self, most: f64, left: [f64; 3], sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+    /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. For each rad an
+    /// episode that gets all of the assistance turns the nominal object with an angular acceleration of `most`.
+    pub(super) fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let factor = self.assisted * most * task.hand.cube.inertia;
         if factor == 0.0 && !self.twisted {
             return None;
         }
         self.twisted = factor != 0.0;
-        let torque = left.map(|angle| factor * angle);
+        let torque = quat::rotation_vector(left).map(|angle| factor * angle);
         sim.twist(task.hand.cube.body, torque);
         Some(torque)
     }

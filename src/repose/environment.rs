@@ -323,7 +323,7 @@ impl Env for Repose {
         let rot_dist_before = self.rot_dist();
         self.actuate(action);
         let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
-        let left = quat::rotation_vector(quat::mul(self.goal, quat::conj(self.cube().orientation)));
+        let left = quat::mul(self.goal, quat::conj(self.cube().orientation));
         let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, push, torque);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
