@@ -1,4 +1,4 @@
-"""Prints the licences of all that a package holds: of each crate in the binary, of MuJoCo's library, and of the C++ library.
+"""Prints the licences of everything in a package: each crate in the binary, MuJoCo's library, and the C++ library.
 
 usage: python3 scripts/licences.py TARGET
 """
@@ -50,7 +50,7 @@ def of_mujoco():
 
 def main():
     target, = sys.argv[1:]
-    found = {}  # text: which crates have it, under which name
+    found = {}  # licence text: the crates that come with it
     without = []
     print("What is in this package, and its licences. shadow-repose itself: LICENSE, NOTICE.\n")
     for name, version, licence, repository, folder in sorted(crates(target)):

@@ -1,4 +1,4 @@
-"""Writes into the metadata of a policy how it was made, as the text `provenance`, before it is published.
+"""Writes into the metadata of a policy how it was made, before it is published. The text is called `provenance`.
 
 usage: python3 scripts/provenance.py POLICY.safetensors OUT.safetensors < FACTS.json
 FACTS.json: {"commands": [...], "seed": 0, "commit": "...", "machine": "...", "minutes": 0}

@@ -45,7 +45,7 @@ class Sides:
                                "--batch", str(batch), "--threads", str(self.threads), *options]))["samples_per_s"]
 
     def training(self):
-        """Returns env steps/s of `train` without options over the iterations that the peer is timed in."""
+        """Returns env steps/s of `train` without options over the iterations in which the peer is timed."""
         steps = ITERATIONS[1] * 16384
         with tempfile.TemporaryDirectory() as folder:
             run([self.program, "train", "--quiet", "--run-dir", f"{folder}/run", "--total-steps", str(steps),

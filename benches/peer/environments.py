@@ -1,10 +1,10 @@
-"""Steps the hands alone, in Python, in turn: `shadow_repose.VectorEnv` and the hands of ppo_peer.py, compiled by PyTorch.
+"""Steps environments without a learner, in Python and in turn: `shadow_repose.VectorEnv`, and ppo_peer.py compiled by PyTorch.
 
 Usage: python environments.py [--pairs 11] [--threads 2] [--hands 1024]
 Needs: the package shadow_repose, torch, numpy, mujoco==3.17.0, and a C++ compiler. Keep the machine idle.
 
-Both sides get the same random actions, one array for each step of all hands, and return observations and rewards as arrays. Only ours
-also computes final observations of hands that dropped the cube, and statistics of episodes.
+Both sides get the same random actions, one array for each step of all environments, and return observations and rewards as arrays.
+Only ours also computes final observations of environments that dropped the cube, and statistics of episodes.
 """
 import argparse
 import statistics

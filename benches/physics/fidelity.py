@@ -1,15 +1,15 @@
 """Measures what physics settings cost and how close they stay to a converged reference with a timestep of 0.002 s.
 
 Usage: python fidelity.py [--rollouts 1000] [--hold 1] [--only NAME ...] [--list]
-Needs: numpy, mujoco==3.17.0. Runs from any folder; keep the machine idle. Takes about ten minutes on two cores.
+Needs: numpy, mujoco==3.17.0. Runs from any folder. Keep the machine idle. Takes about ten minutes on two cores.
 
 Each variant is the project's scene with one change. All variants play the same rollouts of 1 s from the task's start states,
 with actions drawn as a new policy draws them (Gaussian, standard deviation 0.5, a new one every 0.01 s). With `--hold 30` each
 action is held for 0.3 s and drawn with standard deviation 1, so that whole poses are reached. Per variant:
 - speed:  control steps/s relative to the default, median of rounds run in turn
-- apart:  distance between the cube and its position in the reference after 1 s, median and 90th percentile; contacts are chaotic,
+- apart:  distance between the cube and its position in the reference after 1 s, median and 90th percentile. Contacts are chaotic,
           so the row `reference, moved 1 nm` shows the distance that remains with identical settings
-- lost:   rollouts in which the cube ends 0.24 m or more from the goal position; in parentheses those that diverged
+- lost:   rollouts in which the cube ends 0.24 m or more from the goal position, and in parentheses the diverged ones
 - deep:   depth of the deepest contact of the cube and within the hand, computed with all contact pairs, mean over states
 - energy: kinetic energy of the hand and of the cube, mean over states
 """
@@ -173,7 +173,7 @@ def main():
     parser.add_argument("--only", nargs="*", help="variants to run in addition to the default")
     parser.add_argument("--list", action="store_true")
     args = parser.parse_args()
-    mujoco.set_mju_user_warning(lambda message: None)  # MuJoCo warns of diverging states; these are counted
+    mujoco.set_mju_user_warning(lambda message: None)  # MuJoCo warns of diverging states, which are counted here
     if args.list:
         print("\n".join(VARIANTS))
         return

@@ -33,7 +33,7 @@ OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
 
 @contextlib.contextmanager
 def read_from(file):
-    """Ends the program with one sentence if the file does not hold what is looked for in it."""
+    """Ends the program with one sentence if the file lacks what is looked for in it."""
     try:
         yield
     except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
@@ -45,7 +45,7 @@ class Policy:
 
     def __init__(self, path):
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # small products: more threads only wait for each other
+        options.intra_op_num_threads = 1  # for small products, more threads only wait for each other
         try:
             self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors have no common class
@@ -102,7 +102,7 @@ class Hand:
         # Without a keyframe, episodes start in the scene's default pose.
         start = policy.facts["start_keyframe"]
         self.start = self.model.key(int(start)).qpos if start else self.model.qpos0
-        # Where the observation has the goal's orientation, which the relative one follows.
+        # The place of the goal's orientation in the observation. The relative orientation follows it.
         sizes = policy.numbers("observation_sizes").astype(int)
         self.size, self.goal_at = sizes.sum(), sizes[:policy.names("observation_names").index("goal_quat")].sum()
         # An action of -1 … 1 asks for a target within the control range: offset + scale * action.
@@ -117,7 +117,7 @@ class Hand:
         self.goal = np.array([1.0, 0, 0, 0])
 
     def place(self, qpos, qvel):
-        """Puts everything somewhere; positions of bodies follow."""
+        """Sets the positions of everything. Positions of bodies follow."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         mujoco.mj_step1(self.model, self.data)
@@ -145,7 +145,7 @@ class Hand:
         cube, speed = data.qpos[self.cube:self.cube + 7], data.qvel[self.cube_speed:self.cube_speed + 6]
         tips = []
         for kind, tip in self.tips:
-            # The velocity of the frame's origin in the world frame; MuJoCo gives the angular part first.
+            # The velocity of the frame's origin in the world frame. MuJoCo gives the angular part first.
             velocity = np.zeros(6)
             mujoco.mj_objectVelocity(self.model, data, kind, tip, velocity, 0)
             position, orientation = data.xpos[tip], data.xquat[tip]
@@ -197,8 +197,8 @@ def frame(model, name):
 
 
 def varied_model(env, scene, policy, drawn=None):
-    """Compiles the scene with the physics that the settings ask for; without changes, it is the scene itself. `drawn` is what an
-    episode of a training has drawn besides: `randomization` in a dump."""
+    """Compiles the scene with the physics that the settings ask for. Without changes, it is the scene itself. `drawn` is what an
+    episode of a training has drawn on top of them: `randomization` in a dump."""
     drawn = drawn or {}
     factor = {key: env[key + "_scale"] * np.array(drawn.get(key, 1.0))
               for key in ("friction", "cube_mass", "hand_mass", "cube_size", "gains", "damping", "frictionloss")}
@@ -252,7 +252,7 @@ def conjugate(q):
 
 
 def positive(q):
-    """A quaternion and its negative are the same rotation; the policy sees the one with w >= 0."""
+    """A quaternion and its negative are the same rotation. The policy sees the sign with w >= 0."""
     return -q if q[0] < 0 else q
 
 

@@ -1,10 +1,10 @@
-"""FastTD3 in one file: TD3 off policy with many hands, large batches and distributional critics.
+"""FastTD3 in one file: TD3 off policy with many environments, large batches and distributional critics.
 
     pip install torch
     python fast_td3.py --total-steps 10_000_000 --device cuda
 
-After Seo, Sferrazza et al., "FastTD3: Simple, fast, and capable reinforcement learning for humanoid control" (2025). The rewards are those
-of `shadow-repose train`. Scores are those of the task: an evaluation plays whole episodes. Rows go to standard output as CSV.
+After Seo, Sferrazza et al., "FastTD3: Simple, fast, and capable reinforcement learning for humanoid control" (2025). The rewards are the
+same as in `shadow-repose train`. An evaluation plays whole episodes and scores the task itself. Rows go to standard output as CSV.
 """
 import argparse
 import copy
@@ -18,8 +18,8 @@ from torch import nn
 from shadow_repose import VectorEnv
 
 GAMMA, TAU, REWARD_SCALE = 0.99, 0.1, 0.01
-LOW, HIGH, ATOMS = -10.0, 30.0, 101  # the values that the critics tell apart
-NOISE, TARGET_NOISE, NOISE_CLIP = (0.05, 0.6), 0.1, 0.3  # each hand explores with a noise of its own
+LOW, HIGH, ATOMS = -10.0, 30.0, 101  # the values that the critics distinguish
+NOISE, TARGET_NOISE, NOISE_CLIP = (0.05, 0.6), 0.1, 0.3  # each environment explores with a noise of its own
 
 
 def mlp(*sizes):
@@ -61,7 +61,7 @@ class Twins(nn.Module):
         return (logits.softmax(1) * self.atoms).sum(1)
 
     def target(self, rows, actions, rewards, discounts):
-        """Returns the distribution of reward + discount x value, of the twin that expects less, moved to the atoms."""
+        """Returns the distribution of reward + discount x value by the twin that expects less, moved to the atoms."""
         both = self(rows, actions)
         expected = torch.stack([self.values(logits) for logits in both])
         chosen = torch.where((expected[0] < expected[1])[:, None], both[0], both[1]).softmax(1)
@@ -73,7 +73,7 @@ class Twins(nn.Module):
 
 
 def evaluate(act, device, hands=64):
-    """Returns goals per episode, the mean rotation error and the share of drops, of one episode of each hand."""
+    """Returns goals per episode, the mean rotation error and the share of drops, of one episode in each environment."""
     envs = VectorEnv(hands, seed=1_000_003)
     rows, _ = envs.reset()
     found, left = [], np.ones(hands, bool)
@@ -99,7 +99,7 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     device, n, kept = torch.device(args.device), args.hands, args.buffer
-    # Actions are smoothed as in `evaluate` throughout; the program's own training smooths them less and less.
+    # Actions are smoothed as in `evaluate` throughout. The program's own training smooths them less and less.
     same = {"env.act_moving_average": 0.25}
     envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed, set=same)
     size, width = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]

@@ -1,10 +1,10 @@
-"""PPO in one file, in the style of CleanRL: PyTorch learns, on a CPU or a GPU, from hands that step in parallel.
+"""PPO in one file, in the style of CleanRL: PyTorch learns, on a CPU or a GPU, from environments that step in parallel.
 
     pip install torch
     python ppo.py --total-steps 10_000_000 --device cuda
 
-The rewards are those of `shadow-repose train`, so the curves can be compared. Scores are those of the task: an evaluation plays whole
-episodes with mean actions. Rows go to standard output as CSV.
+The rewards are the same as in `shadow-repose train`, so the curves can be compared. An evaluation plays whole episodes with mean
+actions and scores the task itself. Rows go to standard output as CSV.
 """
 import argparse
 import time
@@ -58,7 +58,7 @@ class Agent(nn.Module):
 
 
 def evaluate(agent, device, hands=64):
-    """Returns goals per episode, the mean rotation error and the share of drops, of one episode of each hand."""
+    """Returns goals per episode, the mean rotation error and the share of drops, of one episode in each environment."""
     envs = VectorEnv(hands, seed=1_000_003)
     rows, _ = envs.reset()
     found, left = [], np.ones(hands, bool)
@@ -84,7 +84,7 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     device, n, steps = torch.device(args.device), args.hands, args.horizon
-    # Actions are smoothed as in `evaluate` throughout; the program's own training smooths them less and less.
+    # Actions are smoothed as in `evaluate` throughout. The program's own training smooths them less and less.
     same = {"env.act_moving_average": 0.25}
     envs = VectorEnv(n, training=True, goal_change="truncate", random_age=True, seed=args.seed, set=same)
     size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
@@ -110,7 +110,7 @@ def main():
             row, reward, terminated, truncated, info = envs.step(action.cpu().numpy())
             paid += reward.mean() / steps
             row, reward = torch.from_numpy(row).to(device), REWARD_SCALE * torch.from_numpy(reward).to(device)
-            # Where time is up or the goal is replaced, the value of the last observation stands for the future.
+            # Where time is up or the goal is replaced, the value of the last observation replaces the future rewards.
             if truncated.any():
                 cut = torch.from_numpy(truncated).to(device)
                 with torch.no_grad():

@@ -32,7 +32,7 @@ class Log:
                 self.seconds.append(spent)
 
     def value(self, metric, at, window):
-        """Returns the mean over the `window` steps up to `at`, or the latest evaluation; NaN if the run is not that far yet."""
+        """Returns the mean over the `window` steps up to `at`, or the latest evaluation. NaN if the run has not reached `at` yet."""
         if self.steps[-1] < at:
             return math.nan
         end = next(i for i, steps in enumerate(self.steps) if steps >= at) + 1
@@ -79,7 +79,7 @@ def spread(values, digits):
 
 
 def cell(pairs, digits, is_base):
-    """Formats the mean over the seeds; for a variant also the mean difference from the base, its deviation and its signs."""
+    """Formats the mean over the seeds. For a variant, adds the mean difference from the base, its deviation and its signs."""
     pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
     if not pairs:
         return "-"
@@ -126,7 +126,7 @@ def tables(sweep):
 
 
 def milestones(sweep, logs):
-    """Returns the steps to compare at: before the base has reached any milestone, those that all have made which have begun."""
+    """Returns the steps to compare at. Before the base reaches a milestone, these are the steps that all begun runs have made."""
     made = {name: [log.steps[-1] for log in of.values()] for name, of in logs.items()}
     if made["base"] and max(made["base"]) < sweep.milestones[0]:
         return [min(steps for of in made.values() for steps in of)]

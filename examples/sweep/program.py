@@ -10,7 +10,7 @@ BUILT = pathlib.Path(__file__).resolve().parents[2] / "target/release/shadow-rep
 
 
 def find(given):
-    """Returns the path of the binary: of the given one, or else of this checkout's build, or else of the one on the PATH."""
+    """Returns the path of the binary: the given program, or else the build of this checkout, or else the program on the PATH."""
     named = given or (BUILT if BUILT.is_file() else None) or shutil.which("shadow-repose")
     if named is None:
         sys.exit("there is no program shadow-repose: build it (cargo build --release), install it, or name it with --program")
@@ -23,7 +23,7 @@ def find(given):
 
 
 def inside_wheel(command, python):
-    """Returns the binary that a wheel's command starts: a script for this Python, which knows where the binary is."""
+    """Returns the binary that a wheel's command starts. The command is a script for this Python, which knows where the binary is."""
     where = "import shadow_repose; print(shadow_repose.program())"
     found = subprocess.run([*python, "-c", where], capture_output=True, text=True)
     if found.returncode != 0:
@@ -42,7 +42,7 @@ def copy(program, to):
 
 
 def copy_whole(file, to):
-    """Copies a file under another name first, so that no part of it is left under its name by a kill."""
+    """Copies a file under another name first. So a kill leaves no partial file under the final name."""
     partial = to.with_name(f"{to.name}.partial")
     shutil.copy2(file, partial)
     partial.rename(to)

@@ -1,7 +1,7 @@
 """Trains a base and variants of it under several seeds and compares them: python3 sweep.py FILE.toml DIR
 
-FILE.toml says what to train (sweep.toml in this folder has every key); DIR holds the runs, their picture and a copy of the
-program. After Ctrl-C, a kill or a failure the same command resumes. Needs Linux, Python 3.11 and the program.
+FILE.toml says what to train (sweep.toml in this folder has every key). DIR holds the runs, their picture and a copy of the
+program. After Ctrl-C, a kill or a failure, the same command resumes. Needs Linux, Python 3.11 and the program.
 """
 import argparse
 import contextlib
@@ -26,7 +26,7 @@ sys.dont_write_bytecode = True
 import compare
 import program
 
-# The keys of the file, with their defaults; of those without a default, with their type.
+# The keys of the file with their defaults, and the keys without a default with their types.
 DEFAULTS = {"seeds": [0, 1], "set": [], "variants": {}, "stop": [], "keep": [], "table": [], "window": 1_000_000}
 OTHERS = {"steps": int, "config": str, "fork": str, "runs": int, "threads": int}
 
@@ -51,7 +51,7 @@ class Sweep:
         self.verdicts = {}
 
     def expect_rules(self):
-        """Exits unless there are the checkpoints to fork, and each stop rule is for steps that the base makes."""
+        """Exits unless the checkpoints to fork exist, and each stop rule is for steps that the base makes."""
         forks = [pathlib.Path(self.fork.format(seed=seed)) for seed in self.seeds] if self.fork else []
         if missing := [fork for fork in forks if not fork.is_file()]:
             sys.exit(f"{missing[0]}: there is no such checkpoint")
@@ -90,7 +90,7 @@ class Sweep:
                 sys.exit(f"{self.file}: metrics.csv has no column {rule['metric']}; it has {', '.join(header)}")
 
     def begin(self):
-        """Prepares the folder, and exits if it is in use. Returns what keeps others from using it."""
+        """Prepares the folder, and exits if it is in use. Returns the lock that keeps others from using it."""
         for run in self.all_runs():
             run.expect_settings()
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ class Sweep:
         except BlockingIOError:
             sys.exit(f"{self.folder}: another sweep.py is at work here")
         except OSError:
-            # This file system has no locks. A training refuses a folder that is in use all the same.
+            # This file system has no locks. Even so, a training refuses a folder that is in use.
             pass
         if self.program != copy_in(self.folder):
             program.copy(self.program, copy_in(self.folder))
@@ -161,14 +161,14 @@ class Run:
     def command(self):
         end = ["--threads", self.sweep.threads, "--total-steps", self.pause()]
         if self.checkpoints():
-            # A scene of the user's is not found by a run itself.
+            # A run does not find the user's own scene by itself.
             scene = tomllib.loads((self.path / "config.toml").read_text())["env"].get("model", "builtin")
             again = ["--set", f"env.model={scene}"] if scene != "builtin" else []
             return [self.sweep.program, "train", "--resume", self.path, *again, *end]
         begin = ["--fork", self.fork] if self.fork else ["--seed", self.seed]
         config = ["--config", self.sweep.config] if self.sweep.config else []
         sets = [word for setting in self.set for word in ("--set", setting)]
-        # Each training only begins at first: what is wrong with its settings is found before any has run for hours.
+        # At first, each training only begins. So wrong settings show before any training has run for hours.
         return [self.sweep.program, "train", *begin, *config, *sets, *end, "--run-dir", self.path, "--stop-after", "1s"]
 
     def keep_copy(self):
@@ -185,7 +185,7 @@ class Run:
             program.copy_whole(self.checkpoints()[-1], copy)
 
     def wait_until_free(self):
-        """Waits for a training in this folder to end: those of a killed sweep do so by themselves, but not at once."""
+        """Waits until a training in this folder ends. Trainings of a killed sweep end by themselves, but not at once."""
         lock = self.path / "run.lock"
         if not lock.exists():
             return
@@ -193,7 +193,7 @@ class Run:
             fcntl.flock(file, fcntl.LOCK_EX)
 
     def expect_settings(self):
-        """Exits unless the folder was begun with the same settings; returns the path of their record, and the settings."""
+        """Exits unless the folder was begun with the same settings. Returns the path of their record, and the settings."""
         of = self.sweep
         config = pathlib.Path(of.config).read_text() if of.config else None
         settings = {"fork": self.fork, "config": config, "set": self.set}
@@ -251,8 +251,8 @@ def copy_in(folder):
 
 
 def share(trainings, runs, threads):
-    """Returns how many trainings run at once, and the threads of each. By default all do, with an equal share of the cores:
-    many trainings of few threads make more steps together than few of many."""
+    """Returns how many trainings run at once, and the threads of each. By default all run, with equal shares of the cores:
+    many trainings with few threads make more steps together than few trainings with many threads."""
     cores = len(os.sched_getaffinity(0))
     runs = max(1, min(trainings, runs or cores // (threads or 1)))
     return runs, threads or max(1, cores // runs)
@@ -287,7 +287,7 @@ def train(sweep):
     """Trains all runs until they end or are stopped. Returns whether none failed."""
     lock = sweep.begin()
     for run in sweep.all_runs():
-        # It may have reached a pause when this program was killed.
+        # The run may have reached a pause when this program was killed.
         run.keep_copy()
     at_work = {}
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -309,7 +309,7 @@ def train(sweep):
 
 
 def work(sweep, at_work):
-    """Starts trainings, and looks after those in `at_work`, until there is nothing left to start."""
+    """Starts trainings, and handles the end of those in `at_work`, until no training is left to start."""
     said = set()
     while True:
         for run in [run for run, child in at_work.items() if child.poll() is not None]:
@@ -331,7 +331,7 @@ def work(sweep, at_work):
             elif verdict != "waits" and run.variant not in said:
                 said.add(run.variant)
                 say(f"{run.variant} is stopped: {verdict}")
-        # Those that have not begun first, then the least advanced, so that all can be compared early; seed by seed.
+        # First the runs that have not begun, then the least advanced, seed by seed. So all can be compared early.
         ready.sort(key=lambda run: (len(run.checkpoints()) > 0, run.pause(), sweep.seeds.index(run.seed)))
         for run in ready[:sweep.runs - len(at_work)]:
             run.keep_copy()

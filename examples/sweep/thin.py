@@ -1,6 +1,6 @@
-"""Makes a small table, such as those of docs/curves, from the metrics.csv of a run: python thin.py RUN TABLE
+"""Makes a small table from the metrics.csv of a run, such as the tables in docs/curves: python thin.py RUN TABLE
 
-A row holds the means over the iterations of 400 000 control steps, the steps at its end, and the sums of the times in seconds.
+A row covers the iterations of 400 000 control steps. It holds their means, the steps at its end, and the sums of the times in seconds.
 An iteration with an evaluation is the last of its row, so that evaluations appear at the steps at which they were made.
 """
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 MEANS = ["episode/goals", "episode/in_tolerance", "episode/drop_rate", "episode/rot_dist", "episode/length", "training/progress"]
 MEANS += ["training/turned", "policy/std", "eval/goals", "eval/drop_rate", "eval/rot_dist"]
-# Only a training with randomised episodes has these. Runs before `training/turned` was logged lack that column.
+# Only a training with randomised episodes has these. Runs from before `training/turned` was logged lack that column.
 RANDOMIZED = ["randomized/goals", "randomized/drop_rate", "randomized/rot_dist"]
-# Only a training by the task's own reward is measured by its return.
+# The return measures only a training on the task's own reward.
 RETURNS = ["episode/return", "eval/return"]
 SUMS = ["time/collect_s", "time/update_s"]
 STEPS = 400_000
