@@ -1,7 +1,7 @@
 //! The evaluation of an actor: plays whole episodes of the task, all of which count towards a score.
 //!
 //! Episode k depends only on the seed, the purpose, k and the actor. Episodes run in groups of a fixed size, one per lane, so
-//! that the nets always see batches of the same shape and results do not depend on threads or the number of episodes.
+//! the nets always see batches of the same shape. Results therefore do not depend on threads or the number of episodes.
 
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -71,7 +71,7 @@ pub struct Moment<'a> {
     pub env: &'a Repose,
     /// The observation after the reset or step.
     pub observation: &'a [f32],
-    /// The action as the actor chose it, and the end of the episode if this step ended it; `None` at a reset.
+    /// The action as the actor chose it, and the end of the episode if this step ended it. `None` at a reset.
     pub step: Option<(&'a [f32], Option<End>)>,
 }
 
@@ -125,7 +125,7 @@ pub struct Trial<'a> {
     pub stop: &'a AtomicBool,
 }
 
-/// What is said of a policy whose numbers overflow.
+/// The message about a policy whose numbers overflow.
 const NOT_FINITE: &str = "the actions of the policy are not finite";
 
 /// Checks the policy's action at the start of an episode of this task: its weights may be finite and yet overflow.
@@ -139,8 +139,8 @@ pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     Ok(())
 }
 
-/// Checks the value that the policy gives to the start of an episode of this task, which only a training needs. Its square must be
-/// finite, too: learning minimises squares.
+/// Checks the value that the policy gives to the start of an episode of this task, which only a training needs. Its square must
+/// also be finite, because learning minimises squares.
 ///
 /// # Errors
 /// Fails if the value is not finite.
@@ -153,7 +153,7 @@ pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
 
 impl Trial<'_> {
     /// Plays the episodes and returns them in order, or `None` if they were interrupted. The observer sees the steps of one
-    /// episode in order, interleaved with those of others.
+    /// episode in order, interleaved with the steps of other episodes.
     ///
     /// # Errors
     /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics.
@@ -177,8 +177,8 @@ impl Trial<'_> {
         Ok(self.play(&mut observer)?.map(|played| Score::of(&played, self.task.config().ctrl_dt)))
     }
 
-    /// Plays the episodes that `exchange` deals here, seen by the observer, and returns all of them in order, or `None` if they were
-    /// interrupted.
+    /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,
+    /// or `None` if they were interrupted.
     ///
     /// # Errors
     /// Fails as [`Trial::play`] does.
@@ -267,7 +267,7 @@ impl Actor<'_> {
         }
     }
 
-    /// Writes the actions of these lanes, one row each; those of lanes that have ended are not used.
+    /// Writes the actions of these lanes, one row each. Actions of lanes that have ended are not used.
     fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
@@ -306,7 +306,7 @@ pub struct Player {
 }
 
 impl Player {
-    /// Creates a player at the start of the first of `episodes`; the caller counts the episodes.
+    /// Creates a player at the start of the first of `episodes`. The caller counts the episodes.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
         let Spaces { observation_size, action_size, .. } = task.spaces();
         let (observation, action) = (vec![0.0; observation_size], vec![0.0; action_size]);

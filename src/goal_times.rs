@@ -25,7 +25,7 @@ pub struct GoalTimes {
 /// A goal of an episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Goal {
-    /// Once reached, the control steps that it took; before that, the step of the episode at which it was given.
+    /// Once reached, the control steps that it took. Before that, the step of the episode at which it was given.
     steps: u32,
     /// Rotation error when it was given, rad.
     angle: f64,
@@ -38,7 +38,7 @@ impl GoalTimes {
         Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
     }
 
-    /// Adds a reset or step; those of one episode must come in order.
+    /// Adds a reset or step. The steps of one episode must come in order.
     pub fn observe(&mut self, moment: &Moment) {
         let (stats, angle) = (moment.env.episode(), moment.env.rot_dist());
         let next = Goal { steps: stats.length, angle };
@@ -58,9 +58,9 @@ impl GoalTimes {
         }
     }
 
-    /// Returns `steps_to_goal` (mean and percentiles, control steps including the hold), `drops_first_second` (fraction of the
-    /// episodes) and `steps_fit` (the line of the steps without the hold over the angle: its offset, and its slope in steps per
-    /// rad); null where unknown.
+    /// Returns three values, each null where unknown. `steps_to_goal` holds mean and percentiles, in control steps including
+    /// the hold. `drops_first_second` is a fraction of the episodes. `steps_fit` is the line of the steps without the hold over
+    /// the angle: its offset, and its slope in steps per rad.
     pub fn named(&self) -> [(&'static str, Value); 3] {
         let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
         steps.sort_by(f64::total_cmp);
@@ -88,7 +88,7 @@ fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     low + part * (high - low)
 }
 
-/// Fits the least-squares line y(x), and returns its offset and slope; `NaN` for fewer than two distinct x.
+/// Fits the least-squares line y(x), and returns its offset and slope, or `NaN` for fewer than two distinct x.
 fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
     let count = points.clone().count() as f64;
     let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;

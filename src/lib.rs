@@ -1,14 +1,14 @@
 //! Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 //!
 //! # Vocabulary
-//! A *substep* is one physics step, a *step* (or control step) one action of an environment, an *iteration* one rollout of
-//! all environments and the update that learns from it. An *episode* ends *terminated* (the cube was dropped or the physics
-//! diverged) or *truncated* (time is up). A *goal* is an orientation; it is *reached* when the cube has been within the
-//! tolerance for long enough. Quaternions have the order w, x, y, z. Units are SI and radians; the frame is the world frame
-//! unless stated otherwise. The simulation uses `f64`; everything from the observation on uses `f32`.
+//! A *substep* is one physics step. A *step* (or control step) is one action of an environment. An *iteration* is one
+//! rollout of all environments and the update that learns from it. An *episode* ends *terminated* (the cube was dropped or
+//! the physics diverged) or *truncated* (time is up). A *goal* is an orientation. It is *reached* when the cube has been
+//! within the tolerance for long enough. Quaternions have the order w, x, y, z. Units are SI and radians. The frame is the
+//! world frame unless stated otherwise. The simulation uses `f64`. Everything from the observation on uses `f32`.
 //!
 //! # Modules
-//! From top to bottom. A test compares the last column with the actual imports.
+//! The modules are listed from top to bottom. A test compares the last column with the actual imports.
 //!
 //! | module | what it is | imports |
 //! |---|---|---|
@@ -45,9 +45,9 @@
 //! | [`quat`] | rotations | - |
 //! | [`rng`] | random generators named by (seed, purpose, index) | - |
 //!
-//! `env` and `ppo` do not depend on each other: they meet in `agent`, `evaluate` and the modules above. `run` depends on
-//! neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal) is
-//! confined to one folder, unsafe code to seven files.
+//! `env` and `ppo` do not depend on each other. They are combined in `agent`, `evaluate` and the modules above. `run` depends
+//! on neither. There are no import cycles between files. Each part of the outside world (MuJoCo, candle, files, the terminal)
+//! is confined to one folder, unsafe code to seven files.
 //!
 //! # Data path of an iteration
 //! There are N environments in blocks of n, T steps, and O and A values in an observation and an action. A block's arrays
@@ -64,15 +64,15 @@
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
 //! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
-//! `ppo::kernels` describes how a minibatch is computed; `ppo::candle` does the same with candle's tensors.
+//! `ppo::kernels` describes how a minibatch is computed. `ppo::candle` computes the same with candle's tensors.
 //!
-//! A training may be spread over several processes; [`ranks`] describes what they exchange.
+//! A training may be spread over several processes. [`ranks`] describes what they exchange.
 //!
 //! # Recovery
-//! At the end of each iteration [`train`] copies everything that the next one depends on into a [`ppo::Checkpoint`] with
-//! [`agent::Agent::checkpoint`]: the state of the learner and of the environments. If the following iteration fails or is
-//! stopped (a signal, a panic, a loss that is not finite), that checkpoint is the one to write. [`run`] writes it whole or
-//! not at all, under its number. [`load`] is the only way to read such files; it also finds the newest undamaged one.
+//! At the end of each iteration, [`train`] calls [`agent::Agent::checkpoint`]. It copies the state of the learner and of
+//! the environments into a [`ppo::Checkpoint`]: everything that the next iteration depends on. If that iteration fails or
+//! is stopped (a signal, a panic, a loss that is not finite), this checkpoint is written. [`run`] writes it whole or not
+//! at all, under its number. Such files are read only by [`load`], which also finds the newest undamaged one.
 
 pub mod agent;
 pub mod bench;

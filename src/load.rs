@@ -1,4 +1,4 @@
-//! Reading checkpoints and policies from untrusted files: the worst that such a file can do is to be refused.
+//! Reads checkpoints and policies from untrusted files. A bad file can do no harm: it is refused.
 //!
 //! Its size is checked before it is read, its shapes before anything is allocated for them, and its checksum before its content
 //! is used. No path in it is followed.
@@ -23,14 +23,14 @@ pub const MODEL: &str = "env.model";
 pub struct BuiltIn {
     /// The name that is accepted in place of a file or a run.
     name: &'static str,
-    /// What a user is told that it is.
+    /// Its description for the user.
     title: &'static str,
-    /// What a score names as its checkpoint.
+    /// The name of its checkpoint in a score.
     place: &'static str,
     bytes: &'static [u8],
 }
 
-/// The built-in policies; the first one is played where there is no run.
+/// The built-in policies. The first one is played where there is no run.
 static BUILTIN: [BuiltIn; 2] = [
     BuiltIn {
         name: "builtin",
@@ -56,14 +56,14 @@ pub enum PolicySource {
 }
 
 impl PolicySource {
-    /// Returns the origin that `place` names: `builtin`, `robust` unless there is such a file or folder, a file, or a run folder,
-    /// which stands for its best checkpoint or, if there is none yet, its latest.
+    /// Returns the origin that `place` names: `builtin`, `robust` (unless there is such a file or folder), a file, or a run
+    /// folder. A run folder stands for its best checkpoint or, if there is none yet, its latest.
     ///
     /// # Errors
     /// Fails if there is no such file, run folder or checkpoint.
     pub fn find(place: &Path) -> Result<Self> {
         match BUILTIN.iter().position(|policy| place == Path::new(policy.name)) {
-            // Other names may be those of runs, made before a policy had them.
+            // A run may have the same name as a later built-in policy.
             Some(i) if i == 0 || !place.exists() => Ok(Self::BuiltIn(&BUILTIN[i])),
             _ => run::resolve_checkpoint(place).map(Self::File),
         }
@@ -85,7 +85,7 @@ impl PolicySource {
         }
     }
 
-    /// Reads the policy for use in any scene, whatever the one in which it was trained.
+    /// Reads the policy for use in any scene, regardless of its training scene.
     ///
     /// # Errors
     /// Fails as [`PolicySource::load`] does.
@@ -121,11 +121,11 @@ impl fmt::Display for PolicySource {
     }
 }
 
-/// A policy, and what its file tells of the task that it was trained for.
+/// A policy, and what its file says about the task that it was trained for.
 pub struct Loaded {
     /// Where it comes from.
     pub origin: PolicySource,
-    /// What a user is told that it is.
+    /// Its description for the user.
     pub name: String,
     /// The hand and the object that it was trained with.
     pub record: Record,
@@ -145,7 +145,7 @@ impl Loaded {
             (Some(place), _) => PolicySource::find(place)?,
             (None, Some(newest)) => PolicySource::find(&newest)?,
             (None, None) => {
-                os::say("there is no run here: taking the built-in policy");
+                os::say("there is no run here: using the built-in policy");
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
@@ -174,7 +174,7 @@ impl Loaded {
 /// Returns the hand and the object that a policy with this net was trained with.
 ///
 /// # Errors
-/// Fails if what its file says of them is damaged.
+/// Fails if the record in its file is damaged.
 pub fn record(checkpoint: &Checkpoint, net: &NetConfig) -> Result<Record> {
     let record = match &checkpoint.hand {
         Some(text) => Record::parse(text)?,
@@ -199,8 +199,8 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
 }
 
 /// Returns the first of the listed files (newest first) that is not damaged, and prints a warning for each one before it. A file
-/// that cannot be read or used is not skipped: it may be usable later, and continuing from an older one would discard its
-/// progress. If one has vanished since it was listed, as where a training goes on, the list is made once more.
+/// that cannot be read or used is not skipped, because it may be usable later. Continuing from an older one would discard its
+/// progress. If a file has vanished since it was listed, e.g. because a training goes on, the list is made once more.
 ///
 /// # Errors
 /// Fails if there is no file, if one cannot be read or used, or if all are damaged (with the error of the last one).
@@ -213,7 +213,7 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
-            Err(error) if is_damage(&error) => os::say(&format!("warning: {error:#}\n  Trying the one before.")),
+            Err(error) if is_damage(&error) => os::say(&format!("warning: {error:#}\n  Trying the previous one.")),
             result => return Ok((path.clone(), result?)),
         }
     }
@@ -242,8 +242,8 @@ pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]
     Ok(config)
 }
 
-/// Returns the configuration of the training that wrote a checkpoint in the file `path`, and that of a fork of it, overlaid with
-/// the `user`'s file and `overrides`.
+/// Returns two configurations: of the training that wrote a checkpoint in the file `path`, and of a fork of it. The latter is
+/// overlaid with the `user`'s file and `overrides`.
 ///
 /// # Errors
 /// Fails as [`for_training`] does.
@@ -287,7 +287,7 @@ fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
 /// Checks that a scene other than the built-in one was named by the user.
 ///
 /// # Errors
-/// Fails if it was not; the message says how to name it.
+/// Fails if it was not. The message says how to name it.
 pub fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
     if let Some(model) = env.model_file().filter(|_| !named) {
         let set = os::quoted(&format!("{MODEL}={}", model.display()));

@@ -40,7 +40,7 @@ fn main() -> ExitCode {
     })
 }
 
-/// Prints the help, the version or a usage error, and returns the exit code. One of several says it.
+/// Prints the help, the version or a usage error, and returns the exit code. Among several ranks, only one prints.
 fn tell(answer: &clap::Error) -> ExitCode {
     if ranks::is_spokesman()
         && let Err(error) = answer.print()

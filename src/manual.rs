@@ -19,7 +19,7 @@ pub fn completions(shell: Shell) -> Result<()> {
         let more = if shell == Shell::Fish { after_commands(&program) } else { String::new() };
         return os::print(&(String::from_utf8(text)? + &more));
     }
-    // For a name with a hyphen, clap_complete 4.6 writes a script whose commands have two names, and completes nothing after one.
+    // For a name with a hyphen, clap_complete 4.6 gives each command two names in the script, and completes nothing after a command.
     clap_complete::generate(shell, &mut program.name("shadow_repose"), "shadow_repose", &mut text);
     let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
     os::print(&text)

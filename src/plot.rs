@@ -1,5 +1,5 @@
-//! Learning curves: metrics of one or more runs over control steps or hours. What training logs in each iteration is smoothed,
-//! evaluations are drawn at their own steps.
+//! Learning curves: metrics of one or more runs over control steps or hours. Metrics of each iteration are smoothed.
+//! Evaluations are drawn at their own steps.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -15,8 +15,8 @@ use crate::tags::quantity;
 /// A metric, and what is drawn instead where no run has its values.
 type Metric<'a> = (&'a str, Option<&'a str>);
 
-/// The metrics that are drawn by default: the headline, and what explains it. They have no values where no episode is of the
-/// task itself, because all are randomised, or in an older table.
+/// The metrics that are drawn by default: the headline, and what explains it. They have no values if all episodes are
+/// randomised, or in an older table.
 const DEFAULT: [Metric; 4] = [
     ("eval/goals", None),
     ("episode/goals", Some("randomized/goals")),
@@ -36,8 +36,7 @@ const SMOOTH: usize = 50;
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
-/// A run: its name, its place on the x axis in each row, the lengths of the windows that are smoothed, the names of all its
-/// columns, and those that were asked for.
+/// A run: name, place on the x axis in each row, lengths of the smoothing windows, names of all columns, and the requested columns.
 struct Run {
     name: String,
     along: Vec<f64>,
@@ -46,12 +45,11 @@ struct Run {
     columns: HashMap<String, Vec<f64>>,
 }
 
-/// Draws the curves. Of several runs, those that cannot be drawn are skipped with a warning, e.g. one that was stopped in its
+/// Draws the curves. Of several runs, a run that cannot be drawn is skipped with a warning, e.g. one that was stopped in its
 /// first iteration.
 ///
 /// # Errors
-/// Fails if no run has readable metrics with at least one row, if none has a column that is asked for, or if the picture cannot
-/// be written.
+/// Fails if no run has readable metrics with at least one row, if none has a requested column, or if the picture cannot be written.
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
@@ -63,7 +61,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let wanted: Vec<&str> = metrics.iter().flat_map(|(usual, other)| [*usual].into_iter().chain(*other)).collect();
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &args.metric)?;
-    ensure!(!args.seeds || runs.len() > 1, "--seeds: the mean of a single run; give the runs of several seeds");
+    ensure!(!args.seeds || runs.len() > 1, "--seeds: there is only one run; give the runs of several seeds");
     let has_values = |run: &Run, name: &str| run.columns.get(name).is_some_and(|all| all.iter().any(|x| !x.is_nan()));
     let known = |name: &str| runs.iter().any(|run| has_values(run, name));
     let mut panels = Vec::new();
@@ -178,8 +176,8 @@ impl Run {
     }
 }
 
-/// Returns the mean of these curves and the band from the lowest to the highest, where all of them have values: at the points of
-/// the first, with the others on straight lines between theirs.
+/// Returns the mean of these curves and the band from the lowest to the highest, where all of them have values. The points are
+/// taken from the first curve, and the others are interpolated linearly.
 fn mean_and_band(curves: &[Curve]) -> Curve {
     let dots = curves.iter().any(|curve| curve.dots);
     let mut mean = Curve { dots, ..Curve::default() };
@@ -196,7 +194,7 @@ fn mean_and_band(curves: &[Curve]) -> Curve {
     mean
 }
 
-/// Returns the numbers of consecutive rows that lie in the same window of so many steps.
+/// Returns the numbers of consecutive rows that lie in the same window of this many steps.
 fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
     let first = steps[0];
     // Rounded, because steps are whole numbers and the window is a multiple of their difference.
@@ -215,7 +213,7 @@ fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
     collect_s.iter().zip(update_s).scan(0.0, add).collect()
 }
 
-/// Returns the name of a run, with control characters replaced: that of its folder, or of a table that is kept under a name of
+/// Returns the name of a run, with control characters replaced. It is the name of its folder, or of a table that has a name of
 /// its own, as in docs/curves.
 fn name_of(place: &Path) -> String {
     let whole = place.canonicalize().unwrap_or_else(|_| place.to_owned());

@@ -1,5 +1,5 @@
-//! A processor that MuJoCo cannot run on is named in a sentence. The library uses AVX from its first instructions on, which run
-//! before `main` and would end the program by SIGILL.
+//! Reports a processor that MuJoCo cannot run on. The library uses AVX from its first instructions on. They run before `main`
+//! and would end the program by SIGILL.
 
 #![expect(unsafe_code, reason = "only the linker can place a function before those of the libraries")]
 

@@ -9,7 +9,7 @@ pub type Quat = [f64; 4];
 const H: f32 = 0.5;
 const R: f32 = FRAC_1_SQRT_2;
 
-/// The rotations that map a cube onto itself, as w, x, y, z; one of each pair q and -q.
+/// The rotations that map a cube onto itself, as w, x, y, z. Each pair q and -q has one entry.
 #[rustfmt::skip]
 pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
     // None, and half turns about an axis through the centres of two faces.
@@ -58,7 +58,7 @@ pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
     [x, y, z]
 }
 
-/// Returns the one of `q` and `-q` with w ≥ 0, so that each rotation has one sign.
+/// Returns `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
 pub fn canonical(q: Quat) -> Quat {
     if q[0] < 0.0 { q.map(|x| -x) } else { q }
 }

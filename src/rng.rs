@@ -1,13 +1,13 @@
 //! Stateless randomness: a generator is identified by (seed, purpose, index).
 //!
-//! No generator is carried from one iteration or episode to the next, so anyone who knows these three can draw the same
+//! No generator is carried from one iteration or episode to the next. So anyone who knows these three can draw the same
 //! numbers again, on any thread, in any order, after any interruption. Within an episode, the position of its generator
 //! is part of what is saved.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The only generator of the program; its values are the same in every version of its crate.
+/// The only generator of the program. Its values are the same in every version of its crate.
 pub type Rng = ChaCha8Rng;
 
 /// Returns the generator of stream `index` for `purpose` (at most 24 bytes) under `seed`. Different identifiers never
@@ -27,8 +27,8 @@ pub fn beside(rng: &Rng, purpose: &str) -> Rng {
     stream(seed, purpose, rng.get_stream())
 }
 
-/// Returns the generator for another purpose and one of its places. Those of different places share no numbers as long as fewer
-/// than 2¹⁶ words are drawn.
+/// Returns the generator for another purpose and one of its places. Generators of different places share no numbers as long as
+/// fewer than 2¹⁶ words are drawn.
 pub fn beside_at(rng: &Rng, purpose: &str, place: u32) -> Rng {
     let mut beside = beside(rng, purpose);
     beside.set_word_pos(u128::from(place) << 16);

@@ -1,5 +1,5 @@
-//! How a policy fares on hands and cubes that it was not made for: its score under one change at a time of the physics, of what it
-//! observes, or of when its actions take effect, as a table, JSON and a picture.
+//! The robustness of a policy: its score on hands and cubes that it was not trained for, as a table, JSON and a picture. One
+//! change at a time affects the physics, what it observes, or when its actions take effect.
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -56,7 +56,7 @@ struct Row {
     condition: Condition,
     config: EnvConfig,
     score: Score,
-    /// The goals as a fraction of those without any change.
+    /// The goals as a fraction of the goals without any change.
     kept: f64,
 }
 
@@ -72,7 +72,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         loaded.task(&sets).with_context(|| format!("row `{}`", condition.name))
     };
     let conditions = conditions();
-    // Found out now rather than after minutes.
+    // Problems are found now rather than after minutes.
     let tasks: Vec<Arc<Task>> = conditions.iter().map(task).collect::<Result<_>>()?;
     let configs: Vec<EnvConfig> = tasks.iter().map(|task| task.config().clone()).collect();
     let count = args.episodes.unwrap_or(256) as usize;
@@ -91,7 +91,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
             os::say(&format!("warning: {}: {warning}", condition.name));
         }
         let nominal = rows.first().map_or(score.goals, |nominal| nominal.score.goals);
-        // Of nothing, no share is kept.
+        // Without any goals there is no fraction.
         let kept = if nominal > 0.0 { score.goals / nominal } else { f64::NAN };
         rows.push(Row { condition, config, score, kept });
     }
@@ -133,7 +133,7 @@ fn conditions() -> Vec<Condition> {
     conditions
 }
 
-/// Returns the mean of what is kept over the single changes, each counted as at most 1.
+/// Returns the mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Row]) -> f64 {
     let single = rows.iter().skip(1).filter(|row| !row.condition.is_in_grid());
     let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();
@@ -170,7 +170,7 @@ fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
         let (goals, kept) = (number(score.goals, 2), number(*kept, 2));
         text += &format!("{:<30} {goals:>5}  {:<15} {drops:>7} {kept:>6}\n", condition.name, format!("{low} … {high}"));
     }
-    text + &format!("\nkept on average over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
+    text + &format!("\nmean kept over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
 }
 
 fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {

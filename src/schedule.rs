@@ -1,16 +1,16 @@
 //! Runs blocks of work through many rounds on all threads, without a barrier between the rounds.
 //!
 //! One thread works on a block at a time, and the rounds of a block run in order. A free thread takes the next round of
-//! the block that has waited longest; no thread waits for a block that another one is working on. If fewer blocks than
-//! threads are left, the other threads leave. The content of a block must not depend on the number of threads; then the
-//! result does not either.
+//! the block that has waited longest. No thread waits for a block that another one is working on. If fewer blocks than
+//! threads are left, the other threads leave. The content of a block must not depend on the number of threads. Then the
+//! result does not depend on it.
 
 use std::any::Any;
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
-/// Returns the number of items in each block when `items` of a total of `in_all` items are split: enough blocks for
-/// many threads, enough items in each for full vectors of work.
+/// Returns the number of items in each block when `items` of a total of `in_all` items are split. There are enough
+/// blocks for many threads, and enough items in each for full vectors of work.
 pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
     let size = (in_all / 32).clamp(8, 64);
     (0..items).step_by(size).map(|first| size.min(items - first)).collect()

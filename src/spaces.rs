@@ -9,7 +9,7 @@ pub struct Spaces {
     pub observation_size: usize,
     /// The number of values in an action.
     pub action_size: usize,
-    /// The location of a cube and its goal, if there is one; for `ppo.symmetry`.
+    /// The location of a cube and its goal, if there is one (for `ppo.symmetry`).
     pub cube_and_goal: Option<CubeAndGoal>,
     /// The distance of an observation from its goal, in the unit of `ppo.away_range`.
     pub distance: fn(&Self, &[f32]) -> f32,
@@ -24,6 +24,6 @@ pub struct CubeAndGoal {
     pub goal: usize,
     /// The offset of the orientation of the cube relative to its goal.
     pub relative: usize,
-    /// The rotations that a policy takes for the same: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
+    /// The rotations that a policy treats as the same: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
     pub symmetry: u32,
 }

@@ -14,7 +14,7 @@ pub struct Quantity {
 
 /// The groups of scores: the prefix of a name, what is added to a title, and the episodes.
 const GROUPS: [(&str, &str, &str); 3] = [
-    ("episode/", "training", "Training episodes that ended in the iteration; not those that were randomised."),
+    ("episode/", "training", "Training episodes that ended in the iteration, without the randomised ones."),
     ("randomized/", "randomised training", "Randomised training episodes that ended in the iteration."),
     ("eval/", "evaluation", "Episodes of the task itself with mean actions."),
 ];
@@ -28,7 +28,7 @@ const OTHERS: [(&str, &str, &str); 22] = [
     ("loss/value", "value loss", "The squared error of the values, mean over the minibatches."),
     ("policy/entropy", "entropy (nats)", "Entropy of the action distribution."),
     ("policy/kl", "KL divergence (nats)", "KL divergence from the policy that collected; near ppo.desired_kl."),
-    ("policy/first_kl", "first KL divergence (nats)", "The same before the first gradient step: 0 up to rounding."),
+    ("policy/first_kl", "first KL divergence (nats)", "KL divergence before the first gradient step: 0 up to rounding."),
     ("policy/clip_fraction", "share of samples clipped", "Fraction of the samples whose ratio was clipped."),
     ("policy/std", "standard deviation of actions", "Standard deviation of the actions; 1 is half an actuator's range."),
     ("policy/excess", "excess of mean actions", "Squared distance of the mean actions from [-1, 1]."),
@@ -37,7 +37,7 @@ const OTHERS: [(&str, &str, &str); 22] = [
     ("optim/grad_norm", "gradient norm", "Norm of the gradient before clipping, mean over the minibatches."),
     ("time/collect_s", "collecting (s)", "Seconds of collecting in the iteration."),
     ("time/update_s", "learning (s)", "Seconds of learning in the iteration."),
-    ("time/steps_per_s", "speed (steps/s)", "Control steps per second of collecting and learning, over all hands."),
+    ("time/steps_per_s", "speed (steps/s)", "Control steps per second of collecting and learning, over all environments."),
     ("time/exchange_s", "exchange (s)", "Seconds of collecting and learning that the exchange took, waiting included; with MPI only."),
     ("time/exchange_bytes", "exchange (bytes)", "Bytes that were sent while collecting and learning; with MPI only."),
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
@@ -47,7 +47,7 @@ const OTHERS: [(&str, &str, &str); 22] = [
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];
 
-/// Returns the quantity with this name, if it is one of those that a training logs.
+/// Returns the quantity with this name, if a training logs it.
 pub fn quantity(name: &str) -> Option<Quantity> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {

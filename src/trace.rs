@@ -6,7 +6,7 @@ use crate::env::{End, Env};
 use crate::evaluate::Moment;
 use crate::repose::{Group, Task, add_settings};
 
-/// The number of records at which writing stops; episodes are written whole and in order.
+/// The number of records at which writing stops. Episodes are written whole and in order.
 const ENOUGH: usize = 2000;
 
 /// The records of episodes that may still be needed.
@@ -51,7 +51,7 @@ impl Trace {
 
     /// Records `moment` if it may be needed.
     ///
-    /// Episodes run in parallel, and their lengths are not known beforehand; but once the episodes up to some number have
+    /// Episodes run in parallel, and their lengths are not known beforehand. But once the episodes up to some number have
     /// enough records together, no later one is needed.
     pub fn record(&mut self, moment: &Moment) {
         if moment.episode > self.last {
@@ -81,7 +81,7 @@ impl Trace {
 
 fn record(moment: &Moment) -> Value {
     let (env, simulation) = (moment.env, moment.env.simulation());
-    // The policy of the hand on the other side sees it mirrored.
+    // A policy for the hand on the other side sees it mirrored.
     let mut here = vec![0.0; moment.observation.len()];
     env.observe(&mut here);
     let (qpos, qvel, obs) = (simulation.qpos(), simulation.qvel(), doubles(&here));

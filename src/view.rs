@@ -26,8 +26,8 @@ const ACTORS: [(Motion, &str, Actor); 3] = [
 /// Shows the scene in a window or on a page, or writes one picture of it.
 ///
 /// # Errors
-/// Fails if a setting or the scene cannot be used, if no window can be opened (with what is missing), or if the picture cannot be
-/// written.
+/// Fails if a setting or the scene cannot be used, or if the picture cannot be written. Fails with what is missing if no window
+/// can be opened.
 pub fn view(args: &ViewArgs) -> Result<()> {
     expect_used(&args.settings.set, "view")?;
     if args.shot.size.is_some() && args.screenshot.is_none() {
@@ -67,7 +67,7 @@ fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Re
     see::Live::open(port, &task, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }
 
-/// Loads the task, and tells what of the user's scene the settings replace.
+/// Loads the task, and prints what the settings replace in the user's scene.
 fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
     let task = Task::new(&config.env, &config.hand)?;
     let task = see::task_for_display(&task, &args.shot, [1280, 720], crate::sim::Quality::High)?;

@@ -1,4 +1,4 @@
-//! The largest allocation of a training once it runs. A separate binary, because the allocator is that of the whole process.
+//! The largest allocation of a training once it runs. A separate binary, because a process has only one allocator.
 
 #![allow(unsafe_code)]
 #![allow(clippy::unwrap_used)]
@@ -49,7 +49,7 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let first = iterate();
     let later = [iterate(), iterate()];
     // gemm packs the largest weight matrix, 157 × 256 floats, into its own buffer. An array of all weights, or of a block of rows
-    // in a net, would be larger; one of all samples, much larger.
+    // in a net, would be larger. An array of all samples would be much larger.
     let packed = 4 * 157 * config.ppo.hidden[0];
     assert!(first > 500_000 && later.iter().all(|&largest| largest <= packed), "{first} bytes, then {later:?}");
 }

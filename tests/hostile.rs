@@ -42,8 +42,8 @@ fn a_checkpoint() -> Checkpoint {
     checkpoint
 }
 
-/// Returns the bytes with bits flipped, parts cut out, shuffled, repeated or overwritten, or lengths made huge; more often in the
-/// first `structured` bytes.
+/// Returns the bytes with bits flipped, parts cut out, shuffled, repeated or overwritten, or lengths made huge. This happens more
+/// often in the first `structured` bytes.
 fn mutated(good: &[u8], structured: usize, rng: &mut Rng) -> Vec<u8> {
     let mut bytes = good.to_vec();
     for _ in 0..rng.random_range(1..4) {
@@ -164,7 +164,7 @@ fn growth(rows: u64) -> i64 {
     }
     report.finish();
     drop(report);
-    // A resumed session reads all of it.
+    // A resumed session reads the whole log.
     let mut resumed = Report::new(place.path(), &names, StatusLine::new(rows - 1, rows, true));
     resumed.open_logs(0..rows - 1, rows - 1);
     resumed.finish();

@@ -1,4 +1,4 @@
-"""The hands of shadow-repose as Gymnasium environments, its policies, and its program.
+"""Gymnasium environments of shadow-repose, its policies, and its program.
 
     import shadow_repose
 
@@ -28,7 +28,7 @@ __all__ = ["Env", "Policy", "VectorEnv", "evaluate", "program"]
 
 
 def _expect_avx(facts: str = "/proc/cpuinfo") -> None:
-    """Names a processor that MuJoCo cannot run on. Its library would end Python by SIGILL."""
+    """Reports a processor that MuJoCo cannot run on. MuJoCo's library would end Python by SIGILL."""
     if os.uname().machine != "x86_64":
         return
     try:
@@ -58,7 +58,7 @@ if not TYPE_CHECKING:
 def register() -> None:
     """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`.
 
-    This happens by itself where Gymnasium is imported before this package, and where `shadow_repose.envs` is.
+    This happens by itself if Gymnasium is imported before this package, or if `shadow_repose.envs` is imported.
     """
     from gymnasium.envs import registration
 

@@ -1,4 +1,4 @@
-"""The extension module, which the other modules wrap: use those."""
+"""The extension module. Use the other modules, which wrap it."""
 from typing import Any
 
 import numpy as np

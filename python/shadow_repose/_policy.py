@@ -25,8 +25,8 @@ BUILT_IN = ("builtin", "robust")
 class Policy:
     """A trained policy: it maps raw observations to actions. Create one by `Policy.load`.
 
-    A policy belongs to the settings of its task, above all `env.act_moving_average`. On hands with other settings it scores worse:
-    make them by `policy.make_env()` or `VectorEnv(policy=policy)`.
+    A policy belongs to the settings of its task, above all `env.act_moving_average`. In environments with other settings it scores
+    worse. Create them by `policy.make_env()` or `VectorEnv(policy=policy)`.
     """
 
     def __init__(self, native: _native.Policy) -> None:
@@ -42,11 +42,11 @@ class Policy:
 
         Args:
             place: `"builtin"` or `"robust"`, a checkpoint or policy file, or the folder of a run, for its best checkpoint.
-            set: settings of its task that replace the stored ones; a scene of one's own must be named again by `env.model`.
+            set: settings of its task that replace the stored ones. A scene of your own must be named again by `env.model`.
 
         Raises:
             FileNotFoundError, PermissionError: there is no such file, or it cannot be read.
-            ValueError: the file is damaged or none of the program, or a setting is invalid.
+            ValueError: the file is damaged or does not come from the program, or a setting is invalid.
         """
         place = os.fspath(place)
         if place not in BUILT_IN and not os.path.exists(place):
@@ -60,8 +60,8 @@ class Policy:
     ) -> np.ndarray:
         """Returns actions `[B, A]`, float32, for raw observations `[B, O]`, or `[A]` for `[O]`.
 
-        They are the means, or with `deterministic=False` drawn around them with `std`. They are not clipped; an environment does
-        that. A row's actions are the same bits whatever the other rows are.
+        They are the means, or with `deterministic=False` drawn around them with `std`. They are not clipped, because an environment
+        does that. A row's actions are the same bits whatever the other rows are.
         """
         rows, is_one = self._rows(observations)
         actions = self._native.actions(rows)
@@ -96,7 +96,7 @@ class Policy:
         return np.full(self._native.sizes()[1], self._native.std, np.float32)
 
     def make_env(self, num_envs: int = 64, **options: Any) -> VectorEnv:
-        """Returns `VectorEnv(num_envs, policy=self, **options)`: hands of the task that it was trained for."""
+        """Returns `VectorEnv(num_envs, policy=self, **options)`: environments of the task that it was trained for."""
         from .envs import VectorEnv
 
         return VectorEnv(num_envs, policy=self, **options)
@@ -142,9 +142,9 @@ def evaluate(
     Args:
         policy: a policy, or a place that `Policy.load` takes.
         episodes: how many episodes are played.
-        seed: what they are drawn from.
+        seed: the seed from which they are drawn.
         set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`.
-        threads: worker threads; 0: one per core.
+        threads: worker threads. 0 means one per core.
 
     Ctrl-C interrupts it. Raises ValueError as `Policy.load` does.
     """

@@ -11,7 +11,7 @@ _INSIDE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bin", "shado
 def program() -> str:
     """Returns the path of the program `shadow-repose`, to train with: `subprocess.run([program(), "train", ...])`.
 
-    Raises FileNotFoundError if this package came without it and there is none on the PATH.
+    Raises FileNotFoundError if this package came without it and the PATH has none.
     """
     if os.path.exists(_INSIDE):
         return _INSIDE

@@ -50,7 +50,7 @@ def pairs(settings: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def absolute(settings: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Returns the settings with the scene's path as it is from any folder, for pickles."""
+    """Returns the settings with the absolute path of the scene, for pickles."""
     known = dict(settings or {})
     model = known.get("env.model")
     if model is not None and model != "builtin":
@@ -62,5 +62,5 @@ def flat(text: str) -> dict[str, Any]:
     """Returns the settings in a JSON object of sections, by dotted key."""
     sections = json.loads(text)
     settings = {f"{section}.{key}": value for section, keys in sections.items() for key, value in keys.items()}
-    del settings["env.num_envs"]  # it is not of the task
+    del settings["env.num_envs"]  # it does not belong to the task
     return settings

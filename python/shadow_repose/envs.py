@@ -1,4 +1,4 @@
-"""The hands as Gymnasium environments: N that step together, or one."""
+"""Gymnasium environments of the task: N that step together, or one."""
 from __future__ import annotations
 
 import os
@@ -19,36 +19,37 @@ from ._settings import absolute, flat, number, pairs
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# What the extension module says of an end.
+# The numbers by which the extension module reports an end.
 _TERMINATED, _TRUNCATED, _REDIRECTED = 1, 2, 3
 
 _STATE = ("numbers", "counters", "ends", "returns", "times")
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """N hands that step together. The same seed gives the same bits on any number of threads.
+    """N environments that step together. The same seed gives the same bits on any number of threads.
 
     Args:
-        num_envs: the number N of hands.
-        threads: worker threads; 0: one per core.
-        seed: what the episodes are drawn from until `reset` names another. Those of hand i have the numbers i, i + N, i + 2 N, …
+        num_envs: the number N of environments.
+        threads: worker threads. 0 means one per core.
+        seed: the seed of the episodes until `reset` names another. Environment i plays the episodes i, i + N, i + 2 N, …
         config: a settings file of the program. Its `[ppo]` and `[run]` are not used.
         set: single settings, as `--set`: `{"env.friction_scale": 0.8}`.
-        policy: a policy, or a place that `Policy.load` takes: the task is the one that it was trained for.
-        training: the task as `train` teaches it at `env_steps`: shaped rewards, tolerance, hold, randomisation.
+        policy: a policy, or a place that `Policy.load` takes. The task is then the policy's training task.
+        training: the task as `train` teaches it at `env_steps`: shaping rewards, tolerance, hold, randomisation.
         goal_change: what a new goal means to a learner. `"continue"`: nothing ends, the next observation shows it. `"truncate"`:
-            `truncated` is set, `final_obs` shows the old goal and `info["redirected"]` tells it from an end by time. `train`
-            learns that way, and so can any learner that adds the value of `final_obs` where `truncated` is set.
-        random_age: the first episodes after a reset of all hands end early, at different times, as in `train`.
-        autoreset_mode: when a hand starts its next episode; see Gymnasium. `"truncate"` needs SAME_STEP.
+            `truncated` is set, and `final_obs` shows the old goal. `info["redirected"]` distinguishes this from an end by time.
+            `train` learns that way, and so can any learner that adds the value of `final_obs` where `truncated` is set.
+        random_age: the first episodes after a reset of all environments end early, at different times, as in `train`.
+        autoreset_mode: when an environment starts its next episode (see Gymnasium). `"truncate"` needs SAME_STEP.
         reward_terms: `info["reward"]` holds the terms of each step's reward, which add up to it.
 
     Raises:
-        ValueError: a setting is unknown or invalid, or the scene cannot be used; the message lists everything that is wrong.
-        FileNotFoundError, PermissionError: the settings file or the policy is not there, or cannot be read.
+        ValueError: a setting is unknown or invalid, or the scene cannot be used. The message lists everything that is wrong.
+        FileNotFoundError, PermissionError: the settings file or the policy does not exist, or cannot be read.
 
-    Observations are float32 `[N, O]`, of the built-in hand `[N, 157]`; `observation_layout` names their groups. Actions `[N, A]`, here
-    `[N, 20]`, are moves within the range of each actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z; units are SI.
+    Observations are float32 `[N, O]`. For the built-in hand they are `[N, 157]`. `observation_layout` names their groups. Actions
+    `[N, A]`, here `[N, 20]`, are moves within the range of each actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z, and
+    units are SI.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -80,7 +81,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"autoreset_mode = {autoreset_mode!r}: must be one of {', '.join(AutoresetMode.__members__)}")
         if goal_change == "truncate" and mode is not AutoresetMode.SAME_STEP:
             raise ValueError('goal_change = "truncate" needs autoreset_mode = SAME_STEP: the hand goes on under the new goal at once')
-        pairs(set)  # says what is no setting before anything is loaded
+        pairs(set)  # reports wrong settings before anything is loaded
         if policy is not None and not isinstance(policy, Policy):
             of_task = {key: value for key, value in (set or {}).items() if key.split(".")[0] in ("env", "hand")}
             policy = Policy.load(policy, set=of_task)
@@ -105,7 +106,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def _create(self) -> _native.Hands:
-        """Makes the hands anew."""
+        """Creates the environments anew."""
         made = self._made
         policy = None if made["policy"] is None else made["policy"]._native
         settings = made["config"], policy, pairs(made["set"])
@@ -114,11 +115,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self._hands
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode of each hand, and returns the observations `[N, O]` and an empty dict.
+        """Starts an episode in each environment, and returns the observations `[N, O]` and an empty dict.
 
         Args:
-            seed: the episodes are those of this seed, from the first one on; without it they are the next ones.
-            options: `{"reset_mask": mask}` with a bool array `[N]` restarts only the hands that it marks.
+            seed: the episodes begin with the first one of this seed. Without a seed, the next episodes follow.
+            options: `{"reset_mask": mask}` with a bool array `[N]` restarts only the environments that it marks.
 
         Raises ValueError for a seed that is negative or comes with a mask, and for a mask of another shape.
         """
@@ -140,18 +141,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return hands.reset(seed, mask, self._aged), {}
 
     def step(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps all hands once with `actions` `[N, A]`, which are clipped to [-1, 1].
+        """Steps all environments once with `actions` `[N, A]`, which are clipped to [-1, 1].
 
         Returns observations `[N, O]`, rewards `[N]` (float32), terminated `[N]`, truncated `[N]` and info, all in new memory. Info
         holds, each with a mask `[N]` under the same name with a `_` before it:
-            final_obs `[N, O]`: the last observations of the hands where `terminated` or `truncated` is set (SAME_STEP only);
-            final_info: of the episodes that ended, `episode`: `r` the sum of rewards, `l` steps, `goals` reached, `dropped`,
+            final_obs `[N, O]`: the last observations of the environments where `terminated` or `truncated` is set (SAME_STEP only);
+            final_info: `episode` describes the episodes that ended: `r` the sum of rewards, `l` steps, `goals` reached, `dropped`,
                 `diverged`, `randomized`, `rot_dist` mean rotation error (rad), `reward` the sums of the task's terms;
             redirected `[N]`, without a mask: where the goal was replaced;
             reward, rot_dist (with `reward_terms`): the terms of this step's reward, weighted as in it, and the rotation errors (rad)
                 after it.
 
-        Raises ValueError (shape, NaN) and RuntimeError (not reset, closed, in use by another thread, or a hand failed: reset).
+        Raises ValueError (shape, NaN) and RuntimeError (not reset, closed, in use by another thread, or an environment failed: reset).
         """
         hands, given = self._open(), _numbers(actions, self.action_space.shape)
         observations, rewards, ends, episodes, finals, terms = hands.step(given)
@@ -178,8 +179,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def env_steps(self) -> int:
-        """Control steps so far, over all hands. With `training=True` they decide the lesson, which holds for 16 steps of all hands, as in
-        `train`; set them to go on from a later point.
+        """Control steps so far, over all environments. With `training=True` they determine the lesson, which applies for 16 steps of
+        all environments, as in `train`. Set them to continue from a later point.
         """
         return self._open().env_steps
 
@@ -189,7 +190,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def max_episode_steps(self) -> int:
-        """The steps of an episode that no drop ends."""
+        """The steps of an episode that does not end with a drop."""
         return self._open().max_episode_steps
 
     @property
@@ -199,17 +200,17 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def notes(self) -> list[str]:
-        """What the settings replace in a scene of one's own, and what was found in it."""
+        """What the settings replace in a scene of your own, and what was found in it."""
         return self._open().notes
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Returns everything that the future of the hands depends on, for `set_state` of hands with the same settings."""
+        """Returns the complete state of the environments, for `set_state` of environments with the same settings."""
         return dict(zip(_STATE, self._open().state(), strict=True))
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Goes on from what `get_state` returned, bit for bit, and returns the observations `[N, O]` to act on.
+        """Continues from what `get_state` returned, bit for bit, and returns the observations `[N, O]` to act on.
 
-        Raises ValueError if it is the state of other hands.
+        Raises ValueError if it is the state of other environments.
         """
         types = (np.float64, np.uint64, np.uint8, np.float64, np.uint64)
         try:
@@ -222,7 +223,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self._open().set_state(*parts)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the hands and their threads."""
+        """Frees the environments and their threads."""
         if self._hands is not None:
             self._hands.close()
         self._hands = None
@@ -231,7 +232,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self.num_envs
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the threads. Hands that are not reset are as new in the copy."""
+        """Everything but the threads. Environments that are not reset are as new in the copy."""
         state = self.get_state() if self._open().can_step else None
         return {**self.__dict__, "_hands": state}
 
@@ -258,7 +259,7 @@ def _numbers(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
 
 
 def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Adds to each value, and to those within it, its mask, as Gymnasium does."""
+    """Adds its mask to each value and to the values within it, as Gymnasium does."""
     result: dict[str, Any] = {}
     for name, value in values.items():
         result[name] = _masked(value, mask) if isinstance(value, dict) else value
@@ -267,10 +268,10 @@ def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
 
 
 class Env(gymnasium.Env):
-    """One hand, `gymnasium.make("ShadowRepose-v0")`: observations `[O]`, actions `[A]`.
+    """One environment, `gymnasium.make("ShadowRepose-v0")`: observations `[O]`, actions `[A]`.
 
-    It takes the options of `VectorEnv` that make sense for one. At the end of an episode, `info["final_info"]` holds what it holds
-    there. `vector` has its settings, its layout and its state.
+    It takes the options of `VectorEnv` that make sense for one environment. At the end of an episode, `info["final_info"]` holds the
+    same as in `VectorEnv`. The attribute `vector` gives access to its settings, its layout and its state.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
@@ -311,12 +312,12 @@ class Env(gymnasium.Env):
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
     def close(self) -> None:
-        """Frees the hand."""
+        """Frees the environment."""
         self.vector.close()
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
-    """Returns the values of the first hand, without masks."""
+    """Returns the values of the first environment, without masks."""
     one = {name: value for name, value in info.items() if not name.startswith("_")}
     return {name: _first(value) if isinstance(value, dict) else value[0] for name, value in one.items()}
 

@@ -1,4 +1,4 @@
-"""The hands for rsl_rl, the learner of Isaac Lab and mjlab.
+"""The environments for rsl_rl, the learner of Isaac Lab and mjlab.
 
     from rsl_rl.runners import OnPolicyRunner
     from shadow_repose import VectorEnv
@@ -30,11 +30,11 @@ class _Settings(dict[str, Any]):
 
 
 class RslRlVecEnv(VecEnv):
-    """A `VectorEnv` as a `VecEnv` of rsl_rl, whose tensors lie on `device`. The hands themselves step on the CPU.
+    """A `VectorEnv` as a `VecEnv` of rsl_rl, whose tensors lie on `device`. The environments themselves step on the CPU.
 
-    Give it hands with `goal_change="truncate"`: where a goal is replaced, rsl_rl then adds the value of the state before. The runner's
-    `init_at_random_ep_len` assigns to `episode_length_buf`: all hands then start again at random ages of their own choice. Raises
-    ValueError for hands that do not reset in the same step.
+    Give it environments with `goal_change="truncate"`: where a goal is replaced, rsl_rl then adds the value of the state before. The
+    runner's `init_at_random_ep_len` assigns to `episode_length_buf`. All environments then start again at random ages of their own
+    choice. Raises ValueError for environments that do not reset in the same step.
     """
 
     def __init__(self, envs: VectorEnv, *, device: torch.device | str = "cpu") -> None:
@@ -51,12 +51,12 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """The steps since the last end of each hand."""
+        """The steps since the last end of each environment."""
         return self._lengths
 
     @episode_length_buf.setter
     def episode_length_buf(self, lengths: torch.Tensor) -> None:
-        """Starts all hands again at random ages of their own choice, whatever the lengths say."""
+        """Starts all environments again at random ages of their own choice, whatever the given lengths."""
         self._start(self.envs._open().reset(None, None, True))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
@@ -67,7 +67,7 @@ class RslRlVecEnv(VecEnv):
         return TensorDict({"policy": self._tensor(self._observations)}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Steps all hands once with `actions` `[N, A]`. Returns observations, rewards `[N]`, ends `[N]`, and what to log."""
+        """Steps all environments once with `actions` `[N, A]`. Returns observations, rewards `[N]`, ends `[N]`, and what to log."""
         self._observations, rewards, terminated, truncated, info = self.envs.step(actions.detach().cpu().numpy())
         dones = self._tensor(terminated | truncated).long()
         self._lengths = torch.where(dones.bool(), 0, self._lengths + 1)
@@ -79,5 +79,5 @@ class RslRlVecEnv(VecEnv):
         return self.get_observations(), self._tensor(rewards), dones, extras
 
     def close(self) -> None:
-        """Frees the hands."""
+        """Frees the environments."""
         self.envs.close()

@@ -1,4 +1,4 @@
-"""The hands for Stable-Baselines3.
+"""The environments for Stable-Baselines3.
 
     from stable_baselines3 import PPO
     from shadow_repose import VectorEnv
@@ -23,9 +23,9 @@ from .envs import VectorEnv
 class Sb3VecEnv(VecEnv):
     """A `VectorEnv` as a `VecEnv` of Stable-Baselines3.
 
-    Give it hands with `goal_change="truncate"`: where a goal is replaced, SB3 then adds the value of the last observation under the old
-    one. `info["episode"]` stands only at the end of an episode; besides `r`, `l` and `t` it holds `goals`, `dropped` and the rest of
-    `final_info`. Raises ValueError for hands that do not reset in the same step.
+    Give it environments with `goal_change="truncate"`: where a goal is replaced, SB3 then adds the value of the last observation under
+    the old goal. `info["episode"]` is there only at the end of an episode. Besides `r`, `l` and `t` it holds `goals`, `dropped` and the
+    rest of `final_info`. Raises ValueError for environments that do not reset in the same step.
     """
 
     def __init__(self, envs: VectorEnv) -> None:
@@ -35,7 +35,7 @@ class Sb3VecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts an episode of each hand, of the seed that `seed` has set, if any. Returns the observations `[N, O]`."""
+        """Starts an episode in each environment, from the seed that `seed` has set, if any. Returns the observations `[N, O]`."""
         seed = self._seeds[0]
         self._reset_seeds()
         self._reset_options()
@@ -43,11 +43,11 @@ class Sb3VecEnv(VecEnv):
         return self.envs.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Takes the actions `[N, A]` of the step that `step_wait` makes."""
+        """Stores the actions `[N, A]` for the step that `step_wait` takes."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Steps all hands once."""
+        """Steps all environments once."""
         observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -60,18 +60,18 @@ class Sb3VecEnv(VecEnv):
         return observations, rewards, dones, infos
 
     def close(self) -> None:
-        """Frees the hands."""
+        """Frees the environments."""
         self.envs.close()
 
     def _count(self, indices: None | int | Iterable[int]) -> int:
         return len(list(self._get_indices(indices)))
 
     def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
-        """Returns an attribute of the `VectorEnv` for each index: all hands share it."""
+        """Returns an attribute of the `VectorEnv` for each index: all environments share it."""
         return [getattr(self.envs, attr_name)] * self._count(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
-        """Sets an attribute of the `VectorEnv`, e.g. `env_steps`, for all hands."""
+        """Sets an attribute of the `VectorEnv`, e.g. `env_steps`, for all environments."""
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: None | int | Iterable[int] = None, **kwargs: Any) -> list[Any]:

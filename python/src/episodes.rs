@@ -1,11 +1,11 @@
-//! Episodes that ended, as columns with a row for each hand.
+//! Episodes that ended, as columns with a row for each environment.
 
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shadow_repose::repose::EpisodeStats;
 
-/// Returns the episodes that ended as columns `[N]`, and starts their sums of rewards again.
+/// Returns the episodes that ended as columns `[N]`, and resets their sums of rewards.
 pub(crate) fn columns<'py>(
     py: Python<'py>,
     count: usize,

@@ -1,4 +1,4 @@
-//! Hands that step together.
+//! Environments that step together.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
@@ -22,7 +22,7 @@ use crate::settings::{Set, overrides, resolve, text};
 use crate::workers::Workers;
 use crate::{guarded, refused};
 
-/// N hands of one task, with O values in an observation and A in an action.
+/// N environments of one task, with O values in an observation and A in an action.
 #[pyclass(frozen, module = "shadow_repose._native")]
 pub(crate) struct Hands {
     task: Arc<Task>,
@@ -42,9 +42,9 @@ struct State {
     pool: EnvPool<Repose>,
     workers: Workers,
     seed: u64,
-    /// Control steps, over all hands; in a training they decide the lesson.
+    /// Control steps of all environments together. In a training they determine the lesson.
     env_steps: u64,
-    /// The number of steps at which the lesson began, if one has.
+    /// The number of steps at which the current lesson began, if there is one.
     lesson_from: Option<u64>,
     /// `[N, O]`: what to act on next.
     observations: Vec<f32>,
@@ -53,7 +53,7 @@ struct State {
     can_step: Result<(), &'static str>,
 }
 
-/// What Python is told of an end: nothing, or one of three numbers.
+/// The ends, at the numbers that Python gets for them.
 const ENDS: [Option<End>; 4] = [None, Some(End::Terminated), Some(End::Truncated), Some(End::Redirected)];
 
 const NOT_RESET: &str = "reset the hands before they step";
@@ -63,8 +63,8 @@ const NOT_SET: &str = "the state could not be set: reset the hands before they s
 /// The terms `[N]` of a step's reward by name, and the rotation errors `[N]` after it.
 type Terms<'py> = (Bound<'py, PyDict>, Bound<'py, PyArray1<f32>>);
 
-/// What a step returns: observations `[N, O]`, rewards `[N]`, ends `[N]`, the episodes that ended as columns, the final observations
-/// `[N, O]` if there are any, and the terms if they were asked for.
+/// What a step returns: observations `[N, O]`, rewards `[N]`, ends `[N]`, and the episodes that ended as columns. The final
+/// observations `[N, O]` follow if there are any, and the terms if they were requested.
 type Stepped<'py> = (
     Bound<'py, PyArray2<f32>>,
     Bound<'py, PyArray1<f32>>,
@@ -75,7 +75,7 @@ type Stepped<'py> = (
 );
 
 impl Hands {
-    /// Returns the state, unless it is in use or gone.
+    /// Returns the locked state. Fails if it is in use or gone.
     fn locked(&self) -> PyResult<MutexGuard<'_, Option<State>>> {
         let guard = match self.state.try_lock() {
             Ok(guard) => guard,
@@ -105,7 +105,7 @@ impl Hands {
         lesson
     }
 
-    /// Starts the lesson that holds now. As in a training, it holds for the steps of an iteration.
+    /// Starts the lesson that applies now. As in a training, it applies for the steps of an iteration.
     fn begin_lesson(&self, state: &mut State) {
         let steps = |from| (self.config.ppo.horizon_at(from) * self.count) as u64;
         if state.lesson_from.is_none_or(|from| state.env_steps >= from.saturating_add(steps(from))) {
@@ -114,7 +114,7 @@ impl Hands {
         }
     }
 
-    /// Returns the last observations `[N, O]` of the hands that the last step cut off or ended; zeros for others.
+    /// Returns the last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
     fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let (size, blocks) = (self.observation_size(), &state.pool.blocks);
         let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
@@ -129,7 +129,7 @@ impl Hands {
         self.rows(py, finals).map(Some)
     }
 
-    /// Returns the terms of the last step; zeros where a new episode took the place of the step.
+    /// Returns the terms of the last step, and zeros where a new episode took the place of the step.
     fn step_terms<'py>(&self, py: Python<'py>, state: &mut State, restarted: &[bool]) -> PyResult<Terms<'py>> {
         let weight = state.lesson_from.map_or(1.0, |from| self.lesson(from).task_reward);
         let details = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
@@ -159,7 +159,7 @@ impl State {
         self.pool.blocks.iter().flat_map(|block| &block.ends).map(number).collect()
     }
 
-    /// Returns the hands whose episode is over and whose next one has not begun.
+    /// Returns which environments have finished an episode and have not begun the next one.
     fn waiting(&self) -> Vec<bool> {
         let ends = self.pool.blocks.iter().flat_map(|block| &block.ends);
         ends.map(|end| matches!(end, Some(End::Terminated | End::Truncated))).collect()
@@ -244,19 +244,19 @@ impl Hands {
         text(&self.task)
     }
 
-    /// Where the policy does not fit well.
+    /// Warnings where the policy does not fit well.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.task.warnings().to_vec()
     }
 
-    /// What the settings replace in a scene of the user's, and what was found in it.
+    /// What the settings replace in the user's scene, and what was found in it.
     #[getter]
     fn notes(&self) -> Vec<String> {
         self.task.notes()
     }
 
-    /// Whether the hands have been reset and no step has failed since.
+    /// Whether the environments have been reset and no step has failed since.
     #[getter]
     fn can_step(&self) -> PyResult<bool> {
         Ok(self.locked()?.as_ref().is_some_and(|state| state.can_step.is_ok()))
@@ -275,7 +275,7 @@ impl Hands {
         Ok(())
     }
 
-    /// Starts an episode of each hand, at random ages if `aged`, or one of those that are marked. Returns all observations.
+    /// Starts episodes in the marked environments, or in all, then at random ages if `aged`. Returns all observations.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -313,7 +313,7 @@ impl Hands {
         self.rows(py, state.observations.clone())
     }
 
-    /// Steps all hands once.
+    /// Steps all environments once.
     fn step<'py>(&self, py: Python<'py>, actions: PyReadonlyArray2<'py, f32>) -> PyResult<Stepped<'py>> {
         let (n, size) = (self.count, self.action_size());
         if actions.shape() != [n, size] {
@@ -358,8 +358,8 @@ impl Hands {
         Ok((observations, rewards.into_pyarray(py), ends, ended, finals, terms))
     }
 
-    /// Everything that the future of the hands depends on: (numbers `[N, k]`, counters `[N, m]`, ends `[N]`, returns `[N]`, and the
-    /// seed, the steps, and the steps at which the lesson began).
+    /// The complete state of the environments: numbers `[N, k]`, counters `[N, m]`, ends `[N]` and returns `[N]`. The last array
+    /// holds the seed, the steps, and the steps at which the lesson began.
     #[expect(clippy::type_complexity, reason = "Python takes it apart")]
     fn state<'py>(
         &self,
@@ -375,7 +375,7 @@ impl Hands {
         let state = guard.as_ref().expect("not closed");
         state.can_step.map_err(PyRuntimeError::new_err)?;
         let EnvState { numbers, counters } = guarded(|| state.pool.save())?;
-        // Where a new episode began at once, an end says nothing about the future.
+        // Where a new episode begins at once, the future does not depend on an end.
         let ends = if self.autoreset == Autoreset::SameStep { vec![0; self.count] } else { state.ends() };
         let (wide, long) = (numbers.len() / self.count, counters.len() / self.count);
         Ok((
@@ -387,7 +387,7 @@ impl Hands {
         ))
     }
 
-    /// Goes on, bit for bit, from what `state` returned, and returns the observations `[N, O]` to act on.
+    /// Continues, bit for bit, from what `state` returned, and returns the observations `[N, O]` to act on.
     fn set_state<'py>(
         &self,
         py: Python<'py>,
@@ -435,7 +435,7 @@ impl Hands {
         self.rows(py, state.observations.clone())
     }
 
-    /// Frees the hands and their threads.
+    /// Frees the environments and their threads.
     fn close(&self, py: Python) -> PyResult<()> {
         if let Ok(mut guard) = self.locked() {
             let state = guard.take();

@@ -1,8 +1,8 @@
-//! The extension module of the Python package: hands that step together, and policies.
+//! The extension module of the Python package: environments that step together, and policies.
 //!
-//! It keeps to five rules. Every array that goes out is new memory, and every array that comes in is copied. Work runs without
-//! Python's lock on threads of its own. A fork gets threads of its own. A panic is a `RuntimeError`. Nothing waits for a lock that
-//! another thread of the user may hold: the second one gets an error.
+//! It follows five rules. Every array that goes out is new memory, and every array that comes in is copied. Work runs without
+//! Python's lock on threads of its own. A fork gets threads of its own. A panic becomes a `RuntimeError`. No call waits for a lock
+//! that another thread of the user may hold: the second call fails.
 
 mod episodes;
 mod hands;
@@ -34,11 +34,11 @@ mod _native {
     }
 }
 
-/// Returns an error about what the user gave.
+/// Returns an error about the user's input.
 fn refused(error: Error) -> PyErr {
     let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     let kind = kinds.map(std::io::Error::kind).next();
-    // The library speaks of its command line.
+    // The library's messages name options of its command line.
     let text =
         format!("{error:#}").replace("--mirror plays", "set={\"env.mirror\": True} plays").replace("--set ", "set ");
     match kind {
@@ -48,7 +48,7 @@ fn refused(error: Error) -> PyErr {
     }
 }
 
-/// Does the work; a panic is an error that `except Exception` catches.
+/// Does the work. A panic becomes an error that `except Exception` catches.
 fn guarded<T>(work: impl FnOnce() -> T) -> PyResult<T> {
     // Unwind safe: what a panic left inconsistent is not used again.
     catch_unwind(AssertUnwindSafe(work)).map_err(|panic| panicked(&*panic))

@@ -55,7 +55,7 @@ impl Policy {
             return Err(PyValueError::new_err(format!("observations of {found} values, this policy reads {size}")));
         }
         let seen: Vec<f32> = observations.as_array().iter().copied().collect();
-        // Another call may be using the threads; a fork of it will use them for ever.
+        // Another call may be using the threads. In a fork made meanwhile, they stay in use for ever.
         let (mut shared, mut own) = (WORKERS.try_lock(), Workers::new(1));
         let computed = if rows <= GROUP {
             py.detach(|| guarded(|| compute(&self.fixed, &seen)))?
@@ -73,7 +73,7 @@ impl Policy {
 
 #[pymethods]
 impl Policy {
-    /// Loads a policy: one that is built in by its name, a file, or the best one of a run folder.
+    /// Loads a built-in policy by its name, a policy file, or the best policy of a run folder.
     #[new]
     fn new(py: Python, place: PathBuf, set: Set) -> PyResult<Self> {
         let load = || {
@@ -86,13 +86,13 @@ impl Policy {
         py.detach(|| guarded(load))?.map_err(refused)
     }
 
-    /// What a user is told that it is.
+    /// Its description for the user.
     #[getter]
     fn name(&self) -> &str {
         &self.loaded.name
     }
 
-    /// Where it was found: the name of one that is built in, or its file.
+    /// Where it was found: the name of a built-in policy, or its file.
     #[getter]
     fn place(&self) -> PathBuf {
         let path = self.loaded.origin.path();

@@ -1,4 +1,4 @@
-//! The settings of hands: what a user names, and what a policy brings along.
+//! The settings of environments: what the user sets, and what comes with a policy.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use shadow_repose::repose::Task;
 
 use crate::policy::Policy;
 
-/// The most hands, as in a training.
+/// The most environments, as in a training.
 const MOST_HANDS: usize = 65536;
 
 /// Settings as a user gives them: dotted keys, and values in TOML.
@@ -20,7 +20,7 @@ pub(crate) type Set = Vec<(String, String)>;
 /// Returns the settings in the form of the library.
 ///
 /// # Errors
-/// Fails if one is not of a task, or of a training where there is none.
+/// Fails if one is not a setting of the task or, with `training`, of a training.
 pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
     for (key, _) in &set {
         let section = key.split('.').next().unwrap_or(key);
@@ -32,7 +32,7 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
     Ok(set.into_iter().map(|(key, value)| Override { key, value }).collect())
 }
 
-/// Returns the settings and the task of `count` hands.
+/// Returns the settings and the task of `count` environments.
 ///
 /// # Errors
 /// Fails if the settings are invalid, or if the scene cannot be used.
@@ -54,7 +54,7 @@ pub(crate) fn resolve(
     let of_task: Vec<Override> = overrides.iter().filter(|set| is_of_task(set)).cloned().collect();
     let task = loaded.task(&of_task)?;
     let whole = if training {
-        // The hands of a policy that has learnt are smoothed as it has learnt it, and not helped, unless the user says otherwise.
+        // With a trained policy, actions are smoothed as it has learnt it and nothing assists, unless the user sets otherwise.
         let smoothing = task.config().act_moving_average.to_string();
         let learnt = [("env.act_moving_average", smoothing), ("training.assist", "0".into())];
         let learnt = learnt.map(|(key, value)| Override { key: key.into(), value });

@@ -18,12 +18,12 @@ const PATIENCE: Duration = Duration::from_millis(50);
 /// A pool of worker threads of one process.
 pub(crate) struct Workers {
     threads: usize,
-    /// The process that started them; a fork of it has none of its threads.
+    /// The process that started them. A fork of it has none of its threads.
     pool: Option<(u32, ThreadPool)>,
 }
 
 impl Workers {
-    /// Prepares a pool of so many threads (0: one per core).
+    /// Prepares a pool with this number of threads (0: one per core).
     pub(crate) fn new(threads: usize) -> Self {
         Self { threads, pool: None }
     }
@@ -53,7 +53,7 @@ impl Workers {
     /// Does long work in the pool, without Python's lock. Ctrl-C sets the flag that the work gets, waits for its end, and is raised.
     ///
     /// # Errors
-    /// Fails if the work panics, or with what a signal raises.
+    /// Fails if the work panics, or with the exception that a signal raises.
     pub(crate) fn long<T: Send>(&mut self, py: Python, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
         let (pool, stop, (tell, mut told)) = (self.pool()?, AtomicBool::new(false), mpsc::channel::<()>());
         std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-"""Hands that step together: what they return, and that they return the same bits."""
+"""Environments that step together: what they return, and that they return the same bits."""
 import copy
 import hashlib
 import pickle

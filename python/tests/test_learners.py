@@ -1,4 +1,4 @@
-"""Learners of others, unchanged. Each test runs where its learner is installed."""
+"""Learners from other projects, unchanged. Each test runs where its learner is installed."""
 import numpy as np
 import pytest
 

@@ -1,4 +1,4 @@
-"""A user's own `import mujoco` beside ours: neither does anything to the other.
+"""A user's own `import mujoco` beside ours: neither affects the other.
 
 Other versions are looked for in the folders that SHADOW_REPOSE_MUJOCOS lists, separated by colons (`pip install --target`).
 """

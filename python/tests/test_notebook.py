@@ -31,7 +31,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
         shadow_repose.program()
     except FileNotFoundError as error:
         pytest.skip(str(error))
-    # The kernel finds the packages that this process finds. It knows nothing of kernels and settings of whoever runs the test.
+    # The kernel finds the packages that this process finds. It ignores kernels and settings of the user who runs the test.
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     for place in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "TMPDIR"):
         folder = tmp_path / place

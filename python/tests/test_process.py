@@ -1,4 +1,4 @@
-"""What the process around the hands does: forks, threads, signals, panics, memory."""
+"""The process around the environments: forks, threads, signals, panics, memory."""
 import gc
 import multiprocessing
 import os

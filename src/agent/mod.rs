@@ -1,7 +1,7 @@
 //! The agent: environments, a learner, and the rollout between them. One of its iterations is the whole algorithm.
 //!
-//! It is separate from the training, which decides how long to train, scores, reports and saves, so that benchmarks and tests
-//! run exactly the same iterations.
+//! The training loop is separate: it decides how long to train, scores, reports and saves. So benchmarks and tests run
+//! exactly the same iterations.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,7 +27,7 @@ pub struct Agent<E: Env> {
     pub pool: EnvPool<E>,
     /// The learner.
     pub ppo: Ppo,
-    /// The last rollout; its first observations are the ones to act on next.
+    /// The last rollout. Its first observations are acted on next.
     pub rollout: Rollout,
     /// What the policy needs to act, for each block.
     work: Vec<Workspace>,
@@ -39,7 +39,7 @@ pub struct Agent<E: Env> {
     pub env_steps: u64,
     /// The point at which it was forked from another training, if it was.
     pub fork: Option<Fork>,
-    /// What deals environments and samples, and adds up with others.
+    /// The exchange with other ranks, which assigns environments and samples, and adds up results.
     pub exchange: Exchange,
 }
 
@@ -71,8 +71,8 @@ impl<L> Iteration<L> {
 }
 
 impl Agent<Repose> {
-    /// Creates the agent of a training with these settings, at the start of its first episodes. It has the environments that
-    /// `exchange` deals to it.
+    /// Creates the agent of a training with these settings, at the start of its first episodes. It gets the environments
+    /// that `exchange` assigns to this rank.
     ///
     /// # Errors
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
@@ -87,8 +87,8 @@ impl Agent<Repose> {
 }
 
 impl<E: Env> Agent<E> {
-    /// Creates a learner and starts the first episodes of `envs`, those that `exchange` deals. All randomness
-    /// follows from `seed`.
+    /// Creates a learner and starts the first episodes of `envs`, the environments that `exchange` assigns. All
+    /// randomness follows from `seed`.
     ///
     /// # Errors
     /// Fails if this machine does not support the precision, or if the observations do not have the symmetry.
@@ -170,7 +170,7 @@ impl<E: Env> Agent<E> {
 
 impl<E: Resumable> Agent<E> {
     /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation. All
-    /// that exchange call it together.
+    /// ranks call it together.
     pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
         let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
         let progress = Progress { iteration, env_steps, best, fork, rise: None };
@@ -197,7 +197,7 @@ impl<E: Resumable> Agent<E> {
     }
 }
 
-/// Steps a block of environments with the actions of step `t` of its rollout, and writes there what they lead to.
+/// Steps a block of environments with the actions of step `t` of its rollout, and writes the results there.
 ///
 /// # Errors
 /// Fails with the environment's number if an environment panics.

@@ -1,4 +1,4 @@
-//! In which settings two configurations differ.
+//! The settings in which two configurations differ.
 
 use toml::{Table, Value};
 
@@ -9,7 +9,7 @@ use super::settings::{BUILTIN_MODEL, Config, EnvConfig};
 pub type Difference = (String, [Value; 2]);
 
 impl Config {
-    /// Lists the settings that differ in `other`, except those that may change during a run: the total number of steps, the
+    /// Lists the settings that differ in `other`. Leaves out what may change during a run: the total number of steps, the
     /// number of threads and the path of the scene.
     pub fn differences(&self, other: &Self) -> Vec<String> {
         let differing = differing([self, other].map(|of| {
@@ -25,7 +25,7 @@ impl Config {
         differing([self, other].map(Self::settled))
     }
 
-    /// Returns all settings by dotted key, but for those that only divide the work. A ramp that stays where it is is a number.
+    /// Returns all settings by dotted key, except settings that only divide the work. A constant ramp becomes a number.
     ///
     /// # Panics
     /// Never panics: a configuration is a tree of tables.
@@ -35,7 +35,7 @@ impl Config {
         of_training.map(|(key, value)| (key, constant(value).unwrap_or(value).clone())).collect()
     }
 
-    /// Returns the same training, whatever the length of its run and the machine.
+    /// Returns these settings without the length of the run and without what depends on the machine.
     fn settled(&self) -> Self {
         let mut same = self.clone();
         (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, self.shards());
@@ -61,7 +61,7 @@ fn differing(both: [Config; 2]) -> Vec<Difference> {
     both.map(|((key, own), (_, other))| (key, [own.clone(), other.clone()])).collect()
 }
 
-/// Returns the value of a ramp that stays where it is.
+/// Returns the value of a constant ramp.
 fn constant(value: &Value) -> Option<&Value> {
     let ramp = value.as_table().filter(|table| is_ramp(table))?;
     (ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0)).then_some(&ramp["from"])
@@ -81,7 +81,7 @@ pub fn short(value: &Value) -> String {
     }
 }
 
-/// Returns a value inside of another one, where a text has quotes.
+/// Returns a value as part of another one, where text has quotes.
 fn inner(value: &Value) -> String {
     if value.is_str() { value.to_string() } else { short(value) }
 }

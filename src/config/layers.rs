@@ -67,7 +67,8 @@ impl Config {
         layered(Table::new(), checked(user)?, overrides)
     }
 
-    /// Returns the settings of a task and of its lesson: as [`Config::resolve`] does, but of the user's file nothing else is used.
+    /// Returns the settings of a task and of its lesson, as [`Config::resolve`] does. Other settings in the user's file are
+    /// ignored.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -80,8 +81,7 @@ impl Config {
         layered(Table::new(), user, overrides)
     }
 
-    /// Returns the settings of a training that begins with a policy of this net: as [`Config::resolve`] does, but the base has this
-    /// net.
+    /// Returns the settings of a training that begins with a policy of this net. As [`Config::resolve`], but the base has this net.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -91,7 +91,7 @@ impl Config {
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
-    /// their defaults. In a checkpoint the smoothing of the task is the one of its moment; here it is the first one again.
+    /// their defaults. A checkpoint holds the smoothing of its moment. The result has the initial smoothing again.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -131,7 +131,7 @@ impl Config {
 
 impl PolicyConfig {
     /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
-    /// added and removed between versions. What the built-in scene has given it does not hold in another.
+    /// added and removed between versions. Values that came from the built-in scene do not apply to another scene.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -166,7 +166,7 @@ pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
 
 impl Source {
     fn table(&self) -> Result<(&Path, Table)> {
-        // The base itself names nothing.
+        // The base itself counts as setting nothing.
         if self.text == BASE {
             return Ok((&self.path, Table::new()));
         }

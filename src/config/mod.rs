@@ -115,7 +115,7 @@ mod tests {
         assert_eq!(both(alone, &["training.act_moving_average={from=0.2,to=0.7,steps=9}"]).0, 0.2);
         let two = BASE.replace("act_moving_average = 0.25 ", "act_moving_average = 0.6 ");
         let refused = Config::resolve(Some(&source(&two)), &[]).unwrap_err().to_string();
-        assert!(refused.contains("begins with 0.25: name one of them"), "{refused}");
+        assert!(refused.contains("begins with 0.25: set only one of them"), "{refused}");
         assert!(
             errors("env.act_moving_average=1.5")
                 .contains("env.act_moving_average = 1.5: must be above 0 and at most 1")

@@ -1,4 +1,4 @@
-//! Overlaying one table of settings with another: keys and types are those of the base; what does not fit is reported.
+//! Overlays one table of settings with another. Keys and types come from the base, and what does not fit is reported.
 
 use std::sync::LazyLock;
 
@@ -49,11 +49,11 @@ pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
         Some(value) if !wants_text || value.is_str() => value,
         _ => Value::String(text.to_owned()),
     };
-    // The deepest level is a part of a ramp in a section; anything deeper belongs to an unknown name.
+    // The deepest level is a part of a ramp in a section. Anything deeper belongs to an unknown name.
     let parts: Vec<&str> = key.splitn(3, '.').collect();
     for depth in (1..parts.len()).rev() {
         let whole = parts[..depth].join(".");
-        // `env.noise.joint_pos` changes one value of `env.noise`, so the others come along.
+        // `env.noise.joint_pos` changes one value of `env.noise`, so the other values are copied.
         let by_group = lookup(&DEFAULTS, &whole).and_then(Value::as_table).is_some_and(Table::is_empty);
         let others = lookup(merged, &whole).and_then(Value::as_table).filter(|_| by_group);
         let mut table = others.cloned().unwrap_or_default();
@@ -63,10 +63,10 @@ pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     Table::from_iter([(parts[0].to_owned(), value)])
 }
 
-/// The maximum number of problems to report; the first ones are enough to start with.
+/// The maximum number of problems to report. The first ones are enough to start with.
 const MOST_PROBLEMS: usize = 30;
 
-/// Applies `table` over `merged`, whose keys and types are those of `base`; what does not fit is skipped and reported.
+/// Applies `table` over `merged`, which has the keys and types of `base`. What does not fit is skipped and reported.
 pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
     for (key, value) in table {
         if problems.len() >= MOST_PROBLEMS {
@@ -84,14 +84,14 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             if is_ramp(&expected) {
                 expected.insert("after".into(), 0.into());
             } else if expected.is_empty() {
-                // Values by names that are checked elsewhere replace the ones before.
+                // Values by group replace all earlier ones. The names of the groups are checked elsewhere.
                 merged[key] = Table::new().into();
                 expected = given.keys().map(|name| (name.clone(), 0.0.into())).collect();
             }
             let target = merged[key].as_table_mut().expect("the merged tables are those of the base");
             let parts = format!("{name}.");
             overlay(target, &given, &expected, &parts, problems);
-            // The other parts alone are no ramp that anybody wrote, so no other rule applies to them.
+            // The remaining parts alone are not the ramp that the user wrote, so no other rule is applied to them.
             if is_ramp(&expected) && problems.iter().any(|problem| problem.starts_with(&parts)) {
                 merged[key] = base[key].clone();
             }
@@ -115,7 +115,7 @@ fn inner(expected: &Table, value: &Value) -> Option<Table> {
     let constant = constant.into_iter().map(|(part, value)| (part.to_owned(), value)).collect();
     let constant = number(value).filter(|_| is_ramp(expected)).map(|_| constant);
     let mut given = value.as_table().cloned().or(constant)?;
-    // A complete ramp without `after` starts at step 0, even if the default has an `after`; `to_text` relies on this.
+    // A complete ramp without `after` starts at step 0, even if the default has an `after`. `to_text` relies on this.
     if is_ramp(expected) && ["from", "to", "steps"].iter().all(|part| given.contains_key(*part)) {
         given.entry("after").or_insert(0.into());
     }
@@ -134,7 +134,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
             Ok(Value::Integer(*x as i64))
         }
         (Value::Array(expected), Value::Array(values)) => {
-            // An empty list is one of names.
+            // An empty list is a list of names.
             let one = expected.first().cloned().unwrap_or(Value::String(String::new()));
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))

@@ -4,15 +4,15 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// A value that changes to another one over a given number of control steps (counted over all hands) and then stays constant. It
-/// may begin after the first step. A plain number in the settings is a constant.
+/// A value that changes to another one over a given number of control steps (counted over all environments) and then stays
+/// constant. It may begin after the first step. A plain number in the settings is a constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Ramp {
     /// The value at the first step, and until the ramp begins.
     pub from: f64,
     /// The value at the last step and from then on.
     pub to: f64,
-    /// The length of the ramp in control steps; 0: the value is `to` from its first step on.
+    /// The length of the ramp in control steps. At 0, the value is `to` from its first step on.
     pub steps: u64,
     /// The control steps of the run after which the ramp begins.
     #[serde(default, skip_serializing_if = "is_zero")]
@@ -25,13 +25,13 @@ impl Ramp {
         Self { from: value, to: value, steps: 0, after: 0 }
     }
 
-    /// Returns the value after `env_steps` control steps; it changes by the same difference in each step.
+    /// Returns the value after `env_steps` control steps. It changes by the same difference in each step.
     pub fn by_equal_steps(&self, env_steps: u64) -> f64 {
         let fraction = self.fraction(env_steps);
         self.from * (1.0 - fraction) + self.to * fraction
     }
 
-    /// Returns the value after `env_steps` control steps; it changes by the same factor in each step.
+    /// Returns the value after `env_steps` control steps. It changes by the same factor in each step.
     pub fn by_equal_factors(&self, env_steps: u64) -> f64 {
         let fraction = self.fraction(env_steps);
         self.from.powf(1.0 - fraction) * self.to.powf(fraction)

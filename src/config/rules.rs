@@ -44,7 +44,7 @@ const AT_MOST: &[(&str, f64)] = &[
 /// mistake.
 const LARGEST: f64 = 1e9;
 
-/// The longest delay, control steps: the actions that are under way are kept, and saved, for each hand.
+/// The longest delay, control steps. Delayed actions are kept and saved for each environment.
 const LONGEST_DELAY: u32 = 1000;
 
 /// The largest coordinate of the goal, m: everything near it is measured in `f32`.
@@ -54,7 +54,7 @@ pub const FARTHEST: f64 = 100.0;
 const LONGEST_PATH: usize = 4095;
 const LONGEST_NAME: usize = 255;
 
-/// The least and the largest magnitude of a value that is not 0: much of what is computed from them is computed in `f32`.
+/// The smallest and the largest magnitude of a nonzero value. Much is computed from these values in `f32`.
 const IN_F32: [f64; 2] = [1e-37, 1e38];
 
 /// Returns every rule that the values break, as "key = value: must …".
@@ -133,7 +133,7 @@ fn env(config: &Config, rules: &mut Rules) {
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     let (env, drawn) = (&config.env, &config.randomization);
-    // A factor that is drawn from a range has a setting in [env], too.
+    // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice) else { continue };
         let (name, range) = (format!("randomization.{key}"), format!("[{low}, {high}]"));
@@ -169,11 +169,11 @@ fn learning(config: &Config, rules: &mut Rules) {
     let horizon = ppo.horizon;
     let whole = [horizon.from, horizon.to].iter().all(|steps| steps.fract() == 0.0);
     let multiple = horizon.from < 1.0 || whole && horizon.to % horizon.from == 0.0;
-    rules.check(multiple, "ppo.horizon", horizon, "be a whole number, or end with a whole multiple of it");
+    rules.check(multiple, "ppo.horizon", horizon, "be a whole number, or a ramp that ends at a multiple of its start");
     let most = config.env.num_envs as f64 * horizon.to;
-    rules.check(most <= (1 << 22).into(), "ppo.horizon", horizon, "make at most 2^22 samples (num_envs * horizon)");
+    rules.check(most <= (1 << 22).into(), "ppo.horizon", horizon, "give at most 2^22 samples (num_envs * horizon)");
     let samples = config.steps_per_iteration() as usize;
-    // One of the two holds; a number of minibatches of 0 is reported elsewhere.
+    // Only one of the two applies. A number of minibatches of 0 is reported elsewhere.
     let by_size = ppo.minibatch_size > 0;
     let (key, parts) =
         if by_size { ("ppo.minibatch_size", ppo.minibatch_size) } else { ("ppo.minibatches", ppo.minibatches) };
@@ -211,7 +211,7 @@ impl Rules {
         }
     }
 
-    /// Checks a number, both ends of a ramp, or the numbers of all groups; a ramp that is constant is checked once.
+    /// Checks a number, both ends of a ramp, or the numbers of all groups. A constant ramp is checked once.
     fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: &str) {
         let value = lookup(table, key).expect("a setting");
         let numbers = match value.as_table() {

@@ -1,4 +1,4 @@
-//! The settings as types; `configs/repose.toml` documents the meaning and the unit of each key.
+//! The settings as types. `configs/repose.toml` documents the meaning and the unit of each key.
 
 #![expect(missing_docs, reason = "each key is explained in configs/repose.toml")]
 
@@ -18,7 +18,7 @@ pub const BUILTIN_MODEL: &str = "builtin";
 pub struct Config {
     /// The task and its physics.
     pub env: EnvConfig,
-    /// What of the hand is not found by the structure of the scene, or is to be another.
+    /// The parts of the hand that the user names. The others are found by the structure of the scene.
     pub hand: Parts,
     /// Changes to the task and additions to its reward that only training uses.
     pub training: TrainingConfig,
@@ -73,19 +73,19 @@ pub struct EnvConfig {
     pub vel_obs_scale: f64,
 }
 
-/// A setting that the scene gives unless the user names it.
+/// A setting that comes from the scene unless the user sets it.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct OfScene<T> {
-    /// The default until the scene is known, unless it is named.
+    /// The value that is set or, until the scene is known, the default.
     pub value: T,
-    /// Whether the value holds whatever the scene says.
+    /// Whether the value applies regardless of the scene.
     #[serde(skip)]
     pub named: bool,
 }
 
 impl<T> OfScene<T> {
-    /// Takes the value of the scene, unless one is named.
+    /// Takes the value of the scene, unless one is set.
     pub fn settle(&mut self, of_scene: T) {
         if !self.named {
             *self = Self { value: of_scene, named: true };
@@ -99,7 +99,7 @@ impl<T: PartialEq> PartialEq for OfScene<T> {
     }
 }
 
-/// Values by the name of a group of the observation; groups that are not named have 0.
+/// Values by the name of a group of the observation. Groups that are not named have 0.
 pub type ByGroup = BTreeMap<String, f64>;
 
 /// The effect of a step outside the tolerance on the counter of steps within it.
@@ -194,7 +194,7 @@ pub enum Symmetry {
     None,
     /// A cube and the same cube turned onto itself, whatever the object is.
     Cube,
-    /// The object and the same object turned onto itself, by those of a cube's rotations that do that.
+    /// The object and the same object turned onto itself, by any of a cube's rotations that does so.
     Object,
 }
 
@@ -208,7 +208,7 @@ pub enum Backend {
     Candle,
 }
 
-/// The number format of the matrix products in the nets while learning and collecting; everything else is `f32`.
+/// The number format of the matrix products in the nets while learning and collecting. Everything else is `f32`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
@@ -234,7 +234,7 @@ pub struct RunConfig {
     pub threads: usize,
 }
 
-/// The settings of a learner that its policy keeps for life.
+/// The settings of a learner that are part of its policy.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct NetConfig {
     /// The sizes of the hidden layers, the same for actor and critic.
@@ -269,7 +269,8 @@ impl Config {
 }
 
 impl Config {
-    /// Returns the settings as they are after `env_steps` control steps of the run: its task has the smoothing that is trained then.
+    /// Returns the settings as they are after `env_steps` control steps of the run. Its task then has the smoothing that is trained
+    /// at that time.
     pub fn at(&self, env_steps: u64) -> Self {
         let mut now = self.clone();
         now.env.act_moving_average = self.training.act_moving_average.by_equal_steps(env_steps);
@@ -288,8 +289,8 @@ impl PpoConfig {
         self.horizon.from.max(1.0) as usize
     }
 
-    /// Returns the number of control steps of each environment in an iteration that begins after `env_steps` control steps of the
-    /// run: the largest multiple of the first one that the ramp has reached.
+    /// Returns the control steps of each environment in an iteration that begins after `env_steps` control steps of the run. This
+    /// is the largest multiple of the first horizon that the ramp has reached.
     pub fn horizon_at(&self, env_steps: u64) -> usize {
         let first = self.first_horizon();
         (self.horizon.by_equal_steps(env_steps) / first as f64 + 1e-9) as usize * first
@@ -302,7 +303,7 @@ impl PpoConfig {
         if self.minibatch_size == 0 { in_first / self.minibatches } else { self.minibatch_size }
     }
 
-    /// Returns how far a value may move from the one at collection time; infinity if `value_clip` is 0.
+    /// Returns how far a value may move from its value at collection time, or infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
         if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
     }

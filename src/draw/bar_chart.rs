@@ -11,7 +11,7 @@ use super::chart::{COLOURS, GRID, Picture, draw_text};
 pub struct NamedBar {
     /// The name, to the left.
     pub name: String,
-    /// The value; `NaN` if it is not known.
+    /// The value, or `NaN` if it is not known.
     pub value: f64,
     /// The interval in which it lies.
     pub interval: [f64; 2],
@@ -19,7 +19,7 @@ pub struct NamedBar {
     pub note: String,
 }
 
-/// Values over two quantities; nothing is drawn without rows.
+/// Values over two quantities. Nothing is drawn without rows.
 pub struct HeatMap {
     /// The names of the columns.
     pub columns: Vec<String>,
@@ -103,7 +103,7 @@ impl Picture for BarChart {
     }
 }
 
-/// Returns the colour for a value from 0 (grey) to 1 (that of the bars).
+/// Returns the colour for a value from 0 (grey) to 1 (the colour of the bars).
 fn blended(share: f64) -> RGBColor {
     let mix = |from: u8, to: u8| (f64::from(from) * (1.0 - share) + f64::from(to) * share) as u8;
     RGBColor(mix(240, BAR.0), mix(240, BAR.1), mix(240, BAR.2))

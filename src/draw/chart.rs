@@ -24,7 +24,7 @@ pub struct Subplot {
 pub struct Curve {
     /// Points (x, y), in ascending order of x. A single one is drawn as a dot.
     pub points: Vec<[f64; 2]>,
-    /// For each point, the lowest and the highest value of a band around it; empty without a band.
+    /// For each point, the lowest and the highest value of a band around it. Empty without a band.
     pub band: Vec<[f64; 2]>,
     /// Whether each point has a dot.
     pub dots: bool,
@@ -38,7 +38,7 @@ pub struct Chart {
     pub along: String,
     /// Panels, from top to bottom.
     pub panels: Vec<Subplot>,
-    /// Width and height in pixels; without, 800 wide, and as high as the legend and 260 for each panel.
+    /// Width and height in pixels. By default 800 wide, and as high as the legend plus 260 for each panel.
     pub size: Option<[u32; 2]>,
 }
 
@@ -256,7 +256,7 @@ impl Curve {
         self.points.iter().map(|[x, _]| *x)
     }
 
-    /// Returns all values, those of the band too.
+    /// Returns all values, including the band.
     fn values(&self) -> impl Iterator<Item = f64> {
         self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
     }
@@ -285,7 +285,7 @@ impl Curve {
     }
 }
 
-/// Returns the range of the values and zero, with a margin at the top; never empty.
+/// Returns the range of the values and zero, with a margin at the top. It is never empty.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
     if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }

@@ -1,7 +1,8 @@
-//! One HTML file that shows recorded motion: data, style and code in it, and nothing from elsewhere.
+//! One HTML file that shows recorded motion. It contains data, style and code, and loads nothing from elsewhere.
 //!
-//! The page's own files are in `assets/page`; `FORMAT.md` there says what the blocks of data hold. A table of numbers is stored as
-//! 16-bit integers, column by column, as differences from row to row, all low bytes before all high bytes: so it packs well.
+//! The page's own files are in `assets/page`. `FORMAT.md` there says what the blocks of data hold. A table of numbers is stored as
+//! 16-bit integers, column by column, as differences from row to row. All low bytes come before all high bytes, so it compresses
+//! well.
 
 use std::io::Write;
 
@@ -35,7 +36,7 @@ pub type Mesh = (Vec<([f32; 3], [f32; 3])>, Vec<[usize; 3]>);
 
 /// What a page shows.
 pub struct Page {
-    /// What the page says of itself; see `FORMAT.md`. The number of rows and their scale are added to it.
+    /// The metadata of the page (see `FORMAT.md`). The number of rows and their scale are added to it.
     pub meta: Value,
     /// The bodies and shapes. The list of meshes is added to it.
     pub scene: Value,
@@ -43,17 +44,17 @@ pub struct Page {
     pub meshes: Vec<Mesh>,
     /// The recorded rows, all of one length.
     pub rows: Vec<Vec<f64>>,
-    /// The columns that count, and are stored as they are.
+    /// The columns of counts, which are stored without a scale.
     pub counts: Vec<usize>,
 }
 
 impl Page {
-    /// Returns what names a page: another text for another scene or other columns.
+    /// Returns the key of a page, which is different for another scene or other columns.
     pub fn key(&self) -> String {
         BASE64_STANDARD.encode(&Sha256::digest(format!("{}{}", self.meta, self.scene))[..12])
     }
 
-    /// Returns the page as text. A live page has no rows; it reads them from where it comes from.
+    /// Returns the page as text. A live page has no rows, and reads them from its server.
     pub fn html(mut self) -> String {
         let is_live = self.meta["live"] == true;
         if is_live {
@@ -73,7 +74,7 @@ impl Page {
         let value = |name: &str| match name {
             "POLICY" => policy.clone(),
             "STYLE" => style.clone(),
-            // A path may hold what ends a script.
+            // A path may contain text that ends a script.
             "META" => self.meta.to_string().replace('<', "\\u003c"),
             "SCENE" => packed(self.scene.to_string().as_bytes()),
             "ROWS" if self.rows.is_empty() => String::new(),
@@ -101,7 +102,7 @@ fn lean(text: &str) -> String {
     lines.map(|line| format!("{line}\n")).collect()
 }
 
-/// Returns the source that a content security policy names a text by.
+/// Returns the hash by which a content security policy names a text.
 fn hash(text: &str) -> String {
     format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(text)))
 }
@@ -134,7 +135,8 @@ fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
     (scale, packed)
 }
 
-/// Returns what the scene says of a mesh, and its bytes: points as a table in its bounding box, normals by axis, corners of triangles.
+/// Returns the entry of a mesh in the scene, and its bytes: points as a table in its bounding box, normals by axis, corners of
+/// triangles.
 fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     let bounds = |pick: fn(f32, f32) -> f32, start: f32| {
         [0, 1, 2].map(|axis| corners.iter().fold(start, |bound, (point, _)| pick(bound, point[axis])))

@@ -1,4 +1,4 @@
-//! Environments that an agent acts in, and pools that step many of them at once. Nothing here knows the hand.
+//! Environments that an agent acts in, and pools that step many of them at once. Nothing here depends on the hand.
 //!
 //! Actions come in and observations go out as `f32` slices.
 

@@ -15,10 +15,10 @@ use crate::schedule::{block_sizes, panic_message};
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
-/// The most environments that a thread steps before it looks for others to share with.
+/// The most environments that a thread steps before it can share the rest with other threads.
 const MOST_AT_ONCE: usize = 8;
 
-/// N environments that start their next episode automatically; O is the observation size.
+/// N environments that start their next episode automatically. O is the observation size.
 pub struct EnvPool<E: Env> {
     /// Its blocks, in the order of the environments. None spans two shards.
     pub blocks: Vec<EnvBlock<E>>,
@@ -29,7 +29,7 @@ pub struct EnvPool<E: Env> {
 pub enum Autoreset {
     /// In the step that ended the episode, whose observation is then the first one of the next.
     SameStep,
-    /// In place of the step after it, whose action is ignored and which rewards nothing.
+    /// In place of the step after it. The action of that step is ignored, and its reward is 0.
     NextStep,
     /// Never by itself: [`EnvPool::restart`] does it.
     Disabled,
@@ -37,13 +37,13 @@ pub enum Autoreset {
 
 /// The n environments of a pool that are stepped by one thread at a time.
 pub struct EnvBlock<E: Env> {
-    /// The number of this block, counted over all that exchange.
+    /// The number of this block, counted over all ranks.
     pub number: usize,
-    /// The number of its first environment, counted likewise.
+    /// The number of its first environment, counted over all ranks.
     pub first: usize,
     /// The ends `[n]` of the last step.
     pub ends: Vec<Option<End>>,
-    /// Final observations `[n, O]` of the episodes that ended in the last step, and under goals that were replaced; other rows are
+    /// Final observations `[n, O]` of the episodes that ended in the last step, and under goals that were replaced. Other rows are
     /// older.
     pub final_observations: Vec<f32>,
     /// The description of observations and actions.
@@ -76,7 +76,7 @@ struct Cells<'a> {
 }
 
 impl<E: Env> EnvPool<E> {
-    /// Creates a pool of these environments, all of one kind, which are those that `exchange` deals. Their episodes are drawn from
+    /// Creates a pool of these environments of one kind, which `exchange` assigns to this rank. Their episodes are drawn from
     /// `seed`.
     ///
     /// # Panics
@@ -125,8 +125,8 @@ impl<E: Env> EnvPool<E> {
         self.blocks.iter().map(EnvBlock::count).collect()
     }
 
-    /// Starts the first episode of every environment, at a random age so that they do not all end together, and writes the
-    /// `observations` `[n, O]` of each block.
+    /// Starts the first episode of every environment, and writes the `observations` `[n, O]` of each block. Ages are
+    /// random, so that the episodes do not all end together.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = self.spaces().observation_size;
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
@@ -136,7 +136,7 @@ impl<E: Env> EnvPool<E> {
         });
     }
 
-    /// Makes the first episodes of `seed` the ones that start next.
+    /// Makes the first episodes of `seed` start next.
     pub fn reseed(&mut self, seed: u64) {
         for block in &mut self.blocks {
             block.draw.seed = seed;
@@ -159,13 +159,13 @@ impl<E: Env> EnvPool<E> {
         });
     }
 
-    /// Steps every environment with its row of `actions` `[N, A]`, and writes `rewards` `[N]`, `observations` `[N, O]`, and in the
-    /// blocks the ends and the final observations. A goal that was replaced is so at once; the observation is then under the new
-    /// one. Returns the episodes that ended, with the places of their environments. Threads share the work in parts smaller than a
-    /// block, because all wait for the last one.
+    /// Steps every environment with its row of `actions` `[N, A]`. Writes `rewards` `[N]` and `observations` `[N, O]`, and to the
+    /// blocks the ends and the final observations. Where a goal was replaced, the observation already shows the new one. Returns
+    /// the episodes that ended, with the places of their environments. Threads share the work in parts smaller than a block,
+    /// because all wait for the last one.
     ///
     /// # Errors
-    /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
+    /// Fails with the environment's number if an environment panics. The pool must not be stepped again.
     pub fn step(
         &mut self,
         actions: &[f32],
@@ -255,12 +255,12 @@ impl<E: Env> EnvBlock<E> {
         self.slots.iter_mut().map(|slot| &mut slot.env)
     }
 
-    /// Steps every environment with its row of `actions` `[n, A]`. Where an episode ended, starts a new one; where a goal was
-    /// replaced, continues under another. Writes the `rewards` `[n]`, and the `observations` `[n, O]` to act on next: the first of
-    /// the new episode where one ended, under the new goal where the goal was replaced.
+    /// Steps every environment with its row of `actions` `[n, A]`. Where an episode ended, starts a new one. Where a goal was
+    /// replaced, continues under another one. Writes the `rewards` `[n]`, and the `observations` `[n, O]` to act on next. These
+    /// belong to the new episode or show the new goal.
     ///
     /// # Errors
-    /// Fails with the environment's number if an environment panics; the pool must not be stepped again.
+    /// Fails with the environment's number if an environment panics. The pool must not be stepped again.
     pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
         let Spaces { observation_size: size, action_size, .. } = self.spaces;
         let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());

@@ -1,7 +1,7 @@
 //! Saved environments: two tables with one row per environment, one of doubles and one of integers.
 //!
-//! They are tables and not bytes so that a checkpoint can be inspected with any reader of its format, and so that everything
-//! in it has a type that can be checked.
+//! They are tables and not bytes, so that any reader of the checkpoint format can inspect them. Everything in them has a
+//! type that can be checked.
 
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};

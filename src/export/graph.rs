@@ -8,7 +8,7 @@ use crate::spaces::{CubeAndGoal, Spaces};
 
 /// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
 ///
-/// A `mirror` `[O, O]` is multiplied from the right to observations before all else.
+/// Before anything else, observations are multiplied from the right by a `mirror` `[O, O]`, if there is one.
 pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     let Spaces { observation_size: size, action_size, .. } = policy.spaces;
     let InputTransform { perception, mean, factor } = policy.input_transform();

@@ -1,5 +1,5 @@
-//! Exporting a policy as an ONNX file, which programs in other languages run: symmetry, normaliser and actor in one graph, and what
-//! a program must know to use it as metadata.
+//! Exports a policy as an ONNX file, which programs in other languages run. One graph holds symmetry, normaliser and actor. The
+//! metadata holds what a program must know to use it.
 
 mod graph;
 mod onnx;
@@ -23,14 +23,14 @@ use graph::policy_graph;
 pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
-    let task = loaded.task(&args.set).context("the ranges of the actuators are those of the scene")?;
+    let task = loaded.task(&args.set).context("the file needs the actuator ranges of the scene")?;
     task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), task.config().model_file())?;
     let parts = &task.hand().parts;
     let mut names = [&parts.joints, &parts.actuators, &parts.fingertips].into_iter().flatten();
     if let Some(name) = names.find(|name| name.contains(',')) {
-        bail!("`{name}`: lists in an exported file are comma-separated, so no name may hold a comma");
+        bail!("`{name}`: an exported file separates names by commas, so a name must not contain one");
     }
     let output = os::OutputFile::create(&args.out)?;
     let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, &task));
@@ -41,8 +41,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 
 /// Returns what a program must know to run the policy: lists are comma-separated, numbers can be read back exactly.
 ///
-/// The names are those that mjlab's runners expect, where they have one for it: `joint_names` are what an action drives, here the
-/// actuators, and their target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
+/// The names follow mjlab's runners where they define one. `joint_names` are what an action drives, here the actuators. Their
+/// target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
 fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
     let (config, hand) = (task.config(), task.hand());
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);

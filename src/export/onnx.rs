@@ -1,5 +1,5 @@
-//! The part of the ONNX format that a policy needs: <https://github.com/onnx/onnx/blob/main/onnx/onnx.proto>, whose field numbers
-//! these are. Opset 13 and IR 8 are read by runtimes since 2021.
+//! The part of the ONNX format that a policy needs. The field numbers come from
+//! <https://github.com/onnx/onnx/blob/main/onnx/onnx.proto>. Runtimes read opset 13 and IR 8 since 2021.
 
 use protobuf::{CodedOutputStream, ProtobufResult};
 
@@ -47,7 +47,7 @@ impl Graph {
         output.to_owned()
     }
 
-    /// Adds a constant of floats with these dimensions; none for a single number.
+    /// Adds a constant of floats with these dimensions. There are none for a single number.
     pub(super) fn floats(&mut self, name: &str, dimensions: &[usize], values: &[f32]) {
         assert_eq!(dimensions.iter().product::<usize>(), values.len(), "{name}");
         self.constant(name, dimensions, FLOAT, values.iter().flat_map(|value| value.to_le_bytes()).collect());

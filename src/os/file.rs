@@ -8,10 +8,10 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
 
-/// The most bytes of a text file; a configuration takes a few KiB.
+/// The most bytes of a text file. A configuration takes a few KiB.
 const LARGEST_TEXT: u64 = 1 << 20;
 
-/// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 hands take less.
+/// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 environments take less.
 const LARGEST_BYTES: u64 = 1 << 30;
 
 /// The bytes at the beginning of a file that are looked at first.

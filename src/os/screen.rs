@@ -1,4 +1,4 @@
-//! Stdout as the place of a table: lines as wide as the terminal, shown once or again and again in the same place.
+//! Tables on stdout: lines as wide as the terminal, shown once or repeatedly in the same place.
 
 use anyhow::Result;
 use console::{Term, measure_text_width, truncate_str};
@@ -6,7 +6,7 @@ use console::{Term, measure_text_width, truncate_str};
 use super::progress::is_dumb;
 use super::terminal::is_read;
 
-/// What a table is shown on. Where stdout is no terminal, lines are whole, and follow those before.
+/// The screen that shows a table. Where stdout is no terminal, lines are not cut, and follow the earlier ones.
 #[derive(Debug, Default)]
 pub struct Screen {
     /// The number of lines that were shown last.
@@ -14,7 +14,7 @@ pub struct Screen {
 }
 
 impl Screen {
-    /// Shows lines in place of those that were shown before, as many as fit below each other. Returns whether somebody reads them.
+    /// Shows lines in place of the previous ones, as many as fit below each other. Returns whether somebody reads them.
     ///
     /// # Errors
     /// Fails if stdout cannot be written to.
@@ -44,8 +44,8 @@ pub fn text_of(lines: &[String]) -> String {
     lines.iter().map(|line| cut(line) + "\n").collect()
 }
 
-/// Returns rows as lines with aligned columns: the first `words` columns to the left, those after them to the right, and the last one
-/// as it is.
+/// Returns rows as lines with aligned columns. The first `words` columns are aligned to the left, the others to the right, and the
+/// last one stays as it is.
 pub fn aligned(rows: &[Vec<String>], words: usize) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width =

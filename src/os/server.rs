@@ -11,20 +11,20 @@ use anyhow::{Context, Result, anyhow};
 
 use super::http::{PATIENCE, Refusal, Request, answer, head, refuse};
 
-/// The most readers of events, and the most connections, with those that only fetch the page.
+/// The most readers of events, and the most connections, including connections that only fetch the page.
 const MOST_READERS: usize = 8;
 const MOST_CONNECTIONS: usize = 32;
 
 /// The events that are kept for readers that are a little late.
 const KEPT: usize = 64;
 
-/// The time without an event after which a reader is told that there is none.
+/// The time without an event after which a reader gets an event without news.
 const QUIET: Duration = Duration::from_secs(1);
 
 /// What a user can do about a port that cannot be opened.
-const OTHER_PORT: &str = "choose another one, e.g. --web 7171, or --web 0 for any that is free";
+const OTHER_PORT: &str = "choose another one, e.g. --web 7171, or --web 0 for any free port";
 
-/// What happens with the body of a POST to `controls`; an error is a sentence about it.
+/// What happens with the body of a POST to `controls`. An error is a sentence about it.
 pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
 
 /// A page that is served as long as the program runs.
@@ -87,7 +87,7 @@ impl Server {
         self.shared.news().hello = hello.into();
     }
 
-    /// Sends events, each as the protocol writes it, to all readers. Those that are too late miss them.
+    /// Sends events, each as the protocol writes it, to all readers. Readers that are too late miss them.
     pub fn send(&self, events: &str) {
         let mut news = self.shared.news();
         news.events.push_back(events.into());
@@ -108,14 +108,14 @@ impl Server {
 }
 
 impl Shared {
-    /// Returns the news. A thread that panicked with them has left them whole.
+    /// Returns the news. They are consistent even after a panic of a thread that held them.
     fn news(&self) -> MutexGuard<'_, News> {
         self.news.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn accept(self: Arc<Self>, listener: &TcpListener) {
         for stream in listener.incoming() {
-            // Without one, there may be no descriptors left for a while.
+            // A failure may mean that there are no descriptors left for a while.
             let Ok(mut stream) = stream else {
                 thread::sleep(Duration::from_millis(50));
                 continue;
@@ -144,7 +144,7 @@ impl Shared {
         }
     }
 
-    /// Answers a request; an error is a refusal, with the methods that are allowed.
+    /// Answers a request. An error is a refusal, with the methods that are allowed.
     fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), (Refusal, &'static str)> {
         request.expect_local().map_err(|refusal| (refusal, "GET"))?;
         let on_post = self.on_post.as_ref().filter(|_| request.path == "/controls");

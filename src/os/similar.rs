@@ -17,7 +17,7 @@ pub fn similar<'a>(name: &str, known: impl Iterator<Item = &'a str>, separator: 
     let mut alike: Vec<(usize, &str)> = known.map(|candidate| (distance(candidate), candidate)).collect();
     alike.retain(|(distance, _)| *distance <= 2 + name.len() / 4);
     alike.sort_by_key(|(distance, _)| *distance);
-    // What is much farther than the nearest is not meant.
+    // Names much farther away than the nearest one are left out.
     let nearest = alike.first().map_or(0, |(distance, _)| *distance);
     alike.retain(|(distance, _)| *distance <= nearest + 1);
     alike.into_iter().map(|(_, candidate)| candidate).collect()

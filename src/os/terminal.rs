@@ -29,7 +29,7 @@ pub(super) fn is_read(text: &str) -> Result<bool> {
 /// The most characters of a foreign text that a message quotes.
 const LONGEST_QUOTE: usize = 100;
 
-/// Returns a text from a file of anybody's, short enough for a message and on one line.
+/// Returns a text from an untrusted file, short enough for a message and on one line.
 pub fn shortened(text: &str) -> String {
     let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
     let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
@@ -47,19 +47,18 @@ pub fn number(value: f64, decimals: usize) -> String {
 /// What each line of [`say`] begins with.
 static SPEAKER: OnceLock<String> = OnceLock::new();
 
-/// From now on, lines to stderr begin with this name: there are several processes, and they print to the same place.
+/// From now on, lines to stderr begin with this name, because several processes print to the same place.
 pub fn speak_as(name: &str) {
     let _ = SPEAKER.set(format!("{name}: "));
 }
 
-/// Whether a character steers the terminal, is not seen, or changes the direction or the lines of the text around it.
+/// Whether a character controls the terminal, is invisible, or changes the direction or the lines of the text around it.
 fn is_steering(c: char) -> bool {
     let unseen = matches!(c, '\u{ad}' | '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}');
     c.is_control() || unseen || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns a text of one line in which the characters that steer a terminal are escaped as in JSON, so that a text of JSON stays
-/// one.
+/// Returns a text of one line. Characters that control a terminal are escaped as in JSON, so that JSON stays valid.
 pub fn harmless(text: &str) -> String {
     let mut harmless = String::with_capacity(text.len());
     for c in text.chars() {
@@ -73,7 +72,7 @@ pub fn harmless(text: &str) -> String {
     harmless
 }
 
-/// Prints a line to stderr. Characters that steer the terminal are escaped, since the line may quote an untrusted file.
+/// Prints a line to stderr. Characters that control the terminal are escaped, since the line may quote an untrusted file.
 pub fn say(line: &str) {
     let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
     for c in line.chars() {

@@ -3,7 +3,7 @@
 use anyhow::{Error, Result, anyhow, ensure};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
-/// The most worker threads per core; more would only take turns.
+/// The most worker threads per core. More would only take turns.
 const MOST_THREADS: usize = 16;
 
 /// Starts rayon's global pool, which the whole program uses, with this number of worker threads (0: one per core).
@@ -11,7 +11,7 @@ const MOST_THREADS: usize = 16;
 /// # Errors
 /// Fails if the number is too large, if the system refuses the threads, or on a second call.
 pub fn start_threads(threads: usize) -> Result<()> {
-    // The text of this error already contains that of its source.
+    // The text of this error already contains the text of its source.
     pool(threads)?.build_global().map_err(|error| cannot_start(threads, error))
 }
 

@@ -21,10 +21,10 @@ use crate::run::{self, RunFolder};
 use crate::see::{self, About, Acting, Live};
 use crate::sim::Quality;
 
-/// What is said of the origin of a policy that is built in.
+/// The text for the origin of a built-in policy.
 const BUILT_IN: &str = "built into the program";
 
-/// Returns what a page says of an actor, of the place of its policy and what that is, and of a seed.
+/// Returns what a page says about an actor, the place and the description of its policy, and a seed.
 pub(super) fn about(actor: &str, policy: Option<(&str, &str)>, seed: Option<u64>) -> About {
     let title = match policy.map(|(place, _)| place) {
         Some(place) if place.ends_with(BUILT_IN) => "A built-in policy".to_owned(),
@@ -41,7 +41,7 @@ pub(super) fn about(actor: &str, policy: Option<(&str, &str)>, seed: Option<u64>
 /// The newest policy of a run.
 pub(super) struct Followed {
     run: RunFolder,
-    /// Its file, and what that was like before it was last read.
+    /// Its file, and the stamp of that file before it was last read.
     pub(super) path: PathBuf,
     stamp: Option<Stamp>,
 }
@@ -59,7 +59,7 @@ impl Followed {
         Ok(Self { stamp: Stamp::of(&path), run, path })
     }
 
-    /// Returns whether the file is another one than before.
+    /// Returns whether the file has changed since the last call.
     fn has_changed(&mut self) -> bool {
         let before = self.stamp;
         self.stamp = Stamp::of(&self.path);
@@ -67,7 +67,7 @@ impl Followed {
     }
 }
 
-/// Shows the hand on a page for as long as the program runs. Each episode of a run that is `followed` has its newest policy.
+/// Shows the hand on a page for as long as the program runs. If a run is `followed`, each episode uses its newest policy.
 ///
 /// # Errors
 /// Fails if the port cannot be opened.
@@ -106,8 +106,8 @@ pub(super) fn live(
             let place = followed.path.display();
             match Loaded::find(Some(&followed.path), &args.set) {
                 Ok(newer) if Some(&newer.record) == record.as_ref() => acting = acting_of(&newer, args.stochastic),
-                Ok(_) => os::say(&format!("warning: {place} is for another hand; the one before plays on")),
-                Err(error) => os::say(&format!("warning: {error:#}\n  The policy before plays on.")),
+                Ok(_) => os::say(&format!("warning: {place} is for another hand; the previous policy continues")),
+                Err(error) => os::say(&format!("warning: {error:#}\n  The previous policy continues.")),
             }
         }
         acting.clone()
@@ -126,8 +126,8 @@ fn acting_of(loaded: &Loaded, stochastic: bool) -> Acting {
 /// Writes the episodes of the trace in the file `path` as the file `html`.
 ///
 /// # Errors
-/// Fails if the file is no trace, if its scene is not the built-in one and the user does not name it, or if the HTML file cannot be
-/// written.
+/// Fails if the file is no trace, or if the HTML file cannot be written. Fails if the user does not name a scene that is not built
+/// in.
 pub(super) fn from_trace(path: &Path, html: &Path, args: &PlayArgs) -> Result<()> {
     let cannot = || format!("cannot use the trace {}", path.display());
     let is_begun = |start: &[u8]| {
@@ -139,18 +139,18 @@ pub(super) fn from_trace(path: &Path, html: &Path, args: &PlayArgs) -> Result<()
     let header = header.filter(|header| header.get("observation").is_some());
     let header = header.context("it does not begin with the header of a trace").with_context(cannot)?;
     if let Some(set) = args.set.iter().find(|set| set.key != MODEL && !set.key.starts_with("hand.")) {
-        bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be named", set.key);
+        bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set", set.key);
     }
     let config = Config::resolve(Some(&settings(path, &header).with_context(cannot)?), &args.set)?;
     expect_named_scene(&config.env, args.set.iter().any(|set| set.key == MODEL)).with_context(cannot)?;
     let task = Task::new(&config.env, &config.hand)?;
     let joints = json!(task.hand().parts.joints);
-    ensure!(header["joint_names"] == joints, "{}: it is of another hand, with other joints", cannot());
+    ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
     run::expect_output(html, Some(path), task.config().model_file())?;
     let mut page = PageFile::begin(html, &task, args)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {
-        os::say(&format!("note: {left_out} more episodes of {} are not in the file", path.display()));
+        os::say(&format!("note: {left_out} more episodes of {} are not in the HTML file", path.display()));
     }
     let actor = header["actor"].as_str().filter(|actor| actor.is_ascii() && !actor.is_empty()).unwrap_or("policy");
     let policy = header["checkpoint"].as_str().map(|place| (place, place));

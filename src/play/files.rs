@@ -1,4 +1,4 @@
-//! The files of what is played: a trace, and an HTML file.
+//! The files written while playing: a trace, and an HTML file.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::see::{self, About, Replay};
 use crate::sim::Quality;
 use crate::trace::Trace;
 
-/// The files that the user wants. They are opened before playing, so that a path that cannot be written to does not cost the score.
+/// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.
 pub(super) struct Files {
     trace: Option<(OutputFile, Trace)>,
     page: Option<PageFile>,
@@ -71,7 +71,7 @@ impl PageFile {
     /// Fails if it cannot be written, or if the episodes are too long for it.
     pub(super) fn begin(path: &Path, task: &Task, args: &PlayArgs) -> Result<Self> {
         let output = OutputFile::create(path)?;
-        // The size is that of a film; a page has none.
+        // The size of a film. A page has none.
         let task = see::task_for_display(task, &args.shot, [1280, 720], Quality::Fast)?;
         let episodes = if args.from_trace.is_some() { 0 } else { args.episodes.unwrap_or(1) as usize };
         Ok(Self { output, replay: Replay::new(&task, args.shot.camera, episodes)? })

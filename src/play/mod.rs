@@ -80,18 +80,18 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     if !os::has_display() && leaves_open(args) && os::is_terminal() {
-        os::say("note: there is no display; --web shows the hand in a browser, --html makes a file for one");
+        os::say("note: there is no display; --web shows the hand in a browser, --html writes a file for a browser");
     }
     play_unseen(args, requests, &task, loaded.as_ref())
 }
 
-/// Checks that options that are valid alone are so together.
+/// Checks that options that are valid alone are valid together.
 fn expect_together(args: &PlayArgs) -> Result<()> {
     let is_page = args.html.is_some() || args.web.is_some();
     let is_shown = is_page || args.video.is_some() || wants_window(args);
     let given = args.shot.given().filter(|_| !is_shown);
     let most = see::MOST_EPISODES as u64;
-    // Where an option that excludes another one is given, clap does not ask for the other one.
+    // clap does not demand a required option if a given option excludes it.
     let needs = [
         ("--hands", args.hands.is_some(), "--web", args.web.is_some()),
         ("--follow", args.follow, "--web", args.web.is_some()),

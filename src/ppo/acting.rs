@@ -20,7 +20,7 @@ pub struct Acting<'a> {
 }
 
 impl Acting<'_> {
-    /// Draws actions for the observations of step `t`; writes actions, means, noise scales, log-probabilities and values.
+    /// Draws actions for the observations of step `t`. Writes actions, means, noise scales, log-probabilities and values.
     pub fn act(&self, block: &mut RolloutBlock, t: usize, noise: &mut Rng, work: &mut Workspace) {
         let Spaces { observation_size, action_size, .. } = *self.policy.spaces();
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
@@ -40,14 +40,15 @@ impl Acting<'_> {
                 *action = mean + *scale * std * drawn;
                 squares += ((*action - mean) / (*scale * std)).powi(2);
             }
-            // The log-density omits the scale, here and in the losses; it would cancel in the ratio of the two.
+            // The log-density omits the scale, here and in the losses, because it would cancel in the ratio of the two.
             *log_prob = -0.5 * squares - constant;
         }
     }
 
     /// Returns the factor on the policy's noise. Near the goal, the policy's own noise is as small as the required
-    /// precision demands. Far from it, so little noise would only slow learning down: both what a sample reveals about
-    /// better actions and how far an update with a given KL divergence moves the policy are proportional to the noise.
+    /// precision demands. Far from it, so little noise would only slow learning down. What a sample reveals about
+    /// better actions is proportional to the noise. So is the distance by which an update with a given KL divergence
+    /// moves the policy.
     fn noise_scale(&self, observation: &[f32]) -> f32 {
         if self.away_scale <= 1.0 {
             return 1.0;
@@ -59,8 +60,8 @@ impl Acting<'_> {
     }
 
     /// Scales the rewards of a step. Where the future of an environment was cut off, also adds the discounted value of
-    /// its final observation, so that advantages need only one array of ends. `cut_off` `[n]`, `final_observations`
-    /// `[n, O]`.
+    /// its final observation. So advantages need only one array of ends. `cut_off` `[n]`, `final_observations` `[n,
+    /// O]`.
     pub fn scale_and_bootstrap(
         &self,
         rewards: &mut [f32],

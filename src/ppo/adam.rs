@@ -19,7 +19,7 @@ const EPSILON: f64 = 1e-8;
 /// Parameters that one task updates.
 const CHUNK: usize = 8192;
 
-/// Values whose squares one task adds up; fixed, so that the result does not depend on the number of threads.
+/// Values whose squares one task adds up. The number is fixed, so that the result does not depend on the number of threads.
 const NORM_CHUNK: usize = 4096;
 
 /// The Adam optimizer: D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
@@ -72,7 +72,7 @@ impl Adam {
     }
 }
 
-/// Returns the chunks of these ranges of parameters, whose squares are added up apart.
+/// Returns the chunks of these ranges of parameters, whose squares are added up separately.
 pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let chunks = |group: &Range<usize>| {
         let (firsts, end) = (group.clone().step_by(NORM_CHUNK), group.end);
@@ -110,7 +110,7 @@ mod tests {
         norm(&chunks.map(|chunk| sum_of_squares(&gradient[chunk])).collect::<Vec<f64>>(), groups)
     }
 
-    /// The expected values are those of this program (PyTorch):
+    /// The expected values come from this program (PyTorch):
     /// ```python
     /// import torch
     /// x = torch.tensor([1.0, -2.0, 3.0], requires_grad=True)

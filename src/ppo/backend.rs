@@ -10,7 +10,7 @@ use super::{Policy, Rollout};
 use crate::config::PpoConfig;
 use crate::ranks::Minibatch;
 
-/// The losses of samples and what tells how far the policy has moved: sums over the samples, or means.
+/// The losses of samples, and measures of how far the policy has moved. They are sums over the samples, or means.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Losses {
     /// The clipped surrogate.
@@ -56,7 +56,7 @@ impl Losses {
 
 /// A way to compute gradients.
 pub(super) trait GradientBackend: Send + Sync {
-    /// Prepares for the minibatches of a rollout, before any step on it: `policy` is the one that collected it.
+    /// Prepares for the minibatches of a rollout, before any step on it. `policy` is the policy that collected it.
     fn begin(&mut self, _policy: &Policy, _rollout: &Rollout) {}
 
     /// Computes the gradients of the losses of each group of this minibatch with respect to the parameters of the policy. Returns

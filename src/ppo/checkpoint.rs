@@ -1,8 +1,8 @@
 //! The content of checkpoints: weights, normaliser, optimizer and learning rate of a learner, the whole configuration,
-//! the progress of the run, and whatever else a training run needs to resume. A policy alone contains only weights,
-//! normaliser, configuration and progress.
+//! and the progress of the run. Whatever else a training run needs to resume is added. A policy alone contains only
+//! weights, normaliser, configuration and progress.
 //!
-//! Reading is strict: the arrays must be exactly those that the configuration describes, with the same shapes.
+//! Reading is strict: the arrays and their shapes must be exactly as the configuration describes.
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 
@@ -25,10 +25,10 @@ const SCENE: &str = "scene";
 /// The text that describes the hand and the object of the policy.
 const HAND: &str = "hand";
 
-/// The most bytes of a configuration that are read; ours take one to two thousand.
+/// The most bytes of a configuration that are read. Ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
-/// The text that tells how a published policy was made; `scripts/provenance.py` writes it.
+/// The text that says how a published policy was made. `scripts/provenance.py` writes it.
 const PROVENANCE: &str = "provenance";
 
 /// The name of the logarithms of the standard deviations, one for each action: all are equal.
@@ -46,9 +46,9 @@ pub struct Checkpoint {
     pub progress: Progress,
     /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes.
     pub provenance: Option<String>,
-    /// The fingerprint of the physics of its scene; `None`: the built-in scene.
+    /// The fingerprint of the physics of its scene, or `None` for the built-in scene.
     pub scene: Option<String>,
-    /// The hand and the object that it was trained with; `None`: those of the built-in scene.
+    /// The hand and the object that it was trained with, or `None` for the built-in scene.
     pub hand: Option<String>,
     content: Content,
 }
@@ -102,7 +102,7 @@ impl Checkpoint {
         alone
     }
 
-    /// Returns whether its scene may be the one with this fingerprint.
+    /// Returns whether its scene may be the scene with this fingerprint.
     pub fn is_of_scene(&self, fingerprint: &str) -> bool {
         self.scene.as_ref().is_none_or(|scene| scene == fingerprint)
     }
@@ -223,7 +223,7 @@ impl Policy {
 
 impl Ppo {
     /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
-    /// progress of the run. All that exchange call it together.
+    /// progress of the run. All ranks call it together.
     pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
         let (config, content) = (config.to_owned(), Content::default());
         let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, hand: None, content };

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
-/// The parts of a gradient step. All threads meet at the end of each of them.
+/// The parts of a gradient step. All threads wait for each other at the end of each part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Part {
     /// The weights are arranged for products in bf16.
@@ -22,11 +22,11 @@ impl Part {
         [(Self::Packing, "packing"), (Self::Samples, "samples"), (Self::Sums, "sums"), (Self::Adam, "adam")];
 }
 
-/// A clock of all threads; it stands still until it is started.
+/// A clock of all threads. It stands still until it is started.
 #[derive(Debug, Default)]
 pub(super) struct Clock {
     runs: AtomicBool,
-    /// For each part: nanoseconds from its begin to its end, and those that all threads together worked.
+    /// For each part: nanoseconds from its begin to its end, and the nanoseconds that all threads together worked.
     parts: [[AtomicU64; 2]; Part::ALL.len()],
 }
 
@@ -36,17 +36,17 @@ impl Clock {
         self.runs.store(true, Relaxed);
     }
 
-    /// Returns the seconds of each part, and those that all threads together worked in it.
+    /// Returns the seconds of each part, and the seconds that all threads together worked in it.
     pub(super) fn seconds(&self) -> [[f64; 2]; Part::ALL.len()] {
         self.parts.each_ref().map(|part| part.each_ref().map(|time| 1e-9 * time.load(Relaxed) as f64))
     }
 
-    /// Runs a whole part, at whose end all threads meet.
+    /// Runs a whole part, at whose end all threads wait for each other.
     pub(super) fn part<T>(&self, part: Part, run: impl FnOnce() -> T) -> T {
         self.timed(&self.parts[part as usize][0], run)
     }
 
-    /// Runs what one thread works in a part.
+    /// Runs the work of one thread in a part.
     pub(super) fn work<T>(&self, part: Part, run: impl FnOnce() -> T) -> T {
         self.timed(&self.parts[part as usize][1], run)
     }

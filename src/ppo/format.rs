@@ -14,7 +14,7 @@ use crate::os::shortened;
 /// The metadata key of the checksum.
 const CHECKSUM: &str = "checksum";
 
-/// The largest header that is read. Ours take a few KiB; the limit keeps a foreign one from filling the memory.
+/// The largest header that is read. Ours take a few KiB. The limit keeps a foreign one from filling the memory.
 const LARGEST_HEADER: u64 = 1 << 20;
 
 /// An array of any shape, stored by rows.
@@ -70,11 +70,11 @@ impl Content {
     /// Parses the bytes of a file.
     ///
     /// # Errors
-    /// Fails if the bytes were not written by [`Content::to_bytes`]; with [`Damaged`] if they were changed since.
+    /// Fails if the bytes were not written by [`Content::to_bytes`], or with [`Damaged`] if they were changed since.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let (mut texts, views) = read(bytes)?;
         let stored =
-            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or one of an older version")?;
+            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or an older version wrote it")?;
         let found = checksum(&texts, &views);
         ensure!(
             stored == found,
@@ -89,8 +89,8 @@ impl Content {
     }
 }
 
-/// Returns the file with these texts and arrays and their checksum. The texts are sorted by name: safetensors writes
-/// them in the order of a hash map, which differs from run to run, and files with equal content should be equal.
+/// Returns the file with these texts and arrays and their checksum. The texts are sorted by name, so that files with
+/// equal content are equal. safetensors writes texts in the order of a hash map, which differs from run to run.
 fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
     let mut bytes = safetensors::serialize(views, Some(texts))?;
@@ -105,10 +105,10 @@ fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) ->
     Ok(bytes)
 }
 
-/// Checks the beginning of a file, at least 8 bytes of it if it has as many: what is something else is called that.
+/// Checks the beginning of a file, at least 8 bytes of it if it has as many. A file of another kind is reported as such.
 ///
 /// # Errors
-/// Fails if the bytes do not begin as those of a safetensors file.
+/// Fails if the bytes do not begin like a safetensors file.
 pub fn expect_safetensors(bytes: &[u8]) -> Result<()> {
     ensure!(!bytes.starts_with(b"version "), "a Git LFS pointer: `git lfs pull` fetches the file itself");
     ensure!(!(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)), "an ONNX file, not a safetensors file");

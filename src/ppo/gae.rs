@@ -7,7 +7,7 @@ use super::rollout::RolloutBlock;
 /// whatever reason.
 ///
 /// `gamma` is the factor on a reward for each step that it comes later. At a `lambda` of 1, later rewards count alone (unbiased,
-/// noisy); at 0, the next value replaces them.
+/// noisy). At 0, the next value replaces them.
 ///
 /// J. Schulman et al., "High-dimensional continuous control using generalized advantage estimation" (2016), eq. 16.
 pub(super) fn gae(block: &mut RolloutBlock, gamma: f32, lambda: f32) {
@@ -43,7 +43,7 @@ mod tests {
 
     #[test]
     fn advantages_are_those_worked_out_by_hand() {
-        // Two environments, three steps, γ = 0.5, λ = 0.5; the second environment ends with step 1.
+        // Two environments, three steps, γ = 0.5, λ = 0.5. The second environment ends with step 1.
         let rewards = [1.0, 1.0, 2.0, 2.0, 3.0, 3.0];
         let values = [4.0, 4.0, 8.0, 8.0, 2.0, 2.0, 6.0, 6.0];
         let mut block = block(&rewards, &values, &[false, false, false, true, false, false]);

@@ -1,7 +1,7 @@
 //! Nets made wider without changing what they compute.
 //!
-//! A new unit gets the weights that it would have in a new net, but the weights from new units to old units start at
-//! zero: the output does not change until they are trained. (Copies of old units, as in T. Chen, I. Goodfellow, J.
+//! A new unit gets the weights that it would have in a new net. But the weights from new units to old units start at
+//! zero, so the output does not change until they are trained. (Copies of old units, as in T. Chen, I. Goodfellow, J.
 //! Shlens, "Net2Net" (2016), would need noise to become different, and noise changes the function.)
 
 use anyhow::{Result, ensure};
@@ -17,7 +17,7 @@ impl Checkpoint {
     /// derived from `seed`.
     ///
     /// # Errors
-    /// Fails if a net would become narrower or change its depth, or if the tensors are not those of `from`.
+    /// Fails if a net would become narrower or change its depth, or if the tensors do not match `from`.
     pub fn grow(&mut self, from: &NetConfig, to: &NetConfig, spaces: Spaces, seed: u64) -> Result<()> {
         if from.hidden == to.hidden {
             return Ok(());
@@ -48,7 +48,7 @@ impl Checkpoint {
         })
     }
 
-    /// Replaces the arrays with this prefix by those of the new layout: the values that `begin` returns for them, with
+    /// Replaces the arrays with this prefix by arrays of the new layout: the values that `begin` returns for them, with
     /// the existing values copied over.
     fn widen(&mut self, prefix: &str, [old, new]: [&Layout; 2], begin: impl FnOnce(&[f32]) -> Vec<f32>) -> Result<()> {
         let known = self.take_floats(prefix, &old.views())?;

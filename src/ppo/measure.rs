@@ -35,7 +35,7 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     Ok(seconds)
 }
 
-/// Takes `repeats` more gradient steps as [`time_gradient_steps`] does, and returns the share of the time that threads wait in each
+/// Takes `repeats` more gradient steps as [`time_gradient_steps`] does. Returns the share of the time that threads wait in each
 /// part of a step, and while one thread works between the parts.
 ///
 /// # Errors
@@ -54,8 +54,8 @@ pub fn shares_of_waiting(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -
     Ok(shares)
 }
 
-/// Returns the matrix products of one forward and backward pass: the sizes of the weights `[outputs, inputs]`, and
-/// whether the gradient of the inputs is needed, which is not the case for observations.
+/// Returns the matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the
+/// gradient of the inputs is needed. It is not needed for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
     let nets = [&policy.layout.actor, &policy.layout.critic];
     nets.into_iter().flat_map(|layers| layers.iter().enumerate().map(|(i, layer)| (layer.outputs, layer.inputs, i > 0)))
@@ -66,8 +66,8 @@ pub fn flops_per_sample(policy: &Policy) -> f64 {
     products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
 
-/// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads, with
-/// data that stays in the caches as far as it fits. Returns 10⁹ floating-point operations per second for each repeat.
+/// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads. Their
+/// data stays in the caches as far as it fits. Returns 10⁹ floating-point operations per second for each repeat.
 pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
     let (policy, arithmetic, blocks) = (&ppo.policy, ppo.arithmetic, samples.div_ceil(ROWS));
     let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");

@@ -1,9 +1,8 @@
 //! Proximal policy optimisation (PPO) of a Gaussian policy.
 //!
-//! Inputs and outputs are host slices; all weights are in one array (see `parameters`). Nothing here depends on an
-//! environment or a file.
-//! Notation in comments: a rollout has T steps of N environments, B = T × N samples; a minibatch has M samples; an
-//! observation has O values and an action A.
+//! Inputs and outputs are host slices. All weights are in one array (see `parameters`). Nothing here depends on an
+//! environment or a file. Notation in comments: a rollout has T steps of N environments, so B = T × N samples. A
+//! minibatch has M samples. An observation has O values, and an action has A.
 
 mod acting;
 mod adam;
@@ -73,21 +72,21 @@ pub struct Ppo {
     away_std: f32,
     /// The iteration in which the actor begins to learn.
     actor_from: u64,
-    /// The desired KL divergence of an iteration, nats; 0: the learning rate is fixed.
+    /// The desired KL divergence of an iteration, nats. At 0, the learning rate is fixed.
     desired_kl: f64,
     exchange: Exchange,
-    /// The parameters that are moved here.
+    /// The parameters that this rank moves.
     slices: Slices,
-    /// What measures where threads wait.
+    /// The clock that measures where threads wait.
     clock: Clock,
 }
 
-/// Where a gradient step stands among those that move the policy. The learning rate follows how far they have moved it.
+/// The position of a gradient step among the steps that move the policy. The learning rate follows how far they have moved it.
 #[derive(Clone, Copy, Debug)]
 enum Stage {
-    /// Before all of them: the actor rests.
+    /// Before all of them: only the critic learns.
     CriticAlone,
-    /// The first one of an update: the policy is still the one that acted.
+    /// The first step of an update: the policy is still unchanged since it acted.
     First,
     /// Any other.
     Later,
@@ -98,7 +97,7 @@ enum Stage {
 pub struct UpdateStats {
     /// The losses.
     pub losses: Losses,
-    /// Those of the first minibatch alone, before any gradient step: KL divergence and ratio error are zero up to rounding.
+    /// The losses of the first minibatch alone, before any gradient step: KL divergence and ratio error are zero up to rounding.
     pub first: Losses,
     /// Entropy of the action distribution at noise scale 1, nats.
     pub entropy: f64,
@@ -132,8 +131,8 @@ impl UpdateStats {
 }
 
 impl Ppo {
-    /// Creates a learner for environments with these spaces, which learns from what `exchange` deals to it and adds up with
-    /// others. All its randomness is derived from `seed`.
+    /// Creates a learner for environments with these spaces. It learns from the samples that `exchange` assigns to this
+    /// rank, and adds up results with the other ranks. All its randomness is derived from `seed`.
     ///
     /// # Errors
     /// Fails if this machine does not support the configured precision, or if the observations lack the configured
@@ -184,8 +183,8 @@ impl Ppo {
         Rollout::new(self.config.first_horizon(), block_sizes, &self.policy.spaces)
     }
 
-    /// Sets the standard deviations of the actions, the desired KL divergence and the horizon of the rollout to where their
-    /// ramps are after `env_steps` control steps of the run.
+    /// Sets the standard deviations of the actions, the desired KL divergence and the horizon of the rollout. All follow
+    /// their ramps after `env_steps` control steps of the run.
     pub fn follow_ramps(&mut self, env_steps: u64, rollout: &mut Rollout) {
         let horizon = self.config.horizon_at(env_steps);
         if horizon != rollout.horizon() {
@@ -196,12 +195,12 @@ impl Ppo {
         self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
     }
 
-    /// Begins a run after this iteration of another one, of which it is a fork.
+    /// Begins a fork of another run after this iteration.
     pub fn begin_after(&mut self, iteration: u64) {
         self.actor_from = iteration.saturating_add(self.config.critic_first).saturating_add(1);
     }
 
-    /// Returns whether the actor rests in this iteration.
+    /// Returns whether only the critic learns in this iteration.
     pub fn is_critic_alone(&self, iteration: u64) -> bool {
         iteration < self.actor_from
     }
@@ -225,10 +224,10 @@ impl Ppo {
 
     /// Learns from a rollout that this policy collected, then adds its observations to the normaliser. The normaliser
     /// does not change during collection and learning, so the first minibatch sees exactly the policy that acted.
-    /// Returns `None` if `stop` was set in the meantime; the learner must then be restored before it is used again.
+    /// Returns `None` if `stop` was set in the meantime. The learner must then be restored before it is used again.
     ///
     /// # Errors
-    /// Fails if a loss, gradient or weight is not finite; the policy must not be used or saved then.
+    /// Fails if a loss, gradient or weight is not finite. The policy must then not be used or saved.
     pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
         // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
         // wake it.
@@ -262,7 +261,7 @@ impl Ppo {
             }
             self.check_weights()?;
             if self.is_critic_alone(iteration) {
-                // The normaliser is part of the policy that stands still.
+                // The normaliser is part of the policy, which does not change here.
                 return Ok(Some(self.stats(&steps, explained_variance)));
             }
             let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
@@ -314,7 +313,7 @@ impl Ppo {
         (mean, sum(&|x| (x - mean).powi(2)) / count)
     }
 
-    /// Takes one gradient step on a minibatch; returns the mean losses and the norm of the gradient.
+    /// Takes one gradient step on a minibatch. Returns the mean losses and the norm of the gradient.
     fn minibatch_step(&mut self, rollout: &Rollout, minibatch: &Minibatch, stage: Stage) -> Result<(Losses, f64)> {
         let (nets, clock) = (self.policy.layout.nets(), &self.clock);
         let sums = self.backend.gradients(&self.policy, rollout, minibatch, clock)?;
@@ -346,7 +345,7 @@ impl Ppo {
         Ok((losses, grad_norm))
     }
 
-    /// Returns the mean losses of a minibatch of `count` samples, given the sums of each group here.
+    /// Returns the mean losses of a minibatch of `count` samples, given the sums of each group on this rank.
     fn losses(&self, sums: &[Losses], count: usize) -> Losses {
         let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();

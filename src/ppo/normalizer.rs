@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::widest::widest;
 use crate::ranks::Exchange;
 
-/// Rows that one task sums; fixed, so that the result does not depend on the number of threads.
+/// Rows that one task sums. The number is fixed, so that the result does not depend on the number of threads.
 const ROWS_PER_TASK: usize = 1024;
 
 /// Statistics of each of the O values of an observation.
@@ -25,8 +25,7 @@ impl Normalizer {
         Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
     }
 
-    /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the statistics; `perceive` is first
-    /// applied to each row.
+    /// Adds the raw rows of these arrays `[B, O]` on all ranks to the statistics. `perceive` is first applied to each row.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
     /// variances" (1979), eq. 2.1.

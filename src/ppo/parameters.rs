@@ -1,7 +1,7 @@
-//! The location of each weight of a policy in the one array that holds them all.
+//! The location of each weight of a policy in the single array that holds all weights.
 //!
-//! Code that treats all weights alike (the optimizer, the norm of a gradient, the exchange) uses the array as a
-//! whole; code that needs one of them uses its range.
+//! Code that treats all weights alike (the optimizer, the norm of a gradient, the exchange) uses the array as a whole.
+//! Code that needs one of them uses its range.
 
 use std::ops::Range;
 
@@ -60,7 +60,7 @@ impl Layout {
         Self { actor: net(spaces.action_size), critic: net(1) }
     }
 
-    /// Returns the layers of the actor, then those of the critic.
+    /// Returns the layers of the actor, then the layers of the critic.
     pub fn layers(&self) -> impl Iterator<Item = &Layer> {
         self.actor.iter().chain(&self.critic)
     }

@@ -1,9 +1,9 @@
-//! The reading of observations by a policy: it exploits the symmetry of the cube, then normalises.
+//! How a policy reads observations: it exploits the symmetry of the cube, then normalises.
 //!
-//! The faces of the cube look different, but the hand handles them all alike. If cube and goal are rotated about the
-//! cube's own axes by one of the 24 rotations that map a cube onto itself, the cube moves in the same way under the
-//! same actions, and the remaining rotation to the goal is the same. So if each observation is first mapped to one of
-//! the 24 equivalent ones, a policy has to learn only that one.
+//! The faces of the cube look different, but make no difference to the hand. There are 24 rotations that map a cube
+//! onto itself. If one of them rotates cube and goal about the cube's own axes, the cube moves in the same way under
+//! the same actions. The remaining rotation to the goal is the same. So each observation is first mapped to one of the
+//! 24 equivalent ones, and a policy has to learn only that one.
 
 use anyhow::{Result, ensure};
 
@@ -24,7 +24,7 @@ const EPSILON: f64 = 1e-5;
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
     pub cube_and_goal: Option<CubeAndGoal>,
-    /// The rotations that map the object onto itself; if there are fewer, the first one fills the rest.
+    /// The rotations that map the object onto itself. If there are fewer, the first one fills the rest.
     rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
 }
 
@@ -46,12 +46,12 @@ impl Perception {
         Ok(Self { cube_and_goal, rotations })
     }
 
-    /// Returns the rotations that map the object onto itself; the first one may be repeated at the end.
+    /// Returns the rotations that map the object onto itself. The first one may be repeated at the end.
     pub fn rotations(&self) -> &[[f32; 4]] {
         &self.rotations
     }
 
-    /// Maps one raw observation `[O]`, in place, to the one that represents all equivalent observations.
+    /// Maps one raw observation `[O]`, in place, to the observation that represents all equivalent ones.
     #[inline(always)]
     pub fn canonicalize(&self, observation: &mut [f32]) {
         let Some(CubeAndGoal { cube, goal, .. }) = self.cube_and_goal else { return };
@@ -182,8 +182,8 @@ mod tests {
             let between = |a: [f32; 4], b: [f32; 4]| quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)));
             let left = quat::mul(cube, quat::conj(goal));
             assert!(quat::angle_between(between(new_cube, new_goal), left) < 1e-3);
-            // The largest misorientation of a cube is 62.8°: there, no rotation, a quarter turn about either of two
-            // axes and a third turn about the diagonal between them are equally near.
+            // The largest misorientation of a cube is 62.8°. Equally near are then no rotation, a quarter turn about
+            // either of two axes, and a third turn about the diagonal between them.
             assert!(new_cube[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0, "{new_cube:?}");
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));

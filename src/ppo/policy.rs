@@ -16,7 +16,7 @@ use crate::ranks::Exchange;
 use crate::rng;
 use crate::spaces::Spaces;
 
-/// The factor on the initial weights of the actor's last layer; it keeps first actions near the middle of their range.
+/// The factor on the initial weights of the actor's last layer. It keeps first actions near the middle of their range.
 const LAST_ACTOR_LAYER: f32 = 0.1;
 
 /// The number of rows that are computed together where results must not depend on their number.
@@ -47,8 +47,8 @@ pub struct FrozenPolicy<'a> {
     transform: InputTransform,
 }
 
-/// A policy that never changes, for calls with any number of rows. What it computes of a row are the same bits whatever the others
-/// are: it always computes [`GROUP`] rows together.
+/// A policy that never changes, for calls with any number of rows. The results for a row are bit for bit the same whatever the
+/// other rows are, because it always computes [`GROUP`] rows together.
 pub struct FixedPolicy {
     policy: Arc<Policy>,
     /// Copies of the weights of actor and critic, as a net reads them.
@@ -87,12 +87,12 @@ impl Policy {
         Ok(policy)
     }
 
-    /// Returns the standard deviation of each action at noise scale 1; training may scale the noise (see `Acting`).
+    /// Returns the standard deviation of each action at noise scale 1. Training may scale the noise (see `Acting`).
     pub fn std(&self) -> f32 {
         self.log_std.exp()
     }
 
-    /// Adds the raw rows of these arrays `[B, O]`, and of those that the exchange knows, to the normaliser.
+    /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
         let perception = self.perception;
         self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
@@ -194,7 +194,7 @@ impl FixedPolicy {
         self.in_groups(observations, width, |policy, seen, means, work| policy.mean_actions(seen, means, work))
     }
 
-    /// Returns the values `[B]` of raw observations `[B, O]`, likewise.
+    /// Returns the values `[B]` of raw observations `[B, O]`, shared among threads in the same way.
     pub fn values(&self, observations: &[f32]) -> Vec<f32> {
         self.in_groups(observations, 1, |policy, seen, values, work| policy.values(seen, values, work))
     }

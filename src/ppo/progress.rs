@@ -1,4 +1,4 @@
-//! The progress of a run, as checkpoints tell it: what is finished, what was best, and where it was forked from.
+//! The progress of a run, as checkpoints store it: what is finished, what was best, and where it was forked from.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,9 +26,9 @@ pub struct Progress {
 pub struct Rise {
     /// Goals per episode, rotation error (rad) and share of drops before the first iteration.
     pub before: [f64; 3],
-    /// The same of the best evaluation.
+    /// The same figures of the best evaluation.
     pub best: [f64; 3],
-    /// The evaluations since then.
+    /// The number of evaluations since then.
     pub since: u32,
 }
 
@@ -38,7 +38,7 @@ impl Rise {
         Self { before, best: before, since: 0 }
     }
 
-    /// Takes down another evaluation.
+    /// Records another evaluation.
     pub fn add(&mut self, figures: [f64; 3]) {
         let of = |[goals, rot_dist, _]: [f64; 3]| Evaluation { goals, rot_dist };
         let is_best = of(figures).beats(Some(of(self.best)));
@@ -46,7 +46,7 @@ impl Rise {
     }
 }
 
-/// The scores that evaluations are compared by; in a file, an array of both.
+/// The scores that evaluations are compared by. In a file, they are an array of both.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(from = "[f64; 2]", into = "[f64; 2]")]
 pub struct Evaluation {

@@ -1,7 +1,7 @@
 //! The samples of one iteration: allocated once, written row by row, then read by the update.
 //!
-//! Memory is laid out in the blocks in which environments are stepped, so that each block is written by one thread at a
-//! time, independently of the others.
+//! Memory is laid out in the blocks in which environments are stepped. So one thread at a time writes each block,
+//! independently of the others.
 
 use std::ops::Range;
 
@@ -17,7 +17,7 @@ pub struct Rollout {
     firsts: Vec<u32>,
 }
 
-/// T steps of the n environments of a block; all arrays are time-major.
+/// T steps of the n environments of a block. All arrays are time-major.
 pub struct RolloutBlock {
     /// `[T + 1, n, O]`: raw, as the environments write them
     pub observations: Vec<f32>,
@@ -73,7 +73,7 @@ impl Rollout {
         (&self.blocks[block], (sample - self.firsts[block]) as usize)
     }
 
-    /// Makes it one of `horizon` steps, which begins with the same observations and is otherwise empty.
+    /// Changes it to `horizon` steps. It then begins with the same observations and is otherwise empty.
     pub fn resize(&mut self, horizon: usize, spaces: &Spaces) {
         let sizes: Vec<usize> = self.blocks.iter().map(|block| block.envs).collect();
         let mut resized = Self::new(horizon, &sizes, spaces);

@@ -1,4 +1,4 @@
-//! What must be the same on all ranks of a training, and what one of them may be bound to.
+//! Checks that all ranks of a training are alike, and warns if a launcher binds one of them to a single core.
 
 use anyhow::{Result, ensure};
 

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 
 use super::Ranks;
 
-/// The shards of a training, those of them that this rank computes, and the exchange with the other ranks. All ranks make the same
+/// The shards of a training, the shards that this rank computes, and the exchange with the other ranks. All ranks make the same
 /// calls in the same order. Copies share the count of their traffic.
 #[derive(Clone)]
 pub struct Exchange {
@@ -43,7 +43,7 @@ impl Exchange {
         ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
         ensure!(
             ranks <= shards,
-            "{ranks} ranks, but the training has {shards} shards (run.shards), and a rank computes at least one of them"
+            "{ranks} ranks, but the training has only {shards} shards (run.shards), and each rank needs at least one"
         );
         assert!(shards.is_power_of_two(), "{shards} shards");
         Ok(Self { shards, ..self })
@@ -94,7 +94,7 @@ impl Exchange {
         self.ranks.as_ref().expect("there are several").abort()
     }
 
-    /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts are those of this
+    /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts belong to this
     /// rank, shard after shard, equally many for each.
     pub fn sum<P, T>(&self, parts: &[P], of: impl Fn(&[P]) -> T + Send + Sync, add: impl Fn(&mut T, T)) -> T
     where
@@ -122,7 +122,7 @@ impl Exchange {
         all.iter().map(|bytes| from_bytes(bytes)).collect()
     }
 
-    /// Returns the value of the first rank; the others pass `None`.
+    /// Returns the value of the first rank. The others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
         let Some(ranks) = &self.ranks else { return first.expect("this is the first rank") };
         from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
@@ -141,8 +141,8 @@ impl Exchange {
         }
     }
 
-    /// Returns the traffic since the last call, by name: the time spent, waiting for others included, s, and the bytes that this
-    /// rank has sent to others. Both are `NaN` for a single rank.
+    /// Returns the traffic since the last call, by name: the time spent (s, including the wait for others) and the bytes sent
+    /// by this rank. Both are `NaN` for a single rank.
     pub fn take_traffic(&self) -> [(&'static str, f64); 2] {
         let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));
         let known = |value: f64| if self.is_alone() { f64::NAN } else { value };

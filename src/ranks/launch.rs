@@ -10,7 +10,7 @@ use super::Exchange;
 use crate::os;
 use crate::schedule::panic_message;
 
-/// The time that the first rank has to save what it can and to tell of an error before another one does, and ends it.
+/// The time that the first rank has to save and to report an error, before another rank reports it and ends all.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What a launcher has said about this process.
@@ -22,7 +22,7 @@ struct Launched {
     size: usize,
 }
 
-/// The variables in which launchers tell size and rank: OpenMPI, MPICH and its relatives, Slurm.
+/// The variables in which launchers pass size and rank: OpenMPI, MPICH and its relatives, Slurm.
 const TOLD: [(&str, &str); 3] = [
     ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK"),
     ("PMI_SIZE", "PMI_RANK"),
@@ -40,7 +40,7 @@ pub fn launched_by_mpirun() -> bool {
     std::env::var_os(TOLD[0].0).is_some()
 }
 
-/// Returns whether this process is the one that says what all of those that were started together would say.
+/// Returns whether this process speaks for all processes that were started together.
 pub fn is_spokesman() -> bool {
     launched().is_none_or(|launched| launched.rank == 0)
 }
@@ -64,15 +64,15 @@ fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
     })
 }
 
-/// Joins the processes that the launcher has started together with this one, and returns what `work` does as one of them. If it
-/// fails on one of several, all end.
+/// Joins the processes that the launcher has started together with this one, and returns the result of `work`. If it fails on
+/// one of several, all end.
 ///
 /// # Errors
-/// Fails if there should be several, but this process cannot talk to the others; or as `work` does, if this process is alone.
+/// Fails if there should be several, but this process cannot talk to the others. If this process is alone, fails as `work` does.
 pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<ExitCode> {
     // When the second value is dropped, this process leaves the others, which waits for them.
     let (exchange, _membership) = &match join() {
-        // All ranks hit the same error; only rank 0 reports it.
+        // All ranks hit the same error, and only rank 0 reports it.
         Err(_) if !is_spokesman() => return Ok(ExitCode::FAILURE),
         joined => joined?,
     };
@@ -82,12 +82,12 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
     if !exchange.is_first() {
         os::speak_as(&format!("rank {}", exchange.rank()));
     }
-    // To leave the others means to wait for them, and they may be waiting for this one.
+    // Leaving the others means waiting for them, and they may be waiting for this one.
     let result = catch_unwind(AssertUnwindSafe(|| work(exchange)));
     let result = result.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
     result.or_else(|error| {
         if !exchange.is_first() {
-            // What all ranks meet at once, such as a loss that is not finite, is told by the first.
+            // An error that occurs on all ranks at once, such as a loss that is not finite, is reported by the first.
             std::thread::sleep(PATIENCE);
         }
         os::say(&format!("error: {error:#}"));
@@ -102,7 +102,7 @@ fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
     let exchange = Exchange::new(std::sync::Arc::new(ranks));
     if exchange.is_alone() {
         bail!(
-            "{size} processes were started, but each finds itself alone; under Slurm, start them with srun --mpi=pmix, or with the \
+            "{size} processes were started, but MPI did not connect them; under Slurm, start them with srun --mpi=pmix, or with the \
              mpirun of the MPI that this program was built with"
         );
     }

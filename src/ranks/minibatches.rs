@@ -17,7 +17,7 @@ const SMALLEST_GROUP: usize = 32;
 /// The samples of this rank that one gradient step learns from.
 #[derive(Clone, Debug)]
 pub struct Minibatch<'a> {
-    /// Groups whose gradients are added up as a binary tree; their number is a power of two.
+    /// Groups whose gradients are added up as a binary tree. Their number is a power of two.
     pub groups: Vec<&'a [u32]>,
     /// The number of samples of all ranks.
     pub count: usize,
@@ -73,8 +73,8 @@ impl Minibatches {
     }
 }
 
-/// Returns the number of groups that the `samples` samples of each shard are split into: a power of two, so that all groups can be
-/// added as a tree. It depends on nothing but `samples` and `shards`.
+/// Returns the number of groups that the `samples` samples of each shard are split into. It is a power of two, so that all groups
+/// can be added as a tree. It depends on nothing but `samples` and `shards`.
 fn groups_of_shard(samples: usize, shards: usize) -> usize {
     let mut groups = (GROUPS / shards).max(1);
     while groups > 1 && samples / groups < SMALLEST_GROUP {

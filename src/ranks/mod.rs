@@ -1,14 +1,14 @@
 //! The division of a training run among ranks, which does not affect what it computes.
 //!
-//! A rank is a process; how ranks talk to each other is behind one trait.
-//! The environments are dealt to shards; their number is a setting and a power of two. Everything that is computed from
-//! many samples is computed shard by shard and combined in the order of the shards, gradients as a binary tree. A rank
-//! computes consecutive shards, which form a subtree. So one, two or four ranks give the same bits.
+//! A rank is a process. One trait hides how ranks talk to each other. The environments are dealt to shards, whose
+//! number is a setting and a power of two. Everything that is computed from many samples is computed shard by shard and
+//! combined in the order of the shards, gradients as a binary tree. A rank computes consecutive shards, which form a
+//! subtree. So one, two or four ranks give the same bits.
 //!
 //! The rest of the program knows only [`Exchange`], which sums over all shards and gathers what the ranks have. In a gradient
-//! step the gradient is reduced and scattered: each rank adds up its slice, moves its slice of the parameters, and gathers the
-//! slices of all. Sums of losses, norms and statistics, the episodes that ended and the states of environments are gathered
-//! as bytes.
+//! step the gradient is reduced and scattered. Each rank adds up its slice, updates its slice of the parameters, and gathers
+//! the slices of all. Sums of losses, norms and statistics, the episodes that ended and the states of environments are
+//! gathered as bytes.
 
 mod alike;
 mod exchange;
@@ -52,7 +52,7 @@ pub trait Ranks: Send + Sync {
 }
 
 /// Writes the sum of `parts`, which have equal length and whose number is a power of two. They are added as a binary
-/// tree: the first and the second, the third and the fourth, and so on, then these sums likewise.
+/// tree: first and second, third and fourth, and so on, then these sums in the same way.
 pub fn tree_sum(out: &mut [f32], parts: &[&[f32]]) {
     match parts {
         [part] => out.copy_from_slice(part),
@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn parts_are_added_as_a_tree() {
-        // A one is lost when added to 1e8; only ones that are added to each other first count.
+        // A one is lost when added to 1e8. Only ones that are added to each other first count.
         let parts = [1e8f32, 1.0, 1.0, 1.0, -1e8, 3.0, 1.0, 2.0].map(|x| [x, 1.0]);
         let parts: Vec<&[f32]> = parts.iter().map(|part| &part[..]).collect();
         let mut out = [0.0; 2];

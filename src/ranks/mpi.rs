@@ -1,6 +1,6 @@
 //! Ranks that are processes on one or more machines, by MPI.
 //!
-//! Only data is moved: sums are computed here, in a fixed order, since MPI may add in any.
+//! Only data is moved: sums are computed here, in a fixed order, since MPI may add in any order.
 
 use std::ops::Range;
 

@@ -8,13 +8,13 @@ use rayon::prelude::*;
 use super::exchange::{Exchange, part};
 use super::tree_sum;
 
-/// The slices of an array that the ranks work on: whole chunks, so that what is computed chunk by chunk does not depend on
-/// the number of ranks.
+/// The slices of an array that the ranks work on. They are whole chunks, so results computed chunk by chunk do not depend
+/// on the number of ranks.
 pub struct Slices {
     exchange: Exchange,
     /// The chunks of all ranks.
     chunks: Vec<Range<usize>>,
-    /// The numbers of those of this rank.
+    /// The numbers of this rank's chunks.
     dealt: Range<usize>,
     /// For each rank: its values.
     all: Vec<Range<usize>>,
@@ -44,8 +44,9 @@ impl Slices {
         self.own.clone()
     }
 
-    /// Writes to `numbers` what all ranks add up: `sum` adds up a chunk over the shards of this rank, and the sums of the ranks are added
-    /// as a tree. Afterwards `numbers` hold this rank's slice. Returns what `of` makes of each chunk, in the order of the chunks.
+    /// Writes to `numbers` the sum over all ranks. `sum` adds up a chunk over the shards of this rank, and the sums of the ranks
+    /// are added as a tree. Afterwards `numbers` hold this rank's slice. Returns what `of` computes from each chunk, in the order
+    /// of the chunks.
     pub fn reduce_scatter(
         &self,
         numbers: &mut [f32],

@@ -1,4 +1,5 @@
-//! The conditions of an episode beside the task itself: the physics that it has drawn, forces and help on the object, delay and noise.
+//! The conditions of an episode besides the task itself: the physics that it has drawn, forces and assistance on the object, delay
+//! and noise.
 
 use std::sync::Arc;
 
@@ -9,14 +10,14 @@ use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
 use crate::sim::{Scene, Simulation};
 
-/// The conditions of the current episode of one hand.
+/// The conditions of the current episode of one environment.
 pub(super) struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
     draw: Option<EpisodePhysics>,
-    /// The part of the largest assistance that the episode gets; nothing in half of them.
+    /// The fraction of the largest assistance that the episode gets. It is 0 in half of the episodes.
     assisted: f64,
-    /// Whether the last torque was another than none.
+    /// Whether the last torque was not zero.
     twisted: bool,
     /// What is added to the values of every observation of the episode, in the order of the values.
     bias: Vec<(usize, f32)>,
@@ -32,8 +33,8 @@ impl Conditions {
         self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
     }
 
-    /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`, and gives the simulation its
-    /// physics; the state must be reset after it.
+    /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`. Gives the simulation its
+    /// physics, after which the state must be reset.
     pub(super) fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
         self.draw =
             self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
@@ -73,8 +74,8 @@ impl Conditions {
         Some(force)
     }
 
-    /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. For each rad an
-    /// episode that gets all of the assistance turns the nominal object with an angular acceleration of `most`.
+    /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. With full
+    /// assistance, the nominal object gets an angular acceleration of `most` for each rad.
     pub(super) fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let factor = self.assisted * most * task.hand.cube.inertia;
         if factor == 0.0 && !self.twisted {

@@ -19,10 +19,10 @@ pub struct Diverged {
 }
 
 impl Diverged {
-    /// Returns one object: `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step, `ctrl` the controls
-    /// of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes, `randomization`
-    /// is what this one has drawn (null if nothing), on top of the settings, and `pushes` the force on the cube in each step. In an
-    /// episode that is assisted, `torques` are those on the cube in each step.
+    /// Returns one object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
+    /// controls of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes,
+    /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the cube
+    /// in each step. In an episode with assistance, `torques` is the torque on the cube in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
         let actions: Vec<&[f32]> = tail.actions.chunks_exact(tail.width).collect();
@@ -71,9 +71,9 @@ pub struct Tail {
     pub actions: Vec<f32>,
     /// The number of controls, and of values in an action.
     pub width: usize,
-    /// The random force on the cube in each step, N; empty where there is none.
+    /// The random force on the cube in each step, N. Empty where there is none.
     pub pushes: Vec<[f64; 3]>,
-    /// The torque on the cube in each step, N m; empty where there is none.
+    /// The torque on the cube in each step, N m. Empty where there is none.
     pub torques: Vec<[f64; 3]>,
 }
 
@@ -117,7 +117,7 @@ impl Recorder {
         tail.torques.extend(torque);
     }
 
-    /// Returns the recorded steps; `None` before the first step.
+    /// Returns the recorded steps, or `None` before the first step.
     pub(super) fn tail(&self) -> Option<Tail> {
         let mut parts = [&self.before, &self.now].into_iter().flatten().cloned();
         let mut tail = parts.next()?;

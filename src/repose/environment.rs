@@ -1,6 +1,6 @@
 //! The environment: a Shadow Hand turns the cube in its palm to one goal orientation after another.
 //!
-//! The order within a step is fixed: action, physics, errors and reward against the current goal, hold counter, ends, new
+//! Each step has a fixed order: action, physics, errors and reward against the current goal, hold counter, ends, new
 //! goal, observation with the next goal.
 
 use std::sync::Arc;
@@ -29,7 +29,7 @@ pub struct Repose {
     sim: Simulation,
     rng: Rng,
     goal: Quat,
-    /// What the rewards of the last step depended on; its action is the previous one as observed.
+    /// What the rewards of the last step depended on. Observations show its action as the previous one.
     now: Step,
     servos: Servos,
     conditions: Conditions,
@@ -37,7 +37,7 @@ pub struct Repose {
     age: u32,
     held: u32,
     episode: EpisodeStats,
-    /// Since they were last taken.
+    /// The sums since they were last taken.
     sums: StepSums,
     last: StepDetails,
     recorder: Recorder,
@@ -64,7 +64,7 @@ pub struct StepDetails {
 }
 
 impl Repose {
-    /// Creates an environment of `task`; it must be reset before it is stepped.
+    /// Creates an environment of `task`. It must be reset before it is stepped.
     pub fn new(task: &Arc<Task>) -> Self {
         Self::randomized(task, None)
     }
@@ -122,7 +122,7 @@ impl Repose {
         &self.sim
     }
 
-    /// Returns the physics state for modification; call [`Simulation::refresh`] afterwards.
+    /// Returns the physics state for modification. Call [`Simulation::refresh`] afterwards.
     pub fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.sim
     }
@@ -159,7 +159,7 @@ impl Repose {
         Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
     }
 
-    /// Takes down what the rewards of a step depend on, after its physics.
+    /// Records what the rewards of a step depend on, after its physics.
     fn measure(&mut self, rot_dist_before: f64) {
         let (cube, cube_velocity) = (self.cube(), self.cube_velocity());
         let (task, now, qpos, qvel) = (&self.task, &mut self.now, self.sim.qpos(), self.sim.qvel());
@@ -328,7 +328,7 @@ impl Env for Repose {
         self.recorder.record(&self.sim, action, push, torque);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
         if diverged {
-            // MuJoCo may have cleared the controls; restore what was sent for anyone who reads them.
+            // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
             self.send();
         }
 
@@ -364,7 +364,7 @@ impl Env for Repose {
             let goal_ends = if reached { self.lesson.goals_end } else { self.gives_up() };
             time_is_up.then_some(End::Truncated).or(goal_ends.then_some(End::Redirected))
         };
-        // When the goal is cut off, its final observation must show the old goal; `redirect` replaces it afterwards.
+        // When the goal is cut off, its final observation must show the old goal. `redirect` replaces it afterwards.
         if reached && !self.lesson.goals_end {
             self.replace_goal();
         }
@@ -405,7 +405,7 @@ impl Resumable for Repose {
         ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
         (self.age, self.held) = (age as u32, held as u32);
         let [randomized] = state.counters()?;
-        ensure!(randomized <= 1, "an episode is randomised or not, but the state says {randomized}");
+        ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
         let actuators = self.task.hand.actuators.len();
         let fixed = 4 + 2 * actuators + EpisodeStats::NUMBERS;

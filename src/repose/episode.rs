@@ -18,7 +18,7 @@ pub struct EpisodeStats {
     pub goals: u32,
     /// Steps within the tolerance.
     pub in_tolerance: u32,
-    /// Sum of the rotation error over the steps, rad; a diverged step adds nothing.
+    /// Sum of the rotation error over the steps, rad. A diverged step adds nothing.
     pub rot_dist_sum: f64,
     /// Sums of the reward terms.
     pub reward: TaskReward,
@@ -26,9 +26,9 @@ pub struct EpisodeStats {
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// Whether it was randomised. Not written by `save`; the environment stores it beside the episode.
+    /// Whether it was randomised. Not written by `save`, because the environment stores it beside the episode.
     pub randomized: bool,
-    /// Sum of the rotation towards the goal, rad; negative away from it. Only known of an episode that was played for a score.
+    /// Sum of the rotation towards the goal, rad (negative away from it). Only known for an episode that was played for a score.
     pub turned: f64,
 }
 
@@ -66,7 +66,7 @@ pub struct StepSums {
     pub task: TaskReward,
     /// Sums of the terms that training adds.
     pub training: TrainingReward,
-    /// Sum of the rotation towards the goal, rad; negative away from it.
+    /// Sum of the rotation towards the goal, rad (negative away from it).
     pub turned: f64,
     /// Steps in which the physics diverged.
     pub diverged: u64,
@@ -96,7 +96,7 @@ impl AddAssign for StepSums {
     }
 }
 
-/// Means over finished episodes; `NaN` where there is nothing to average.
+/// Means over finished episodes, or `NaN` where there is nothing to average.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Score {
     /// The number of episodes.
@@ -133,8 +133,7 @@ pub struct Score {
     pub diverged: usize,
 }
 
-/// A figure of a score: its name in columns and tags, what it is in a few words (with its unit in brackets), what it is in a
-/// sentence, and its value.
+/// A figure of a score: name in columns and tags, title (with its unit in brackets), description in a sentence, and value.
 #[derive(Clone, Copy)]
 pub struct Figure(pub &'static str, pub &'static str, pub &'static str, fn(&Score) -> f64);
 
@@ -163,7 +162,7 @@ pub const OF_EVALUATIONS: [Figure; 4] = [
 const HEADLINE: [&str; 4] = ["goals", "drop_rate", "rot_dist", "return"];
 
 impl Score {
-    /// Returns a warning if many of the steps diverged; each such step ended an episode.
+    /// Returns a warning if many of the steps diverged. Each such step ended an episode.
     pub fn divergence(&self) -> Option<String> {
         divergence(self.diverged as u64, self.env_steps)
     }

@@ -29,7 +29,7 @@ pub struct Hand {
     pub joints: Vec<Hinge>,
     /// Actuators in action order.
     pub actuators: Vec<Actuator>,
-    /// The joints that each actuator drives, and the coefficients of their sum; none for a tendon along a path in space.
+    /// The joints that each actuator drives, and the coefficients of their sum. There are none for a tendon along a path in space.
     pub driven: Vec<Vec<(String, f64)>>,
     /// Fingertips in observation order.
     pub fingertips: Vec<Frame>,
@@ -48,8 +48,8 @@ pub struct Hand {
 }
 
 impl Hand {
-    /// Finds the parts of the hand in `scene`: those that are `named`, and the others in the order of the Shadow Hand if they
-    /// have its names with one prefix, else by the structure of the scene.
+    /// Finds the parts of the hand in `scene` that are not `named`. They have the order of the Shadow Hand if they have
+    /// its names with one prefix. Otherwise they are found by the structure of the scene.
     ///
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
@@ -72,7 +72,7 @@ impl Hand {
     /// Binds these parts of `scene`, all of which are named but for the start.
     ///
     /// # Errors
-    /// Fails with one message on all names that are missing, and on all that belong to something else.
+    /// Fails with one message on all names that are missing, and on all that belong to another kind of object.
     pub fn bind(scene: &Scene, parts: Parts) -> Result<Self> {
         let mut problems = Vec::new();
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
@@ -110,7 +110,7 @@ impl Hand {
         *self.start[self.cube.qpos..].first_chunk().expect("a free joint")
     }
 
-    /// Returns the prefix of its names if it has those of the Shadow Hand.
+    /// Returns the prefix of its names if it has the names of the Shadow Hand.
     pub fn side(&self) -> Option<&str> {
         let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
         let names = self.parts.joints.iter().map(|name| name.strip_prefix(prefix));
@@ -153,6 +153,6 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 /// Finds each of these names, and lists what is wrong.
 fn each<T>(names: &[String], find: impl Fn(&str) -> Result<T>, problems: &mut Vec<String>) -> Vec<T> {
     let twice = names.iter().enumerate().filter(|(i, name)| names[..*i].contains(name));
-    problems.extend(twice.map(|(_, name)| format!("is asked for `{name}` twice")));
+    problems.extend(twice.map(|(_, name)| format!("`{name}` is named twice")));
     names.iter().filter_map(|name| find(name).map_err(|error| problems.push(error.to_string())).ok()).collect()
 }

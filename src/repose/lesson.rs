@@ -1,4 +1,4 @@
-//! The lesson: what training changes about the task and adds to its reward at a given step of a run.
+//! The lesson, a stage of the curriculum: what training changes about the task and adds to its reward at a given step of a run.
 
 use super::reward::{Description, ramped, training_reward, training_weights};
 use super::{Step, TrainingReward};
@@ -70,7 +70,7 @@ impl Lesson {
         ];
         all.extend(ramped(weights));
         let smoothing = Description("act_moving_average", "The weight of the new target in the smoothed one.");
-        all.push((Description("randomized", "Probability that an episode that begins is randomised."), randomized));
+        all.push((Description("randomized", "Probability that a new episode is randomised."), randomized));
         all.push((smoothing, act_moving_average));
         all.push((
             Description("assist", "The largest angular acceleration towards the goal for each rad of error, 1/s²."),

@@ -1,4 +1,5 @@
-//! The mirror image of a hand: what it observes as the hand on the other side would, mirrored in the plane y = 0 of the world.
+//! The mirror image of a hand: turns what it observes into what the hand on the other side would observe. The mirror is the
+//! plane y = 0 of the world.
 
 use anyhow::{Result, ensure};
 
@@ -6,15 +7,17 @@ use super::observation::{Layout, TIP_QUAT};
 use super::record::Record;
 use crate::quat::{self, Quat};
 
-/// The largest difference of mirrored fingertips from those of the policy's hand: m, and of the components of quaternions.
+/// The largest allowed difference between mirrored fingertips and the fingertips of the policy's hand: m, and components
+/// of quaternions.
 const TOLERANCE: f64 = 1e-4;
 
-/// Turns observations of a hand into those of its mirror image.
+/// Turns observations of a hand into observations of its mirror image.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Mirror {
     /// The values that change their sign, by index.
     signs: Vec<usize>,
-    /// For each fingertip the index of its orientation, and the rotation between the mirrored frame and that of the other hand.
+    /// For each fingertip the index of its orientation, and the rotation between the mirrored frame and the frame of the other
+    /// hand.
     tips: Vec<(usize, Quat)>,
 }
 
@@ -27,9 +30,10 @@ impl Mirror {
     /// Returns the mirror from the hand of `here` to the hand of `policy`.
     ///
     /// # Errors
-    /// Fails if the fingertips of one are not where those of the other are in the mirror, in any of the recorded poses.
+    /// Fails if, in any recorded pose, the fingertips of one hand are not where the mirrored fingertips of the other are.
     pub(super) fn new(here: &Record, policy: &Record, layout: &Layout) -> Result<Self> {
-        // Returns how far a fingertip is from that of the other hand in a recorded pose, and the rotation between the two.
+        // Returns how far a fingertip is from its counterpart on the other hand in a recorded pose, and the rotation
+        // between the two.
         let compare = |at: usize| {
             let ([x, y, z, own @ ..], [a, b, c, other @ ..]) = (here.tips[at], policy.tips[at]);
             let apart = [x - a, -y - b, z - c].into_iter().map(f64::abs).fold(0.0, f64::max);
@@ -43,7 +47,7 @@ impl Mirror {
                 let turned = between.iter().zip(turn).map(|(a, b)| a * b).sum::<f64>();
                 ensure!(
                     apart <= TOLERANCE && turned >= 1.0 - TOLERANCE,
-                    "the hand is not the mirror image of the policy's in the plane y = 0: the fingertip `{}` is {:.1} mm off",
+                    "the hand is not the mirror image of the policy's hand (plane y = 0): the fingertip `{}` is {:.1} mm off",
                     here.fingertips[i],
                     1e3 * apart
                 );

@@ -12,9 +12,9 @@ pub struct Group {
     pub start: usize,
     /// The number of values.
     pub length: usize,
-    /// The unit; 1 for dimensionless values.
+    /// The unit, or 1 for dimensionless values.
     pub unit: &'static str,
-    /// The values that change their sign in the mirror, by index; of fingertips, for each one.
+    /// The values that change their sign in the mirror, by index. For fingertips, the indices apply to each one.
     mirrored: &'static [usize],
 }
 
@@ -33,8 +33,8 @@ pub(super) const TIPS: usize = 9;
 /// The layout of the observations of a hand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
-    /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z; all but those of the
-    /// fingertips have w ≥ 0.
+    /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z. Except for the
+    /// fingertips, they have w ≥ 0.
     pub groups: [Group; 11],
     /// The number of values in an observation.
     pub size: usize,

@@ -1,5 +1,5 @@
-//! The physical quantities that may differ from those of the scene, as one table: what `[env]` sets for the whole task, what a
-//! randomised episode draws, and what traces and dumps report.
+//! The physical quantities that may differ from the scene, as one table. `[env]` sets them for the whole task, randomised
+//! episodes draw them, and traces and dumps report them.
 
 use std::ops::Index;
 
@@ -19,15 +19,15 @@ pub struct Quantity {
     pub name: &'static str,
     /// Its name in `[env]`, in traces and in dumps.
     pub setting: &'static str,
-    /// Its unit; 1 for a factor.
+    /// Its unit, or 1 for a factor.
     pub unit: &'static str,
     /// The value that changes nothing.
     pub neutral: f64,
     /// The value for the whole task.
     task: fn(&EnvConfig) -> Vec<f64>,
     law: Law,
-    /// What its values change in a scene: one value, one for each axis, for each actuator in action order, or for each joint in
-    /// observation order. A single value is valid for all actuators or joints.
+    /// What its values change in a scene. There is one value, or one for each axis, each actuator in action order, or each
+    /// joint in observation order. A single value is valid for all actuators or joints.
     change: fn(&Hand, &[f64]) -> Vec<Change>,
 }
 
@@ -131,8 +131,8 @@ impl Quantity {
             }
             Law::Within(limit) => axes.map(|_| rng::uniform(rng, -limit(config), limit(config))).collect(),
             Law::Normal(std) => axes.map(|_| normal(rng, std(config))).collect(),
-            // With probability ½ all joints have the same factor. Independent draws alone would leave their mean near the middle,
-            // and a policy that has met only such hands fails on one whose joints are all damped little.
+            // With probability ½ all joints have the same factor. Independent draws alone would leave their mean near the middle.
+            // A policy that has seen only such hands fails on one whose joints all have little damping.
             Law::Each(count, range) => {
                 let [low, high] = range(config);
                 let together = rng::uniform(rng, 0.0, 1.0) < 0.5;

@@ -18,10 +18,10 @@ use crate::sim::{Scene, Simulation, Variants, origin};
 /// The random physics, noise and delays of a training.
 pub struct Randomization {
     config: RandomizationConfig,
-    /// The scene of the episodes that are not randomised. Its physics are those of the task.
+    /// The scene of the episodes that are not randomised. It has the physics of the task.
     nominal: Scene,
     variants: Variants,
-    /// The factor on the lengths of the cube in each variant; the last one is the nominal scene.
+    /// The factor on the lengths of the cube in each variant. The last one is the nominal scene.
     sizes: Vec<f64>,
     noise: NoiseStd,
     bias: NoiseStd,
@@ -41,14 +41,14 @@ pub struct EpisodePhysics {
 }
 
 impl EpisodePhysics {
-    /// Returns the control steps between an action and its effect, in addition to those of the task.
+    /// Returns the control steps between an action and its effect, in addition to the delay of the task.
     pub fn delay(&self) -> u32 {
         self.physics["delay"][0] as u32
     }
 }
 
 impl Randomization {
-    /// Prepares the randomised episodes of a training; `None` if it has none.
+    /// Prepares the randomised episodes of a training, or `None` if it has none.
     ///
     /// # Errors
     /// Fails if the scene cannot be varied in this way, or if a setting names an unknown group of the observation.
@@ -74,14 +74,14 @@ impl Randomization {
         &self.nominal
     }
 
-    /// Returns the most control steps between an action and its effect, in addition to those of the task.
+    /// Returns the most control steps between an action and its effect, in addition to the delay of the task.
     pub fn most_delay(&self) -> u32 {
         self.config.delay[1]
     }
 
-    /// Draws the physics of the episode that owns `rng`; the generator's position does not matter. Returns `None` if the episode is
-    /// not randomised, which happens with probability 1 - `probability`. All numbers are drawn in any case, so that one setting does not
-    /// change what is drawn for another.
+    /// Draws the physics of the episode that owns `rng`. The generator's position does not matter. Returns `None` if the episode is
+    /// not randomised, which happens with probability 1 - `probability`. All numbers are drawn in any case, so that one setting
+    /// does not change what is drawn for another.
     pub fn draw(&self, rng: &Rng, probability: f64, hand: &Hand) -> Option<EpisodePhysics> {
         let shared = &mut rng::beside(rng, "randomization");
         let randomized = rng::uniform(shared, 0.0, 1.0) < probability;
@@ -103,7 +103,7 @@ impl Randomization {
         randomized.then_some(EpisodePhysics { physics, has_noise, has_bias, has_pushes })
     }
 
-    /// Gives the simulation the physics of a draw; its state must be reset after it.
+    /// Gives the simulation the physics of a draw. Its state must be reset after it.
     pub fn vary(&self, simulation: &mut Simulation, draw: &EpisodePhysics, task: &Task) {
         self.variants.vary(simulation, self.variant(draw), &draw.physics.changes(&task.hand));
     }
@@ -130,7 +130,7 @@ impl Randomization {
         if draw.has_bias { drawn } else { Vec::new() }
     }
 
-    /// Returns the force on the cube, N, in a step (from 0) of the episode of `rng`; `None` if it has none.
+    /// Returns the force on the cube, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.
     pub(super) fn push(&self, draw: &EpisodePhysics, rng: &Rng, step: u32) -> Option<[f64; 3]> {
         let std = self.config.push;
         let rng = &mut rng::beside_at(rng, "push", step / self.config.push_steps);

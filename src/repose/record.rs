@@ -1,4 +1,4 @@
-//! What a policy's file says of the hand and the object that it was trained with.
+//! What a policy's file says about the hand and the object that it was trained with.
 
 use anyhow::{Result, anyhow, bail, ensure};
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,7 @@ use crate::quat::CUBE_ROTATIONS;
 use crate::sim::{Frame, Parts, Pose, Scene, Simulation};
 use crate::spaces::Spaces;
 
-/// The most bytes of a record that are read; that of the Shadow Hand has three thousand.
+/// The most bytes of a record that are read. The record of the Shadow Hand has three thousand.
 const LONGEST: usize = 1 << 16;
 
 /// The fractions of the ranges of joints, in turn, at which the poses of fingertips are recorded.
@@ -32,7 +32,7 @@ pub struct Record {
     pub fingertips: Vec<String>,
     /// The poses of the fingertips in two poses of the hand, in the world frame: position in m, orientation w,x,y,z.
     pub tips: Vec<[f64; 7]>,
-    /// The rotations of a cube, by number, that a policy takes for the same.
+    /// The rotations of a cube, by number, that a policy treats as the same.
     pub symmetry: Vec<usize>,
 }
 
@@ -61,7 +61,8 @@ impl Record {
         Ok(record)
     }
 
-    /// Returns the record of a policy with this setting: by default it takes for the same what the object maps onto itself.
+    /// Returns the record of a policy with this setting: by default it treats as the same all rotations that map the object
+    /// onto itself.
     pub fn with(mut self, symmetry: Symmetry) -> Self {
         match symmetry {
             Symmetry::None => self.symmetry = vec![0],
@@ -84,8 +85,8 @@ impl Record {
         Layout::new(self.joints.len(), self.fingertips.len(), self.actuators.len()).spaces(&self.symmetry)
     }
 
-    /// Checks that a policy for this hand can act with the hand `there` of a scene, perhaps in the mirror, and returns a warning if
-    /// an action means another angle there.
+    /// Checks that a policy for this hand can act with the hand `there` of a scene, perhaps in the mirror. Returns a warning if an
+    /// action means another angle there.
     ///
     /// # Errors
     /// Fails with the names that differ.
@@ -111,7 +112,7 @@ impl Record {
             }
         }
         if !differ.is_empty() {
-            let hint = if is_other_hand { "; --mirror plays the policy of one hand with the other" } else { "" };
+            let hint = if is_other_hand { "; --mirror plays the policy of the opposite hand" } else { "" };
             bail!("the policy is for another hand: {scene} has {}{hint}", shortened(&differ.join(", ")));
         }
         let apart = |i: usize| {
@@ -126,7 +127,7 @@ impl Record {
     }
 }
 
-/// Returns whether a name in a scene is that of a policy, perhaps with a prefix more.
+/// Returns whether a name in a scene is the name in a policy, perhaps with an additional prefix.
 fn is_named(found: &str, own: &str) -> bool {
     found.strip_suffix(own).is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(['/', '_', '-', '.', ':']))
 }

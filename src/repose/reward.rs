@@ -1,4 +1,4 @@
-//! The rewards of a control step, as two tables: the terms of the task, which is scored, and those that only training adds.
+//! The rewards of a control step, as two tables: the terms of the task, which is scored, and the terms that only training adds.
 //!
 //! A term is one row. Its column in `metrics.csv`, its tag, its sums and its description follow from that row.
 
@@ -19,13 +19,13 @@ pub struct Step {
     pub rot_dist: f64,
     /// Distance of the cube from the goal position.
     pub goal_dist: f64,
-    /// Whether the rotation error is within the tolerance of the lesson, which training may set apart from the task's.
+    /// Whether the rotation error is within the tolerance of the lesson, which may differ from the task's in training.
     pub within: bool,
     /// Whether the cube was dropped.
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
     pub action: Vec<f32>,
-    /// The action of the step before, clipped; zeros after a reset.
+    /// The action of the step before, clipped. Zeros after a reset.
     pub previous_action: Vec<f32>,
     /// The pose of the cube.
     pub cube: Pose,
@@ -37,7 +37,7 @@ pub struct Step {
     pub joint_vel: Vec<f64>,
 }
 
-/// What a reader is told about a quantity: its name in columns, tags and JSON, and what it is, in a sentence.
+/// The description of a quantity for a reader: its name in columns, tags and JSON, and what it is, in a sentence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Description(pub &'static str, pub &'static str);
 
@@ -54,7 +54,7 @@ enum Weight {
     Ramp(Description, fn(&TrainingConfig) -> Ramp),
 }
 
-/// Rotation error, rad, below which coming nearer is hardly paid more than in proportion.
+/// Rotation error, rad, below which coming nearer is rewarded hardly more than in proportion.
 const NEAR: f64 = 0.1;
 
 #[rustfmt::skip]
@@ -71,8 +71,8 @@ const TASK: [TaskTerm; 5] = [
         |env, step| if step.goal_dist >= env.fall_dist { env.fall_penalty } else { 0.0 }),
 ];
 
-// What is paid for turning and approaching is a difference of potentials, so no way of going back and forth earns anything (Ng,
-// Harada and Russell, "Policy invariance under reward transformations", 1999).
+// The rewards for turning and approaching are differences of potentials, so going back and forth earns nothing (Ng, Harada and
+// Russell, "Policy invariance under reward transformations", 1999).
 #[rustfmt::skip]
 const TRAINING: [TrainingTerm; 4] = [
     TrainingTerm(Description("progress", "The training reward for turning towards the goal."),
@@ -100,7 +100,7 @@ pub struct Terms<const LIST: usize, const N: usize>([f64; N]);
 /// The task's reward by term.
 pub type TaskReward = Terms<0, { TASK.len() }>;
 
-/// The reward that training adds, by term; or the weights of these terms.
+/// The reward that training adds, by term, or the weights of these terms.
 pub type TrainingReward = Terms<1, { TRAINING.len() }>;
 
 impl<const LIST: usize, const N: usize> Terms<LIST, N> {

@@ -13,7 +13,7 @@ use crate::rng::Rng;
 const MEASURED: [&str; 7] =
     ["joint_pos", "joint_vel", "cube_pos", "cube_quat", "cube_linvel", "cube_angvel", "fingertips"];
 
-/// The standard deviation of what is added to each value of an observation: those that are not 0, by index.
+/// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct NoiseStd(Vec<(usize, f32)>);
 
@@ -27,7 +27,7 @@ impl NoiseStd {
             if !MEASURED.contains(&name.as_str()) {
                 let known = layout.groups.iter().any(|group| group.name == name);
                 let what = if known { "is not measured" } else { "is not a group of the observation" };
-                bail!("`{}` {what}; those that can have noise are {}", shortened(name), MEASURED.join(", "));
+                bail!("`{}` {what}; these groups can have noise: {}", shortened(name), MEASURED.join(", "));
             }
         }
         let of_group = |Group { name, start, length, .. }: Group| {
@@ -48,7 +48,7 @@ impl NoiseStd {
     }
 }
 
-/// Adds offsets to others; both are in the order of the values of an observation.
+/// Adds offsets to others. Both are in the order of the values of an observation.
 pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
     for (i, added) in more {
         match bias.binary_search_by_key(&i, |&(i, _)| i) {
@@ -58,8 +58,8 @@ pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (
     }
 }
 
-/// Adds the offset of an episode. On an orientation q it is a small rotation that stays the same however the body turns: q ⊗ (1, v),
-/// where v are the last three of its four numbers.
+/// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
+/// numbers. It stays the same however the body turns.
 pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
     let orientations = || std::iter::once(layout.start(CUBE_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
     let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
@@ -72,8 +72,8 @@ pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &La
     }
 }
 
-/// Makes an observation consistent after something was added to its values: quaternions have length 1 and their usual sign, and
-/// the orientation relative to the goal follows from that of the cube.
+/// Makes an observation consistent after something was added to its values. Quaternions get length 1 and their usual sign. The
+/// orientation relative to the goal follows from the orientation of the cube.
 pub(super) fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));

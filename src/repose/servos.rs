@@ -29,8 +29,8 @@ impl Servos {
         self.due.copy_from_slice(&self.targets);
     }
 
-    /// Turns an action, clipped to [-1, 1], into targets, of which those that are due take effect. `alpha` is the weight of an
-    /// action in the smoothed targets.
+    /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect. `alpha` is the weight of an action
+    /// in the smoothed targets.
     pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], alpha: f64) {
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
@@ -60,8 +60,8 @@ impl Servos {
         oldest.chain(self.under_way.iter().copied())
     }
 
-    /// Resumes with these last targets and the newest `delay` sets of those that [`Self::under_way`] returned. If there are fewer,
-    /// because a fork has a longer delay than its parent, the oldest one is repeated.
+    /// Resumes with these last targets and the newest `delay` sets that [`Self::under_way`] returned. If there are fewer, because
+    /// a fork has a longer delay than its parent, the oldest one is repeated.
     pub(super) fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
         let oldest = if under_way.is_empty() { last } else { &under_way[..last.len()] };
         self.reset(last.iter().copied(), 0);

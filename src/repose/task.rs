@@ -28,9 +28,9 @@ pub struct Task {
     pub(super) noise: NoiseStd,
     /// The standard deviation of the offset of an observation that lasts an episode.
     pub(super) bias: NoiseStd,
-    /// The rotations of a cube, by number, that the policy takes for the same; by default those that the object has.
+    /// The rotations of a cube, by number, that the policy treats as the same. By default, these are the symmetries of the object.
     pub(super) symmetry: Vec<usize>,
-    /// What turns observations into those of the policy's hand, if that is on the other side.
+    /// What turns observations into observations of the policy's hand, if that is on the other side.
     pub(super) mirror: Option<Mirror>,
     /// Where the policy does not fit well.
     warnings: Vec<String>,
@@ -117,7 +117,8 @@ impl Task {
         &self.scene
     }
 
-    /// Tells what of a user's scene the settings replace, and that the goal and the start of its cube are those of the scene.
+    /// Returns notes on a user's scene: what the settings replace in it, and whether the goal and the start of its cube come
+    /// from it.
     pub fn notes(&self) -> Vec<String> {
         let Some(file) = self.config.model_file() else { return Vec::new() };
         let (scene, place, own) = (file.display(), self.config.goal_position.value, self.hand.place());
@@ -128,7 +129,7 @@ impl Task {
         }
         let mut unused: Vec<String> = self.scene.keyframes().iter().map(|key| format!("`{key}`")).collect();
         let used = Vec::from_iter(self.hand.keyframe.map(|keyframe| unused.remove(keyframe)));
-        for (keys, what) in [(used, "episodes start in the keyframe"), (unused, "not used are the keyframes")] {
+        for (keys, what) in [(used, "episodes start in the keyframe"), (unused, "no episode uses the keyframes")] {
             if !keys.is_empty() {
                 notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
             }
@@ -142,7 +143,7 @@ impl Task {
         let round = self.scene.round_axes(self.hand.cube.body);
         if !round.is_empty() {
             notes.push(format!(
-                "no turn of `{object}` about its axes {round} can be seen or felt, but goals differ by such turns, and scores count them"
+                "turns of `{object}` about its axes {round} cannot be seen or felt, but goals include such turns, and scores count them"
             ));
         }
         notes.push(match place == own {
@@ -182,7 +183,7 @@ impl Task {
         let mut warnings = Vec::from_iter(policy.expect_fits(&here, self.config.mirror, &place)?);
         if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
             warnings.push(format!(
-                "the policy takes {} orientations of an object for the same, but `{}` of {place} has only {} that are alike",
+                "the policy treats {} orientations of an object as alike, but `{}` of {place} has only {} that are alike",
                 policy.symmetry.len(),
                 self.hand.parts.object,
                 here.symmetry.len()
@@ -223,8 +224,8 @@ impl Task {
         self.hand.layout.spaces(&self.symmetry)
     }
 
-    /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's), and with a centre
-    /// of mass that can be shifted.
+    /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's). With `shifts`,
+    /// its centre of mass can be shifted.
     ///
     /// # Errors
     /// Fails like [`Task::new`].

@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 
 use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
 
-/// The folder of the checkpoints in that of a run.
+/// The folder of the checkpoints in the folder of a run.
 pub(super) const CHECKPOINTS: &str = "checkpoints";
 
 /// The folder `checkpoints` of a run.
@@ -45,7 +45,7 @@ impl Checkpoints {
     /// Writes the checkpoint of an iteration, makes it the latest, and then removes all but the newest `keep`.
     ///
     /// # Errors
-    /// Fails if the checkpoint cannot be written; the earlier ones are kept then.
+    /// Fails if the checkpoint cannot be written. The earlier ones are then kept.
     pub fn write(&self, iteration: u64, bytes: &[u8], keep: usize) -> Result<()> {
         self.create_folder()?;
         let path = self.path_of(iteration);
@@ -119,7 +119,7 @@ impl Checkpoints {
     }
 }
 
-/// Checks that what is about to be written into is no link: a run folder may have been changed since the training began.
+/// Checks that a folder that is about to be written into is no link: a run folder may have been changed since the training began.
 ///
 /// # Errors
 /// Fails if it is.

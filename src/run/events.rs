@@ -41,8 +41,8 @@ impl EventFile {
         written.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
     }
 
-    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names,
-    /// and discards values from earlier files at `first_step` and later.
+    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names.
+    /// It discards values from earlier files at `first_step` and later.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
@@ -104,7 +104,7 @@ impl EventFile {
     }
 }
 
-/// Cuts off the events after `last_step`, and those that a crash left incomplete, in every event file of `folder`, so that no
+/// Cuts off the events after `last_step`, and events that a crash left incomplete, in every event file of `folder`. So no
 /// reader finds a step twice.
 ///
 /// # Errors

@@ -196,8 +196,8 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Returns the files of the run: those with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`. Other files
-    /// in the folder are left out.
+    /// Returns the files of the run: files with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`.
+    /// Other files in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
         let inner = [DIVERGED, HPARAMS].map(|name| self.path.join(name));
@@ -221,8 +221,8 @@ impl RunFolder {
         is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
     }
 
-    /// Writes or removes the file that says to scripts that the training is not to be continued: all steps are made, or a file
-    /// `stop` has ended it. If that fails, a script at most continues what is finished.
+    /// Writes or removes the file that marks a training as not to be continued: all steps are made, or a file `stop` has ended
+    /// it. If that fails, a script at most continues what is finished.
     pub fn mark_finished(&self, finished: bool) {
         let path = self.path.join(FINISHED);
         // A file with content is the user's.
@@ -261,7 +261,7 @@ impl RunFolder {
         write_whole(&folder.join(name), text.as_bytes())
     }
 
-    /// Returns the path and the text of the configuration in the folder; `None` if there is none.
+    /// Returns the path and the text of the configuration in the folder, or `None` if there is none.
     ///
     /// # Errors
     /// Fails if the file cannot be read.
@@ -285,8 +285,8 @@ impl RunFolder {
     }
 }
 
-/// Returns the checkpoint that `place` refers to: `place` itself, or the best checkpoint of a run folder, or its latest if
-/// there is no best one yet.
+/// Returns the checkpoint that `place` refers to: `place` itself, or the best checkpoint of a run folder. If there is no
+/// best one yet, it is the latest.
 ///
 /// # Errors
 /// Fails if there is no checkpoint.

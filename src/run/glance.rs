@@ -1,4 +1,4 @@
-//! What the files of a run tell those who only look. Nothing is changed, no link in a folder is followed, no pipe is waited for.
+//! What the files of a run show to a reader. Nothing is changed, no link in a folder is followed, and no pipe is opened.
 
 use std::fs::{self, Metadata};
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ pub struct Glance {
 }
 
 impl Glance {
-    /// Looks at a folder; returns `None` if it holds no run.
+    /// Looks at a folder. Returns `None` if it holds no run.
     pub fn of(folder: &Path) -> Option<Self> {
         // Any other kind of file, e.g. a link, is not one of a run.
         let facts = |name: &str| fs::symlink_metadata(folder.join(name)).ok().filter(Metadata::is_file);

@@ -6,7 +6,7 @@ use tensorboard_proto::summary::HistogramProto;
 const BINS: usize = 60;
 
 /// Counts of values in bins of equal width between the smallest and the largest. `bucket_limit` holds the upper limits of the
-/// bins, `bucket` the number of values in each. A bin holds its lower limit; the last also holds its upper one.
+/// bins, `bucket` the number of values in each. A bin includes its lower limit. The last one also includes its upper limit.
 pub type Histogram = HistogramProto;
 
 /// Counts `values`, which must be finite.

@@ -1,9 +1,9 @@
-//! A run as a row of TensorBoard's HPARAMS: its settings, and a few figures as metrics. TensorBoard puts the settings in front in
-//! which runs differ, and draws only runs that have a value for each of them: so all settings are in each row.
+//! A run as a row of TensorBoard's HPARAMS: its settings, and a few figures as metrics. TensorBoard shows first the settings
+//! in which runs differ. It draws only runs that have a value for each of them, so all settings are in each row.
 //!
-//! The row has a folder of its own, `hparams` in that of the run, because TensorBoard takes all scalars beside it for its metrics.
-//! No experiment is written, which would name the columns of all rows: no run knows the others, and TensorBoard finds them by itself.
-//! The messages are those of TensorBoard's `plugins/hparams/plugin_data.proto`, which tensorboard-proto does not know.
+//! The row has a folder of its own, `hparams` in the folder of the run, because TensorBoard takes all scalars beside it for its
+//! metrics. No experiment is written, which would name the columns of all rows: no run knows the others, and TensorBoard finds them
+//! by itself. The messages are defined in TensorBoard's `plugins/hparams/plugin_data.proto`, which tensorboard-proto does not know.
 
 use std::fs;
 use std::path::Path;

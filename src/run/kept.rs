@@ -9,7 +9,7 @@ use super::folder::{CONFIG, DIVERGED, FINISHED, METRICS, POLICY, RunFolder, VERS
 use crate::os::{LOCK, final_path, same_file};
 use crate::sim::scene_files;
 
-/// The names of the files that a run keeps in its folder; a star stands for anything.
+/// The names of the files that a run keeps in its folder. A star stands for anything.
 const IN_RUN: [&str; 9] =
     [CONFIG, VERSION, POLICY, LOCK, METRICS, FINISHED, "metrics.before-*.csv", "events.out.*", ".shadow-repose-*"];
 
@@ -24,15 +24,15 @@ const INSIDE: [&str; 7] = [
     ".shadow-repose-*",
 ];
 
-/// Checks that an output replaces neither one of the files that are `read`, nor one of those of the `scene`, and that it has no
-/// name that a run keeps for its own files. Other names in the folder of a run are free.
+/// Checks that an output replaces no file that is `read`, and no file of the `scene`. It must not have a name that a run keeps
+/// for its own files. Other names in the folder of a run are free.
 ///
 /// # Errors
-/// Fails if it does, through whatever links.
+/// Fails if it does, even through links.
 pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, scene: Option<&Path>) -> Result<()> {
     let mut read = read.into_iter().map(PathBuf::from).chain(scene.map(scene_files).unwrap_or_default());
     if let Some(read) = read.find(|read| same_file(path, read)) {
-        bail!("{}: would replace {}, which is read; choose another name", path.display(), read.display());
+        bail!("{}: would replace the input {}; choose another name", path.display(), read.display());
     }
     let Some(whole) = final_path(path) else { return Ok(()) };
     let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
@@ -46,7 +46,7 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
         None => name == *kept,
     });
     let place = run.path().display();
-    ensure!(!is_run || !is_kept, "{}: the run {place} keeps a file of this name; choose another name", path.display());
+    ensure!(!is_run || !is_kept, "{}: the run {place} reserves this file name; choose another name", path.display());
     Ok(())
 }
 

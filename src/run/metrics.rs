@@ -65,7 +65,7 @@ impl Metrics {
     /// Adds a row, which ends with a line feed.
     ///
     /// # Errors
-    /// Fails if the file cannot be written; [`Metrics::repair`] must succeed before the next row.
+    /// Fails if the file cannot be written. [`Metrics::repair`] must succeed before the next row.
     pub(super) fn row(&mut self, row: &str) -> Result<()> {
         self.file.write_all(row.as_bytes()).cannot("write", &self.path)?;
         self.length += row.len() as u64;
@@ -101,7 +101,7 @@ struct Rows {
     dropped: u64,
 }
 
-/// Counts the rows of a table up to an iteration and after it; returns `None` if the header is different.
+/// Counts the rows of a table up to an iteration and after it. Returns `None` if the header is different.
 fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Rows>> {
     // A device has no rows to keep, and may have no end.
     if !file.metadata()?.is_file() {
@@ -130,8 +130,8 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     Ok(Some(found))
 }
 
-/// Reads the next row into `row`, with its line feed, and returns its length; 0 at the end. The rest of a row that is too long
-/// is read as another one.
+/// Reads the next row into `row`, with its line feed, and returns its length, or 0 at the end. The rest of a row that is too
+/// long is read as another one.
 pub(super) fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io::Result<u64> {
     row.clear();
     reader.take(LONGEST_ROW).read_until(b'\n', row).map(|length| length as u64)

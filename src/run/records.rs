@@ -10,7 +10,7 @@ use protobuf::CodedInputStream;
 use protobuf::wire_format::WireType;
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
-/// The most bytes of an event. This program writes none that is larger; a record that claims to be is damaged.
+/// The most bytes of an event. This program writes none that is larger. A record that claims to be is damaged.
 const LARGEST: u64 = 64 << 20;
 
 /// Returns the number of bytes at the start of a file that are whole events up to `last_step`. Steps do not decrease within a
@@ -29,7 +29,7 @@ pub(super) fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u
     Ok(length)
 }
 
-/// Reads the next event; returns `None` at the end of the file, or if no whole record follows.
+/// Reads the next event. Returns `None` at the end of the file, or if no whole record follows.
 fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
     let Some(length) = checked(reader, 8)? else { return Ok(None) };
     match length.try_into().map(u64::from_le_bytes) {
@@ -38,7 +38,7 @@ fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
     }
 }
 
-/// Reads `count` bytes and their checksum; returns `None` if they are incomplete or do not match.
+/// Reads `count` bytes and their checksum. Returns `None` if they are incomplete or do not match.
 fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
     let (mut bytes, mut checksum) = (Vec::new(), [0; 4]);
     if reader.by_ref().take(count as u64).read_to_end(&mut bytes)? < count {
@@ -50,7 +50,7 @@ fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
     }
 }
 
-/// Returns the step of an event, or 0 if it has none; `None` if it is not a protobuf message.
+/// Returns the step of an event, or 0 if it has none. Returns `None` if it is not a protobuf message.
 fn step_of(event: &[u8]) -> Option<i64> {
     let (mut stream, mut step) = (CodedInputStream::from_bytes(event), 0);
     while !stream.eof().ok()? {

@@ -55,7 +55,7 @@ impl<W> Log<W> {
         Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
     }
 
-    /// Writes an iteration if possible; says so if the log fails or recovers.
+    /// Writes an iteration if possible. Reports if the log fails or recovers.
     fn write(&mut self, progress: &StatusLine, write: impl FnOnce(&mut W) -> Result<()>) {
         match self.writer.as_mut().map(write) {
             Some(Ok(())) => {
@@ -70,14 +70,14 @@ impl<W> Log<W> {
         }
     }
 
-    /// Ensures that everything is on the disk; says so if it is not.
+    /// Ensures that everything is on the disk. Reports if it is not.
     fn sync(&mut self, progress: &StatusLine, sync: impl FnOnce(&mut W) -> Result<()>) {
         let Some(result) = self.writer.as_mut().map(sync) else { return };
         let unsynced = std::mem::take(&mut self.unsynced);
         result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
     }
 
-    /// Stops writing, and counts the iterations that are `lost`; says so unless that is known.
+    /// Stops writing, and counts the iterations that are `lost`. Reports this unless it is known.
     fn give_up(&mut self, progress: &StatusLine, lost: u64, error: &anyhow::Error) {
         self.lost += lost;
         self.writer = None;
@@ -115,7 +115,7 @@ impl Report {
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
     pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
         (self.iterations, self.env_steps) = (iterations, env_steps);
-        // A session that ended before its next checkpoint may have logged later steps; these are made again.
+        // A session that ended before its next checkpoint may have logged later steps. These are made again.
         match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
             Ok(events) => self.events.writer = Some(events),
             Err(error) => self.events.give_up(&self.progress, 0, &error),

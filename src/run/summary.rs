@@ -1,7 +1,7 @@
 //! The values of an event for TensorBoard: numbers, histograms, an animated picture, text.
 //!
 //! Numbers, histograms and pictures have the older form, which is smaller and which all readers convert. The first value of a
-//! tag in a file also holds its plugin, data class and description; without a data class, TensorBoard shows no description.
+//! tag in a file also holds its plugin, data class and description. Without a data class, TensorBoard shows no description.
 
 use std::collections::HashMap;
 
@@ -12,7 +12,7 @@ use tensorboard_proto::types::DataType;
 
 use super::Histogram;
 
-/// What the quantities are that are logged, by their tags.
+/// The descriptions of the logged quantities, by their tags.
 pub type Descriptions = HashMap<String, String>;
 
 /// What some iterations have in the event file besides numbers, each with its tag.

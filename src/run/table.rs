@@ -11,7 +11,7 @@ use super::folder::METRICS;
 use super::metrics::next_row;
 use crate::os::{Cannot, shortened};
 
-/// The most bytes that are read of a table; a million rows take half of this.
+/// The most bytes that are read of a table. A million rows take half of this.
 const LARGEST_TABLE: u64 = 1 << 30;
 
 /// The most rows that are read for a chart. Ten times the default training has fewer.
@@ -29,11 +29,11 @@ const LONGEST_NAME: usize = 64;
 pub struct MetricsTable {
     /// The names of all its columns.
     pub names: Vec<String>,
-    /// The values of those that were asked for and that it has, by name.
+    /// The values of the requested columns that it has, by name.
     pub columns: HashMap<String, Vec<f64>>,
 }
 
-/// Returns the table that `place` means: a file, or that of a run folder.
+/// Returns the table that `place` means: a file, or the table of a run folder.
 pub fn table_of(place: &Path) -> PathBuf {
     if place.is_dir() { place.join(METRICS) } else { place.to_owned() }
 }
@@ -77,7 +77,7 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
 }
 
-/// Returns the cells at these places of a row, in rising order; `None` if it has not this number of cells.
+/// Returns the cells at these places of a row, in rising order, or `None` if it does not have this number of cells.
 fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
     let (mut rest, mut first, mut found) = (row, 0, Vec::with_capacity(places.len()));
     for &place in places {
@@ -90,7 +90,8 @@ fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u
     is_last.then_some(found)
 }
 
-/// Returns what follows so many commas, if there are as many. Most of a long row is counted in chunks, a few instructions each.
+/// Returns what follows this number of commas, if there are as many. Most of a long row is counted in chunks, a few
+/// instructions each.
 fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
     let mut begin = 0;
     for chunk in row.as_chunks::<32>().0 {
@@ -110,7 +111,7 @@ fn number(cell: &[u8]) -> Result<f64> {
     Ok(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN })
 }
 
-/// Returns the value at `x` on the straight lines between `points`; `None` outside of them.
+/// Returns the value at `x` on the straight lines between `points`, or `None` outside of them.
 pub fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
     let after = points.partition_point(|point| point[0] < x);
     let [right, high] = *points.get(after)?;

@@ -21,12 +21,12 @@ const FIGURES: [Figure; 4] = [
     ("turned", "training/turned", "turned", 1.0, 2),
 ];
 
-/// The figures of evaluations; the others are those of every iteration.
+/// The number of figures of evaluations. The others are logged in every iteration.
 const OF_EVALUATIONS: usize = 3;
 
 /// Two runs, A and B.
 pub(super) struct Comparison {
-    /// The settings in which they differ; `None` if those of one are not known.
+    /// The settings in which they differ, or `None` if the settings of one are not known.
     settings: Option<Vec<Difference>>,
     /// Steps, and the figures of both there.
     rows: Vec<(f64, [[f64; 2]; FIGURES.len()])>,
@@ -81,7 +81,7 @@ impl Comparison {
             [format!("{step:.0}")].into_iter().chain(cells).collect()
         });
         let figures = if self.rows.is_empty() {
-            vec!["there are no steps up to which both were evaluated".into()]
+            vec!["the evaluations of the two runs do not overlap in steps".into()]
         } else {
             aligned(&[heads].into_iter().chain(figures).collect::<Vec<_>>(), 0)
         };
@@ -122,14 +122,14 @@ fn curves(run: &Run) -> Result<Curves> {
     }))
 }
 
-/// Returns the steps at which A was evaluated while B was, too: the last one, and others evenly before it.
+/// Returns the steps at which A was evaluated within the evaluations of B: the last one, and others evenly before it.
 fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
     let common: Vec<f64> = a[0].iter().map(|[step, _]| *step).filter(|step| value_at(&b[0], *step).is_some()).collect();
     let count = common.len().min(MOST_MARKS);
     (1..=count).map(|mark| common[mark * common.len() / count - 1]).collect()
 }
 
-/// Returns the mean of the values after `begin` up to `end`; NaN if there are none.
+/// Returns the mean of the values after `begin` up to `end`, or NaN if there are none.
 fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
     let inside = points.iter().filter(|[step, _]| *step > begin && *step <= end).map(|[_, value]| *value);
     let (sum, count) = inside.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));

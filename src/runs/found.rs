@@ -47,10 +47,10 @@ pub(super) struct Run {
     problems: Vec<String>,
 }
 
-/// The figures in the table of a run; NaN where it has none.
+/// The figures in the table of a run, NaN where it has none.
 #[derive(Clone, Debug)]
 pub(super) struct Figures {
-    /// What of the table they were read from.
+    /// The stamp of the table that they were read from.
     stamp: Option<Stamp>,
     env_steps: Option<u64>,
     steps_per_s: f64,
@@ -61,7 +61,7 @@ pub(super) struct Figures {
 }
 
 impl Run {
-    /// Reads what a run tells at the time `now`. Figures that are `known` are read again only if the table has changed.
+    /// Reads what the files of a run show at the time `now`. Figures that are `known` are read again only if the table has changed.
     pub(super) fn of(
         path: &Path,
         glance: &Glance,
@@ -75,7 +75,7 @@ impl Run {
         });
         let (config, problem) = match config.transpose() {
             Ok(config) => (config, None),
-            Err(error) => (None, Some(format!("config.toml is not one of this version: {error:#}"))),
+            Err(error) => (None, Some(format!("config.toml does not fit this version: {error:#}"))),
         };
         let stamp = glance.metrics.as_deref().and_then(Stamp::of);
         let figures = match known.filter(|known| known.stamp == stamp) {

@@ -1,4 +1,4 @@
-//! A table of run folders, newest first, and the comparison of two runs. All is found from their files, which are only read.
+//! A table of run folders, newest first, and the comparison of two runs. Everything comes from their files, which are only read.
 
 mod comparison;
 mod found;
@@ -22,11 +22,11 @@ use found::{Figures, Run};
 /// The time between two tables of `--watch`.
 const EVERY: Duration = Duration::from_secs(5);
 
-/// The heads of the columns; words are in the first [`WORDS`].
+/// The heads of the columns. The first [`WORDS`] columns hold words.
 const HEADS: [&str; 8] = ["run", "state", "left", "steps", "steps/s", "goals", "best", "differs from the default in"];
 const WORDS: usize = 2;
 
-/// Prints the runs in a folder or, of two runs, their comparison; with `--watch` again and again.
+/// Prints the runs in a folder, or the comparison of two runs. With `--watch`, prints again and again.
 ///
 /// # Errors
 /// Fails if the folder cannot be read, if a folder that is named holds no run, or if stdout cannot be written to.
@@ -62,8 +62,8 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
     }
 }
 
-/// Reads the runs at these places: one folder of runs, or runs themselves. Those of a folder come newest first. What was read
-/// `before` of a table that has not changed is not read again.
+/// Reads the runs at these places: one folder of runs, or runs themselves. Runs of a folder come newest first. A table that
+/// has not changed since it was read `before` is not read again.
 fn read(places: &[PathBuf], default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
     let mut found: Vec<(PathBuf, Glance)> = match places {
@@ -74,7 +74,7 @@ fn read(places: &[PathBuf], default: &Config, before: &[Run]) -> Result<Vec<Run>
         places => {
             let runs = places.iter().map(|place| {
                 ensure!(place.exists(), "{}: no such folder", place.display());
-                let no_run = || format!("{} holds no run; a folder of runs is named alone", place.display());
+                let no_run = || format!("{} holds no run; to list a folder of runs, name it alone", place.display());
                 seen(place.clone()).with_context(no_run)
             });
             runs.collect::<Result<_>>()?

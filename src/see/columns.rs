@@ -24,7 +24,8 @@ pub(super) const MOST: u32 = 32_767;
 pub(super) struct Columns {
     /// The task, which was loaded for display.
     task: Arc<Task>,
-    /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place; mocap bodies but the goal stay.
+    /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place. Mocap bodies other than the
+    /// goal stay.
     drawing: Drawing,
     /// The number of values in `qpos`.
     positions: usize,
@@ -74,7 +75,7 @@ impl Columns {
     /// Returns the row of a record of a trace.
     ///
     /// # Errors
-    /// Fails if it is none, or is one of another scene.
+    /// Fails if it is not a record, or is one of another scene.
     pub(super) fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
         let number = |value: &Value| value.as_f64().filter(|x| x.abs() < LARGEST);
         let list = |key: &str, length: usize| {
@@ -111,12 +112,12 @@ impl Columns {
         row
     }
 
-    /// Gives a row the poses of the row before: those after a step that diverged mean nothing.
+    /// Gives a row the poses of the row before: poses after a step that diverged mean nothing.
     pub(super) fn stay(&self, row: &mut [f64], before: &[f64]) {
         row[..self.poses()].copy_from_slice(&before[..self.poses()]);
     }
 
-    /// Turns the quaternions of a row so that they go on from those of the row before: q and -q are the same turn.
+    /// Chooses the signs of the quaternions of a row to continue the row before: q and -q are the same rotation.
     pub(super) fn go_on(&self, row: &mut [f64], before: &[f64]) {
         for &place in &self.quaternions {
             let same: f64 = (place..place + 4).map(|i| row[i] * before[i]).sum();

@@ -24,7 +24,7 @@ struct Frames {
     fps: u32,
     /// The most frames of an episode.
     longest: u64,
-    /// Those of the current episode so far.
+    /// The frames of the current episode so far.
     drawn: u64,
 }
 
@@ -77,7 +77,7 @@ impl Film {
     /// Adds the frames that are due at `moment`.
     ///
     /// # Errors
-    /// Fails if OpenGL, the encoder or the file does; [`Film::abandon`] returns the cause if it was the encoder or the file.
+    /// Fails if OpenGL, the encoder or the file does. [`Film::abandon`] returns the cause if it was the encoder or the file.
     pub fn observe(&mut self, moment: &Moment) -> Result<()> {
         ensure!(!self.writer.failed(), "the film cannot be continued");
         self.frames.draw_due(moment, |frame| {
@@ -133,8 +133,8 @@ impl EpisodeFilms {
         Ok(Self { task, frames })
     }
 
-    /// Plays the first of `episodes` as an evaluation of `task` does, which may only smooth actions differently, and returns its first
-    /// 20 s; `None` if `stop` was set meanwhile. Calls `meanwhile` in each step.
+    /// Plays the first of `episodes` as an evaluation of `task` does, which may only smooth actions differently. Returns its first
+    /// 20 s, or `None` if `stop` was set meanwhile. Calls `meanwhile` in each step.
     ///
     /// # Errors
     /// Fails if OpenGL does.

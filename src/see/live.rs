@@ -1,4 +1,4 @@
-//! Hands on a page while they move. Nothing moves while nobody looks.
+//! Live hands on a page. Nothing moves while nobody looks.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::os::{self, Machine, Server};
 use crate::repose::{Task, TaskReward};
 use crate::sim::Camera;
 
-/// The time between two rows, s, rounded to control steps; a page interpolates between rows.
+/// The time between two rows, s, rounded to control steps. A page interpolates between rows.
 const BETWEEN_ROWS: f64 = 0.02;
 
 /// The time between two looks at the clock.
@@ -32,7 +32,7 @@ type Stepping = dyn Fn(&mut Player) -> Option<End>;
 pub struct Acting {
     /// Takes one step.
     pub step: Rc<Stepping>,
-    /// What the page calls the policy, if it is not the one that it names throughout.
+    /// The page's name for the policy, if it differs from the name for the whole page.
     pub policy: Option<String>,
 }
 
@@ -98,7 +98,7 @@ impl Live {
         Ok(Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands })
     }
 
-    /// Shows the hands for as long as the program runs; `next` says who acts in each further episode.
+    /// Shows the hands for as long as the program runs. `next` says who acts in each further episode.
     pub fn show(mut self, next: &mut dyn FnMut() -> Acting) -> ! {
         let (start, mut clock, mut steps, mut begun) =
             (Instant::now(), Clock::new(self.task.config().ctrl_dt), 0_u64, self.hands.len());

@@ -1,7 +1,7 @@
 //! The task on display: in a window, as a film or as a picture, and in a browser.
 //!
-//! Without the feature `viewer` there is no window; without `video` there are no films or pictures. What would show them refuses
-//! with one of the messages below. Neither feature changes anything else.
+//! Without the feature `viewer` there is no window. Without `video` there are no films or pictures. A request for them fails
+//! with one of the messages below. The features have no other effect.
 
 mod clock;
 mod columns;

@@ -13,7 +13,7 @@ use crate::evaluate::Moment;
 use crate::repose::{Task, TaskReward};
 use crate::sim::Camera;
 
-/// The most episodes of a file, and the most steps of all of them: a browser reads it at once, and 1000 steps add 57 kB.
+/// The most episodes of a file, and the most steps of all of them. A browser reads the file at once, and 1000 steps add 57 kB.
 pub const MOST_EPISODES: usize = 20;
 const MOST_STEPS: usize = 60_000;
 
@@ -88,7 +88,7 @@ impl Replay {
                 self.columns.stay(&mut row, before);
             }
         }
-        // A trace gives no error of a reset; that of the first step is the same to a hundredth.
+        // A trace has no rotation error of a reset. The error of the first step is the same to a hundredth.
         let error = self.columns.error();
         if let [first] = &mut rows[..]
             && first[error] == 0.0

@@ -7,8 +7,8 @@ use serde_json::{Value, json};
 use crate::os::OnPost;
 use crate::repose::Task;
 
-/// What a request is told that moves none of the actuators.
-const MALFORMED: &str = "Only a list of pairs of an actuator's number and a finite value is read.";
+/// The answer to a request that moves none of the actuators.
+const MALFORMED: &str = "Send a list of pairs: the number of an actuator, and a finite value.";
 
 /// A slider for each actuator, in action order. An actuator obeys its slider from the first time that this is moved.
 #[derive(Clone)]
@@ -23,7 +23,7 @@ struct State {
 struct Slider {
     name: String,
     range: [f64; 2],
-    /// In the unit of the range; `None`: it was not moved yet.
+    /// In the unit of the range. `None` if it was not moved yet.
     value: Option<f64>,
 }
 

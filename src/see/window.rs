@@ -27,11 +27,11 @@ pub struct Window {
 }
 
 impl Window {
-    /// Opens a window on `task`, which must have been loaded for display. The user chooses between `actors`, initially the one
-    /// at `first`.
+    /// Opens a window on `task`, which must have been loaded for display. The user chooses between `actors`, initially
+    /// `actors[first]`.
     ///
     /// # Errors
-    /// Fails if there is no display or a library is missing; the message names the packages that provide it.
+    /// Fails if there is no display or a library is missing. The message names the packages that provide it.
     pub fn open(task: &Task, actors: Vec<&'static str>, first: usize) -> Result<Self> {
         let viewer = Viewer::open(task.scene(), "shadow-repose", actors, first)?;
         os::say(KEYS);
@@ -94,7 +94,7 @@ struct Tally {
     steps: u64,
     /// All episodes before the current one.
     episodes: usize,
-    /// Those that the user did not end.
+    /// Episodes that the user did not end.
     completed: u32,
     drops: u32,
     goals: u32,
@@ -110,7 +110,7 @@ impl Tally {
         self.goals += episode.goals;
     }
 
-    /// Returns what happened in the episodes before the current one, also in those that the user ended.
+    /// Returns what happened in the episodes before the current one, including episodes that the user ended.
     fn before(&self) -> String {
         match self.episodes {
             0 => "nothing yet".to_owned(),

@@ -24,7 +24,7 @@ pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xm
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Cone {
-    /// That of the scene.
+    /// The cones that the scene sets.
     Scene,
     /// Four-sided pyramids inside the cones: faster.
     Pyramidal,
@@ -44,7 +44,7 @@ pub struct Compilation {
     /// The factor on the lengths of the object: its shapes, and the places of what is attached to it. Its mass stays the same.
     pub size: f64,
     /// Whether the object's centre of mass may later be shifted. MuJoCo has a shortcut for bodies whose centre of mass is the
-    /// origin of their frame; without it, results differ in rounding.
+    /// origin of their frame. Without it, results differ in rounding.
     pub shifts: bool,
     /// The name of a mocap body that is added to show the goal: it looks like the object, and touches nothing.
     pub adds_goal: Option<&'static str>,
@@ -75,7 +75,7 @@ impl Compilation {
             if let Ok(model) = model {
                 return Ok(model);
             }
-            // The wrapper cuts off the message of this way at 100 bytes; the other way gives it whole.
+            // The wrapper cuts off this message at 100 bytes. The way below gives it whole.
         }
         self.spec(file)?.compile().map_err(refused)
     }
@@ -118,7 +118,7 @@ impl Compilation {
     }
 }
 
-/// Returns all that MuJoCo says of a file that it cannot parse. The wrapper's message has at most 99 bytes.
+/// Returns MuJoCo's whole message about a file that it cannot parse. The wrapper's message has at most 99 bytes.
 fn parse_error(file: &Path) -> Option<String> {
     let name = CString::new(file.to_str()?).ok()?;
     let mut message = [0_u8; 4096];

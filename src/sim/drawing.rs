@@ -8,10 +8,10 @@ use serde::Serialize;
 use super::Scene;
 use super::look::{Camera, HIDDEN};
 
-/// A scene as a page draws it. Lengths in m, quaternions w, x, y, z; a pose is in the frame of the parent or of the body.
+/// A scene as a page draws it. Lengths in m, quaternions w, x, y, z. A pose is in the frame of the parent or of the body.
 #[derive(Clone, Debug, Serialize)]
 pub struct Drawing {
-    /// Every body after its parent; the first is the world.
+    /// Every body after its parent. The first is the world.
     pub bodies: Vec<DrawnBody>,
     /// The shapes that are seen.
     pub geoms: Vec<DrawnGeom>,
@@ -61,14 +61,14 @@ pub struct DrawnGeom {
     shininess: f32,
     #[serde(skip_serializing_if = "Option::is_none")]
     mesh: Option<usize>,
-    /// Whether it is part of a fine picture, or of a plain one, only.
+    /// Whether it is part only of a fine picture, or only of a plain one.
     #[serde(skip_serializing_if = "is_false")]
     fine: bool,
     #[serde(skip_serializing_if = "is_false")]
     plain: bool,
 }
 
-/// A point of view on a sphere around a centre; degrees.
+/// A point of view on a sphere around a centre, in degrees.
 #[derive(Clone, Debug, Serialize)]
 pub struct DrawnCamera {
     azimuth: f64,
@@ -231,7 +231,7 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: bool) -> Option<DrawnGeom> 
     })
 }
 
-/// Returns the parts of a mesh, with one corner for each pair of point and normal that a triangle uses, in the order of their first
+/// Returns the parts of a mesh. They have one corner for each pair of point and normal that a triangle uses, in the order of first
 /// use.
 fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     let [first, points, normals] =

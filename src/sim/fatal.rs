@@ -1,5 +1,5 @@
-//! Fatal errors of MuJoCo, e.g. when a scene needs more memory than it has reserved: MuJoCo ends the process, but the program
-//! can save what must not be lost first.
+//! Fatal errors of MuJoCo, e.g. when a scene needs more memory than it has reserved. MuJoCo ends the process, but the program
+//! can first save what must not be lost.
 
 #![expect(unsafe_code, reason = "MuJoCo takes a C function")]
 
@@ -26,9 +26,9 @@ pub fn stepping<T>(kind: &'static str, number: usize, work: impl FnOnce() -> T) 
     done
 }
 
-/// Registers `rescue` to be called with a message, on the thread that failed, before MuJoCo ends the process. It
-/// replaces any function registered before. Other threads keep running meanwhile; if MuJoCo fails on one of them too, that
-/// thread waits until `rescue` has returned.
+/// Registers `rescue` to be called with a message, on the thread that failed, before MuJoCo ends the process. It replaces
+/// any function registered before. Other threads keep running meanwhile. If MuJoCo also fails on one of them, that thread
+/// waits until `rescue` has returned.
 pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
     *RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner()) = Some(Box::new(rescue));
 }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use crate::os::read_bytes;
 
-/// Returns the files that a scene may read: its own, those that it includes, meshes, textures, height fields. Each is looked for in
-/// every folder that the scene names, so that some may be none of its files.
+/// Returns the files that a scene may read: its own, included files, meshes, textures, height fields. Each is looked for in every
+/// folder that the scene names, so some may not belong to it.
 pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     let folder_of = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
     let top = folder_of(scene);

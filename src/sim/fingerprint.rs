@@ -10,7 +10,7 @@ macro_rules! arrays {
     ($model:ident[$geom:ident]: $($array:ident)*) => { &[$(&$model.$array()[$geom]),*] };
 }
 
-/// Lists those of these arrays of a model in which something differs from MuJoCo's default.
+/// Lists these arrays of a model, but only where something in them differs from MuJoCo's default.
 macro_rules! unusual {
     ($model:ident: $($array:ident $default:expr),*) => {
         [$((stringify!($array), $model.$array().iter().any(|x| *x != $default).then(|| format!("{:?}", $model.$array())))),*]
@@ -18,8 +18,8 @@ macro_rules! unusual {
 }
 
 /// Returns a checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
-/// nothing are left out, and so are sensors, keyframes and plugins. What version 0.3 did not take counts only where it is unusual,
-/// so that the checksum of other scenes stays.
+/// nothing are left out, and so are sensors, keyframes and plugins. Quantities that version 0.3 left out count only where they are
+/// unusual, so that the checksum of other scenes stays the same.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| parts.iter().for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()));

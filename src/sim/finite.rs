@@ -43,7 +43,7 @@ fn first_in_assets(model: &MjModel) -> Option<String> {
     Some(format!("{quantity} of {kind} `{}`", shortened(name)))
 }
 
-/// What MuJoCo computes when it compiles a model, besides what has a name that ends with 0.
+/// Quantities that MuJoCo computes when it compiles a model, in addition to the names that end with 0.
 const DERIVED: [&str; 5] = ["body_subtreemass", "dof_length", "geom_aabb", "geom_rbound", "bvh_aabb"];
 
 /// Returns the first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
@@ -63,7 +63,7 @@ fn first_in(text: &str) -> Option<(String, String)> {
             if indented && !first.ends_with('0') && !DERIVED.contains(&first) {
                 return Some((first.to_owned(), object));
             }
-            // What MuJoCo has computed follows from something else, and so may what stands for the whole model.
+            // A value that MuJoCo has computed follows from another one. So may a value of the whole model.
             let object = if indented { object } else { String::new() };
             derived = derived.or(Some((first.to_owned(), object)));
         }

@@ -22,7 +22,7 @@ const FACES: [[f32; 3]; 6] =
 /// The thickness of a face's plate beyond the box, as a fraction of the box's half size.
 const PLATE: f64 = 0.02;
 
-/// Compiles the scene in `file` with what it lacks; `None` if it lacks nothing.
+/// Compiles the scene in `file` with what it lacks. Returns `None` if it lacks nothing.
 ///
 /// # Errors
 /// Fails if MuJoCo refuses the scene.
@@ -60,7 +60,7 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
                 .with_group(VISUAL)
                 .with_contype(0)
                 .with_conaffinity(0)
-                // Whatever the defaults of its class say.
+                // Regardless of the defaults of its class.
                 .with_quat([1.0, 0.0, 0.0, 0.0])
                 .with_mass(0.0)
                 .with_density(0.0);

@@ -17,7 +17,7 @@ const MILLIMETRE: f64 = 1e-3;
 /// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
 type Part = (&'static str, &'static str, &'static str, f64);
 
-/// The parts, by the beginning of the bodies' names. The values are those of MuJoCo Menagerie's Shadow Hand.
+/// The parts, by the beginning of the bodies' names. The values come from MuJoCo Menagerie's Shadow Hand.
 const PARTS: [(&str, &[Part]); 5] =
     [("rh_", &HAND), ("rh_ff", &FINGER), ("rh_mf", &FINGER), ("rh_rf", &FINGER), ("rh_lf", &FINGER)];
 
@@ -64,9 +64,9 @@ pub enum Quality {
 /// The position of a camera on a sphere around the scene's centre, which it looks at.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Viewing direction around the vertical, degrees; 0 is along +x.
+    /// Viewing direction around the vertical, degrees (0 is along +x).
     pub azimuth: f64,
-    /// Viewing direction above the horizontal, degrees; negative looks down.
+    /// Viewing direction above the horizontal, degrees (negative looks down).
     pub elevation: f64,
     /// Distance from the scene's centre, m.
     pub distance: f64,
@@ -75,7 +75,7 @@ pub struct Camera {
 /// The look of a scene.
 #[derive(Clone, Debug)]
 pub struct Look {
-    /// The contents of [`mesh_files`], in that order, for the built-in hand; if empty, its primitives are shown.
+    /// The contents of [`mesh_files`], in that order, for the built-in hand. If empty, its primitives are shown.
     pub meshes: Vec<Vec<u8>>,
     /// Width and height of pictures in pixels.
     pub size: [u32; 2],

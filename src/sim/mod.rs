@@ -1,7 +1,7 @@
 //! The wrapper around MuJoCo: loads a scene, finds objects in it by name, steps it and reports divergence.
 //!
-//! Nothing outside this folder names `mujoco_rs`; nothing inside it knows the task, but for the look of the hand. Angles are in
-//! rad, lengths in m, in the world frame.
+//! Nothing outside this folder names `mujoco_rs`. Nothing inside it depends on the task, except for the look of the hand.
+//! Angles are in rad, lengths in m, in the world frame.
 
 mod compilation;
 mod drawing;

@@ -195,9 +195,9 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
     painter.text(at, Align2::RIGHT_CENTER, &gauge.text, FontId::monospace(12.0), colour);
 }
 
-/// Closes MuJoCo's own panel at the left when the window opens: its second reset and its physics options are not of the task,
-/// and it takes a third of a small window. mujoco-rs has no setting for that, so this drags its edge to the window's side, as
-/// a user could; the key X opens it again.
+/// Closes MuJoCo's own panel at the left when the window opens. Its second reset and its physics options do not belong to the
+/// task, and it takes a third of a small window. mujoco-rs has no setting for that, so this drags its edge to the window's
+/// side, as a user could. The key X opens it again.
 #[derive(Default)]
 pub(super) struct CloseLeftPanel {
     frame: usize,
@@ -219,7 +219,7 @@ impl egui::Plugin for CloseLeftPanel {
         let drag = [moved(edge), press(edge, true), moved(side), press(side, false), Event::PointerGone];
         if let Some(event) = drag.into_iter().nth(self.frame) {
             self.frame += 1;
-            // Nothing else may come between.
+            // No other event may come between.
             input.events = vec![event];
         }
     }

@@ -25,7 +25,7 @@ impl Renderer {
     /// Creates a renderer that draws `scene` with its look.
     ///
     /// # Errors
-    /// Fails if there is no EGL; the message names the packages that provide it.
+    /// Fails if there is no EGL. The message names the packages that provide it.
     pub fn new(scene: &Scene) -> Result<Self> {
         let build = || MjRenderer::builder().camera(MjvCamera::new_free(&scene.model)).build(&scene.model);
         let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?;

@@ -98,7 +98,7 @@ impl Scene {
     pub fn load(file: Option<&Path>, compilation: &Compilation) -> Result<Self> {
         quieten_mujoco();
         let compiled = compilation.compile(file).and_then(|model| {
-            // The built-in scene has been looked at.
+            // The built-in scene is known to be finite.
             let culprit = file.map_or(Ok(None), |_| not_finite(&model))?;
             if let Some(culprit) = culprit {
                 bail!("{culprit} is not a finite number");
@@ -117,7 +117,7 @@ impl Scene {
         if file.is_none() && !look.meshes.is_empty() {
             scene = Self::checked(look.dress(compilation)?, compilation)?;
         }
-        // A scene that cannot be given more is shown as it is.
+        // A scene to which nothing can be added is shown as it is.
         if let Some(file) = file
             && let Ok(Some(model)) = furnished(file, &scene.model, compilation)
         {
@@ -132,7 +132,7 @@ impl Scene {
     /// Panics if the scene is shared.
     pub fn set_look(&mut self, look: &Look, nominal: &Self) {
         let model = Arc::get_mut(&mut self.model).expect("a new scene is not shared");
-        // MuJoCo computes these anew with masses; the picture stays as it is.
+        // MuJoCo computes these anew with masses, but the picture stays as it is.
         (model.stat_mut().center, model.stat_mut().extent) = (nominal.model.stat().center, nominal.model.stat().extent);
         look.set_up(model);
     }

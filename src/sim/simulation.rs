@@ -14,7 +14,7 @@ use crate::quat::{self, Quat};
 pub enum Physics {
     /// The state can be used.
     Sound,
-    /// The state or a control was not finite or was far too large; MuJoCo has reset what it could not use.
+    /// The state or a control was not finite or was far too large. MuJoCo has reset what it could not use.
     Diverged,
 }
 
@@ -47,7 +47,7 @@ impl Simulation {
         Self { data: MjData::new(scene.model.clone()), shared: None, spare: None }
     }
 
-    /// Goes back to the model of the scene, if it was given another one; the state must be reset after it.
+    /// Goes back to the model of the scene, if it was given another one. The state must be reset after it.
     pub fn share_model(&mut self) {
         self.spare = self.take_own_model();
     }
@@ -65,7 +65,7 @@ impl Simulation {
         self.shared = Some(self.data.swap_model(Arc::new(model)));
     }
 
-    /// Resets to the default state and clears warm start and warnings; call [`Simulation::refresh`] after changing the state.
+    /// Resets to the default state and clears warm start and warnings. Call [`Simulation::refresh`] after changing the state.
     pub fn reset(&mut self) {
         self.data.reset();
     }
@@ -90,7 +90,8 @@ impl Simulation {
         Physics::Sound
     }
 
-    /// Begins a replay with [`Simulation::step_whole`] from the state of a simulation of `scene`: that of this one, or a variation.
+    /// Begins a replay with [`Simulation::step_whole`] from the state of a simulation of `scene`, which is this simulation's scene
+    /// or a variation of it.
     ///
     /// # Panics
     /// Panics if the scene or the state is of another kind.
@@ -104,7 +105,7 @@ impl Simulation {
         (0..substeps).for_each(|_| self.data.step());
     }
 
-    /// Returns whether the state diverged. MuJoCo resets it silently within the step; only its warning counters show it.
+    /// Returns whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
         [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC, MjtWarning::mjWARN_BADCTRL]
@@ -152,8 +153,8 @@ impl Simulation {
         SimulationState(self.data.state(EVERYTHING))
     }
 
-    /// Resumes from the values of a state, with bodies up to date: the next step is bit for bit that of the simulation that
-    /// the state was taken from.
+    /// Resumes from the values of a state, with bodies up to date. The next step is bit for bit the next step of the
+    /// simulation that the state was taken from.
     ///
     /// # Errors
     /// Fails if the state is of another scene or has diverged.
@@ -188,7 +189,7 @@ impl Simulation {
     /// Returns the velocity of a frame at its origin.
     pub fn velocity(&self, frame: Frame) -> Velocity {
         let (kind, id) = match frame {
-            // XBODY is the frame's origin; BODY would be the centre of mass.
+            // XBODY is the frame's origin. BODY would be the centre of mass.
             Frame::Body(Body(id)) => (MjtObjBase::mjOBJ_XBODY, id),
             Frame::Site(id) => (MjtObjBase::mjOBJ_SITE, id),
         };
@@ -196,7 +197,8 @@ impl Simulation {
         Velocity { linear: [x, y, z], angular: [wx, wy, wz] }
     }
 
-    /// Applies a force (N, world frame) to the centre of mass of a body in all steps until it is replaced or the state is reset.
+    /// Applies a force (N, world frame) to the centre of mass of a body. It acts in all steps until it is replaced or the state
+    /// is reset.
     pub fn push(&mut self, Body(id): Body, force: [f64; 3]) {
         self.data.xfrc_applied_mut()[id][..3].copy_from_slice(&force);
     }

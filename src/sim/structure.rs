@@ -20,20 +20,21 @@ pub struct Parts {
     pub fingertips: Vec<String>,
     /// The body that the hand turns.
     pub object: String,
-    /// The mocap body that shows the goal; empty if there is none.
+    /// The mocap body that shows the goal. Empty if there is none.
     pub goal: String,
-    /// The keyframe in which an episode starts; if empty, `start` or `home`, else the only one, else the default pose.
+    /// The keyframe in which an episode starts. If empty: `start` or `home`, else the only one, else the default pose.
     pub start: String,
 }
 
-/// What a user is told whose scene has nothing to turn.
+/// The message for a user whose scene has nothing to turn.
 const NO_OBJECT: &str = "has no body with a free joint that the hand could turn; for a cube like the built-in one, add \
                          <body name=\"cube\" pos=\"X Y Z\"><freejoint/><geom type=\"box\" size=\".025 .025 .025\" \
                          mass=\".028\" friction=\"1.2\"/></body> to <worldbody>";
 
 impl Scene {
-    /// Returns `named`, completed by what the structure of the scene says: all actuators; the limited hinges of the trees that
-    /// they move; the last bodies of these trees; the only other body with a free joint; the only other mocap body.
+    /// Returns `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
+    /// limited hinges of the trees that they move. The fingertips are the last bodies of these trees. The object is the only
+    /// other body with a free joint, and the goal the only other mocap body.
     ///
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.

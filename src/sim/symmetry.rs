@@ -37,7 +37,7 @@ struct Form {
 
 impl Scene {
     /// Returns the numbers of the rotations in [`CUBE_ROTATIONS`] that map a body, with all that is attached to it, onto itself.
-    /// With moving parts there is only the one that rotates nothing.
+    /// With moving parts there is only the identity.
     pub fn symmetry(&self, body: Body) -> Vec<usize> {
         let form = self.form(body);
         let turns = CUBE_ROTATIONS.iter().map(|turn| quat::normalized(turn.map(f64::from)));
@@ -92,7 +92,7 @@ fn touches(model: &MjModel, geom: usize) -> bool {
         || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
 }
 
-/// Returns the pose inside a frame as one in the frame's own surroundings.
+/// Returns a pose that is given in a frame as a pose in the surroundings of that frame.
 fn inside((origin, axes): ([f64; 3], Quat), position: [f64; 3], orientation: Quat) -> ([f64; 3], Quat) {
     let [x, y, z] = quat::rotate(axes, position);
     ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))

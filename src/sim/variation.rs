@@ -115,7 +115,7 @@ impl Variants {
     /// Fails if they differ in their structure.
     pub fn new(scenes: Vec<Scene>) -> Result<Self> {
         let alike = scenes.windows(2).all(|pair| pair[0].model.is_compatible_with_model(&pair[1].model));
-        ensure!(alike, "with another size it has another structure");
+        ensure!(alike, "its structure changes with the size of the object");
         Ok(Self { scenes, workspaces: Workspaces::default() })
     }
 
@@ -133,7 +133,7 @@ impl Variants {
         let mut model = simulation.take_own_model().unwrap_or_else(|| (**scene).clone());
         assert!(model.is_compatible_with_model(scene), "scenes that differ only in sizes");
         // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
-        // process if they differ; both come from the same scene, so they do not.
+        // process if they differ. Both come from the same scene, so they do not.
         unsafe { mj_copyModel(model.ffi_mut(), scene.ffi()) };
         simulation.set_own_model(changed(model, changes, &self.workspaces));
     }
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn the_boxes_of_a_shifted_body_are_those_that_mujoco_compiles() {
-        // The boxes in which contacts are searched are kept in the frame of the inertia; `mj_setConst` updates them.
+        // The boxes in which contacts are searched are kept in the frame of the inertia. `mj_setConst` updates them.
         let compilation = Compilation { object: "cube".into(), shifts: true, ..Compilation::plain(0.01, Cone::Scene) };
         let scene = Scene::load(None, &compilation).unwrap();
         let shift = Change::CentreOfMass(scene.body("cube").unwrap(), [0.01, -0.004, 0.002]);

@@ -24,11 +24,11 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// Opens a window on `scene` with the given title. The user chooses which of `choices` moves the hand, initially the one
-    /// at `first`.
+    /// Opens a window on `scene` with the given title. The user chooses which of `choices` moves the hand, initially
+    /// `choices[first]`.
     ///
     /// # Errors
-    /// Fails if there is no display or a library is missing; the message names the packages that provide it.
+    /// Fails if there is no display or a library is missing. The message names the packages that provide it.
     pub fn open(scene: &Scene, title: &str, choices: Vec<&'static str>, first: usize) -> Result<Self> {
         let build = || MjViewer::builder().window_name(title.to_owned()).build_passive(&scene.model);
         let mut viewer = attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;

@@ -8,7 +8,7 @@ const SMALL_MINIBATCH: usize = 1024;
 /// The smallest weight of the task's reward at which its scales matter.
 const LITTLE: f64 = 0.1;
 
-/// The memory for the models of randomised hands above which there is a note, bytes.
+/// The memory for the models of randomised environments above which there is a note, bytes.
 const MUCH: usize = 2 << 30;
 
 /// Returns the notes about these settings, compared with the `default`, for a scene of this size in bytes.
@@ -53,7 +53,7 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     if randomizes && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
-            "[randomization]: each of {} hands gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
+            "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
              (randomization.share=0 avoids this)",
             env.num_envs, share.after
         ));
@@ -89,7 +89,7 @@ mod tests {
         assert!(hints_for(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
         let [line] = &hints_for(&["env.num_envs=8192"])[..] else { panic!("one line") };
         assert!(
-            line.contains("each of 8192 hands gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
+            line.contains("8192 environments gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
             "{line}"
         );
         assert!(hints_for(&["env.num_envs=8192", "randomization.share=0"]).is_empty());

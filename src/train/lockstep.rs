@@ -12,7 +12,7 @@ use crate::os::{self, Requests};
 use crate::ranks::Exchange;
 use crate::sim;
 
-/// Why a training has ended that was told to stop, other than by a file.
+/// The reason for the end of a training that was asked to stop, other than by a file.
 pub(super) const STOPPED: &str = "stopped";
 
 /// What follows an iteration.
@@ -26,7 +26,7 @@ pub(super) struct Decision {
     pub stop: Option<(ExitCode, &'static str)>,
 }
 
-/// What all must know to decide.
+/// What all ranks must know to decide.
 #[derive(Serialize, Deserialize)]
 struct Vote {
     stop: bool,
@@ -36,7 +36,7 @@ struct Vote {
     weights: u32,
 }
 
-/// Computes, and leaves reporting and saving to the first.
+/// Computes, and leaves reporting and saving to the first rank.
 pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
     let mut plan = Plan::receive(exchange)?;
@@ -67,14 +67,14 @@ pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCod
 }
 
 impl Session {
-    /// Agrees with the others on what follows this iteration, and checks that all have the same weights. `by_file` says that the
-    /// user has asked for a stop by a file; `improved`, that this iteration had the best evaluation so far.
+    /// Agrees with the other ranks on what follows this iteration, and checks that all have the same weights. `by_file`: the
+    /// user has asked for a stop by a file. `improved`: this iteration had the best evaluation so far.
     ///
     /// # Errors
     /// Fails if the weights differ.
     pub(super) fn decide(&self, requests: &Requests, by_file: bool, improved: bool) -> Result<Decision> {
         let exchange = &self.agent.exchange;
-        // Alone, the next iteration stops at once.
+        // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop().load(Ordering::Relaxed);
         let weights = if exchange.is_alone() { 0 } else { self.agent.ppo.checksum() };
         let signal = if asked { requests.signal() } else { 0 };

@@ -1,4 +1,4 @@
-//! The log row of an iteration. Each value is named by the type that owns it; this module adds the groups and the order.
+//! The log row of an iteration. Each value is named by the type that owns it. This module adds the groups and the order.
 
 use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
@@ -9,9 +9,9 @@ use crate::tags::quantity;
 
 /// The scores of the episodes that ended in an iteration.
 pub(super) struct Ended {
-    /// Those that were the task as it is.
+    /// The score of the episodes of the task as it is.
     pub nominal: Score,
-    /// Those that were randomised, if the training has such.
+    /// The score of the randomised episodes, if the training has such.
     pub randomized: Option<Score>,
 }
 
@@ -22,15 +22,15 @@ impl Ended {
         Self { nominal: Score::of(&nominal, ctrl_dt), randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)) }
     }
 
-    /// Returns the score to show: that of the task as it is, where such episodes ended.
+    /// Returns the score to show: the score of the task as it is, if such episodes ended.
     pub(super) fn shown(&self) -> &Score {
         self.randomized.as_ref().filter(|_| self.nominal.episodes == 0).unwrap_or(&self.nominal)
     }
 }
 
-/// Returns the values of an iteration by name, always the same names in the same order: the episodes that ended in it, all its
-/// steps, the lesson, the evaluation (a score of no episodes if there was none), the update and the timings, with the traffic
-/// of the exchange.
+/// Returns the values of an iteration by name, always the same names in the same order. They cover the episodes that ended in
+/// it, all its steps, the lesson and the evaluation (a score of no episodes if there was none). Then come the update and the
+/// timings, with the traffic of the exchange.
 pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     let Outcome { iteration, steps, evaluation, traffic, .. } = outcome;
     let mut row = Vec::new();

@@ -10,12 +10,12 @@ use crate::quat;
 use crate::repose::{Repose, Task};
 use crate::rng;
 
-/// The number of episodes, and their steps; in the first ones the object settles.
+/// The number of episodes, and their steps. In the first ones the object settles.
 const EPISODES: u64 = 16;
 const STEPS: usize = 400;
 const SETTLING: usize = 60;
 
-/// The standard deviation of the actions, which is that of an untrained policy by default.
+/// The standard deviation of the actions. An untrained policy has the same by default.
 const STD: f32 = 0.6;
 
 /// The mobility of the built-in hand, rad in 100 steps.
@@ -28,7 +28,7 @@ pub(super) fn mobility(task: &Arc<Task>) -> String {
     let (rate, object) = (100.0 * turned / f64::from(steps.max(1)), &task.hand().parts.object);
     format!(
         "random actions turn `{object}` by {rate:.2} rad in 100 steps (the built-in hand: {OF_BUILTIN}), and drop it in {drops} of \
-         {EPISODES} episodes; docs/HANDS.md tells what raises the first"
+         {EPISODES} episodes; docs/HANDS.md says how to raise the turning rate"
     )
 }
 

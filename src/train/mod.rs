@@ -41,8 +41,8 @@ use session::Session;
 /// several processes, they train together.
 ///
 /// # Errors
-/// Fails if settings, files or the scene cannot be used, if the run folder cannot be written to at the start or at the end, if a
-/// loss is not finite, or after a panic. One of several ends all others then, and does not return.
+/// Fails if settings, files or the scene cannot be used, if a loss is not finite, or after a panic. Fails if the run folder
+/// cannot be written to at the start or at the end. One of several processes then ends all others, and does not return.
 pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
     ranks::together(|exchange| match exchange.is_first() {
         true => lead(args, requests, exchange),
@@ -56,8 +56,8 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     let place = saver.held.folder.path().display().to_string();
     if session.finished() {
         let advice = match session.is_flat() {
-            true => "its evaluations no longer rise; --fork continues it",
-            false => "a larger --total-steps continues it",
+            true => "its evaluations no longer rise; use --fork to continue",
+            false => "use a larger --total-steps to continue",
         };
         os::say(&format!("{place} is finished: {}; {advice}", saver.held.steps_made()));
         return Ok(ExitCode::SUCCESS);
@@ -137,15 +137,15 @@ fn run(session: &mut Session, mut saver: Saver, report: &mut Report, requests: &
 }
 
 impl Session {
-    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. Who leads passes what reports
-    /// and saves. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
+    /// Runs one iteration: collects, learns, evaluates when that is due, and decides what follows. The first rank passes what
+    /// reports and saves. Returns `None` if a stop was requested meanwhile. If the iteration does not complete, only the state
     /// at the end of the previous one can be used.
     ///
     /// # Errors
     /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
     fn iterate(&mut self, requests: &Requests, mut lead: Option<Lead>) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
-        // With others, nobody can stop or save in the middle of an iteration: they wait for what is computed here.
+        // With other ranks, none can stop or save in the middle of an iteration: they wait for what is computed here.
         let never = Requests::none();
         let now = if self.agent.exchange.is_alone() { requests } else { &never };
         let iterate = || {
@@ -173,8 +173,8 @@ impl Session {
         caught(iterate).with_context(|| format!("iteration {number}"))
     }
 
-    /// Returns the histograms and the film that are due after this iteration; `None` if a stop was requested meanwhile. Only who
-    /// leads has some.
+    /// Returns the histograms and the film that are due after this iteration, or `None` if a stop was requested meanwhile. Only
+    /// the first rank has some.
     #[cfg_attr(not(feature = "video"), expect(unused_variables, reason = "only a film answers requests and may warn"))]
     fn media(&mut self, requests: &Requests, lead: Option<&mut Lead>) -> Option<Media> {
         let mut media = Media::default();
@@ -195,7 +195,7 @@ impl Session {
         Some(media)
     }
 
-    /// Returns the task as it is played now.
+    /// Returns the task with its present smoothing.
     fn task_now(&self) -> Arc<Task> {
         self.task.smoothed(self.config.at(self.agent.env_steps).env.act_moving_average)
     }
@@ -227,7 +227,7 @@ impl Session {
         Ok(true)
     }
 
-    /// Takes down an evaluation, if the score is one, and returns whether it is the best so far.
+    /// Records an evaluation, if the score is one, and returns whether it is the best so far.
     fn take_down(&mut self, evaluation: &Score) -> bool {
         let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
         let improved = found.beats(self.best);
@@ -239,7 +239,7 @@ impl Session {
         improved
     }
 
-    /// Plays the evaluation episodes, if they are `due`, and reports their score; returns `None` if a stop was requested meanwhile.
+    /// Plays the evaluation episodes, if they are `due`, and reports their score. Returns `None` if a stop was requested meanwhile.
     fn evaluate(&self, due: bool, requests: &Requests, mut lead: Option<&mut Lead>) -> Result<Option<Score>> {
         let ctrl_dt = self.task.config().ctrl_dt;
         if !due {
@@ -274,7 +274,7 @@ impl Session {
         self.diverged += steps.diverged;
         let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
-            // Warn once; the total is printed at the end.
+            // Warn once. The total is printed at the end.
             self.warned = true;
             report.warn(&warning);
         }
@@ -283,7 +283,7 @@ impl Session {
         self.far = if is_far { self.far.saturating_add(1) } else { 0 };
         if self.far == FAR_FOR {
             report.warn(&format!(
-                "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: steps are too \
+                "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: updates are too \
                  large; lower ppo.learning_rate_range or ppo.learning_rate"
             ));
         }
@@ -298,7 +298,7 @@ fn say_what_next(run: &Path) {
     os::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
 }
 
-/// Runs what may panic; a panic is an error.
+/// Runs what may panic. A panic becomes an error.
 fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
     let caught = catch_unwind(AssertUnwindSafe(run));
     caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))))

@@ -1,14 +1,14 @@
-//! What an iteration of a training gives back.
+//! The results of an iteration of a training.
 
 use super::lockstep::Decision;
 use crate::agent::Iteration;
 use crate::repose::{EpisodeStats, Lesson, Score, StepSums};
 use crate::run::Media;
 
-/// The results of one iteration, of all that exchange unless stated otherwise.
+/// The results of one iteration, of all ranks unless stated otherwise.
 #[derive(Debug, Default)]
 pub(super) struct Outcome {
-    /// The record of the iteration here.
+    /// The record of the iteration on this rank.
     pub iteration: Iteration<Lesson>,
     /// The episodes that ended.
     pub ended: Vec<EpisodeStats>,
@@ -18,8 +18,8 @@ pub(super) struct Outcome {
     pub evaluation: Score,
     /// The cost of the exchange while collecting and learning, by name.
     pub traffic: [(&'static str, f64); 2],
-    /// Histograms and film of the environments here.
+    /// Histograms and film of the environments of this rank.
     pub media: Media,
-    /// What follows.
+    /// What follows the iteration.
     pub decision: Decision,
 }

@@ -13,10 +13,10 @@ use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
 
-/// The saver of a training. It always holds the state at the end of the last complete iteration, which is what remains if the
-/// next one does not complete; or the state that was last handed over.
+/// The saver of a training. It always holds the state at the end of the last complete iteration, or the state that was last
+/// handed over. This state remains if the next iteration does not complete.
 ///
-/// Nothing in the folder of a resumed run is changed before the first iteration is done: until then, anyone who named the wrong
+/// Nothing in the folder of a resumed run is changed before the first iteration is done. Until then, a user who named the wrong
 /// run or checkpoint can stop.
 pub(super) struct Saver {
     /// What is to be saved, and where.
@@ -81,8 +81,9 @@ impl Saver {
         self.save_before_fatal_errors();
     }
 
-    /// Writes into the folder for the first time, unless that is done: the checkpoint that the training starts from, as the
-    /// newest; the logs, cut off after it; the settings. In this order, a run that is killed in between can be resumed.
+    /// Writes into the folder for the first time, unless that is done. The order is the checkpoint that the training starts
+    /// from (as the newest), the logs (cut off after it), and the settings. So a run that is killed in between can be
+    /// resumed.
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
@@ -113,7 +114,7 @@ impl Saver {
         Ok(())
     }
 
-    /// Gives the folder back after a training that has ended as it should. Another end leaves its mark in the lock file.
+    /// Releases the folder after a training that has ended normally. After any other end, the name stays in the lock file.
     pub(super) fn release(&mut self) {
         self.lock.take().into_iter().for_each(Locked::release);
     }
@@ -161,7 +162,7 @@ impl Saver {
     /// first iteration of a resumed run there is nothing to save.
     ///
     /// # Errors
-    /// Fails if the folder cannot be written to; the message states where the state is instead.
+    /// Fails if the folder cannot be written to. The message states where the state is instead.
     pub(super) fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
         let saved = if self.held.wrote { self.save(report) } else { Ok(()) };
         report.finish();
@@ -198,7 +199,7 @@ pub(super) struct Lead<'a> {
 }
 
 impl Lead<'_> {
-    /// Saves the state at the end of the last complete iteration, if that is requested. What takes long calls this meanwhile.
+    /// Saves the state at the end of the last complete iteration, if that is requested. Work that takes long calls this meanwhile.
     pub(super) fn save_if_asked(&mut self, requests: &Requests) {
         if self.saver.held.wrote && requests.take_save() {
             self.saver.save_or_warn(self.report);
@@ -218,7 +219,7 @@ impl Held {
         write(folder, self.best.as_deref().filter(|_| unsaved), &self.last, keep)
     }
 
-    /// Saves the state elsewhere after it could not be saved in its folder for this `reason`; returns an error for both.
+    /// Saves the state elsewhere after it could not be saved in its folder for this `reason`. Returns an error for both.
     pub(super) fn elsewhere(&self, reason: Error) -> Error {
         let saved = RunFolder::for_now().and_then(|run| match self.write(&run, 1) {
             Ok(()) => Ok(run),
@@ -247,9 +248,9 @@ impl Held {
     }
 }
 
-/// Returns the score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run: that of the best
-/// checkpoint in the folder; if that is lost, of the policy that was made from it; if that is lost too, the one stored in the
-/// resumed checkpoint.
+/// Returns the score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run. It is the score
+/// of the best checkpoint in the folder. If that is lost, the score of the policy that was made from it counts, else the score
+/// in the resumed checkpoint.
 pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<Evaluation>) -> Option<Evaluation> {
     let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
     score(&folder.checkpoints().best()).or_else(|| score(&folder.policy())).or(resumed)
@@ -268,7 +269,7 @@ fn write(folder: &RunFolder, best: Option<&Checkpoint>, last: &Checkpoint, keep:
     checkpoints.write(last.progress.iteration, &last.to_bytes()?, keep)
 }
 
-/// Ensures that the policy file is that of the best checkpoint or, if nothing was scored yet, that of `last`.
+/// Ensures that the policy file belongs to the best checkpoint or, if nothing was scored yet, to `last`.
 fn keep_policy(folder: &RunFolder, last: &Checkpoint) -> Result<()> {
     let score = |checkpoint: &Checkpoint| checkpoint.progress.best;
     let shared = load::read(&folder.policy()).ok().as_ref().and_then(score);

@@ -36,7 +36,7 @@ pub(super) struct Session {
     /// What films evaluation episodes, as long as that works.
     #[cfg(feature = "video")]
     pub films: Option<EpisodeFilms>,
-    /// The number of steps of this session on which the physics diverged.
+    /// The number of steps of this session in which the physics diverged.
     pub diverged: u64,
     /// Whether the warning about them was printed.
     pub warned: bool,
@@ -132,7 +132,7 @@ impl Session {
         }
         self.rise = checkpoint.progress.rise;
         if !checkpoint.is_of_scene(&self.scene) && agent.exchange.is_first() {
-            os::say("warning: the scene is not the one of the checkpoint: the resumed run is a different training");
+            os::say("warning: the scene differs from the checkpoint's scene: the resumed run is a different training");
         }
         checkpoint.finish()
     }

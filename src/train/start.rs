@@ -1,4 +1,4 @@
-//! What a training starts from: settings, and a policy or a state. Only who leads a training needs the files; others receive the
+//! What a training starts from: settings, and a policy or a state. Only the first rank needs the files. The others receive the
 //! plan.
 
 use std::path::{Path, PathBuf};
@@ -22,11 +22,11 @@ use crate::run::{self, RunFolder};
 pub(super) struct Plan {
     /// The settings of the run.
     pub config: Config,
-    /// The checkpoint that it starts from, and what it takes from it; without one, it starts from random weights.
+    /// The checkpoint that it starts from, and what it takes from it. Without one, it starts from random weights.
     pub from: Option<(Takes, Checkpoint)>,
     /// The best evaluation so far.
     pub best: Option<Evaluation>,
-    /// What cannot be done if it cannot start from that.
+    /// The context of the error if it cannot start from that.
     pub context: Option<String>,
     /// Whether to write the steps that led to diverged states.
     pub dumps: bool,
@@ -35,11 +35,11 @@ pub(super) struct Plan {
 /// What a training takes from the checkpoint that it starts from.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) enum Takes {
-    /// The policy; all else is as in any new run.
+    /// The policy. Everything else is as in any new run.
     Policy,
     /// The whole state.
     State,
-    /// The whole state, under settings that have changed from those in the checkpoint.
+    /// The whole state, under settings that differ from the checkpoint's.
     Fork,
 }
 
@@ -102,7 +102,7 @@ impl Plan {
         let checkpoints = folder.checkpoints();
         ensure!(
             !checkpoints.newest_first().is_empty(),
-            "{} holds no checkpoint; what ended before its first one is begun again by the command that began it",
+            "{} holds no checkpoint: the run ended before it saved one; repeat the command that started it",
             place.display()
         );
         let lock = folder.lock()?;
@@ -115,8 +115,8 @@ impl Plan {
         expect_same(&checkpoint, &path, args)?;
         let config = config.with_context(|| context.clone())?;
         expect_config(&folder, &config)?;
-        // The best is the one in the folder. It may have been saved after the checkpoint that is resumed, and a worse one must
-        // not replace it.
+        // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
+        // one must not replace it.
         let best = best_so_far(&folder, checkpoint.progress.best);
         let from_newest = os::same_file(&path, &newest[0]);
         let from = Some((Takes::State, checkpoint));
@@ -125,14 +125,14 @@ impl Plan {
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
-    /// change unless they determine the size of the state or the kind of policy; nets may become wider.
+    /// change unless they determine the size of the state or the kind of policy. Nets may become wider.
     ///
     /// # Errors
     /// Fails if the checkpoint cannot be resumed from, or if the settings do not fit it.
     fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
         if matches!(PolicySource::find(place), Ok(PolicySource::BuiltIn(_))) {
             let name = place.display();
-            bail!("--fork {name}: a policy alone, without the state of a training; use --init {name} to start from it");
+            bail!("--fork {name}: a built-in policy has no training state; use --init {name} to start from it");
         }
         let context = || format!("cannot fork {}", place.display());
         let (path, checkpoint) = load::newest_sound(|| checkpoints_at(place)).with_context(context)?;
@@ -155,7 +155,7 @@ impl Plan {
         let progress = &mut checkpoint.progress;
         ensure!(
             progress.env_steps < config.run.total_steps,
-            "run.total_steps = {}: the checkpoint has made {} already; set the new total with --total-steps",
+            "run.total_steps = {}: the checkpoint is at step {} already; set a larger total with --total-steps",
             config.run.total_steps,
             progress.env_steps
         );
@@ -177,7 +177,7 @@ impl Plan {
                 Some((_, checkpoint)) => load::record(checkpoint, &net)?,
                 None => task.record().with(net.symmetry),
             };
-            // What is written can be read.
+            // What is written must be readable.
             Record::parse(&record.to_text())?;
             Ok((task.for_policy(&record)?, record))
         };
@@ -200,7 +200,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Returns the plan that the first has sent.
+    /// Returns the plan that the first rank has sent.
     ///
     /// # Errors
     /// Fails if the sender runs another version of the program.
@@ -212,7 +212,7 @@ impl Plan {
     }
 }
 
-/// Returns the checkpoint `place`, or those of the run there, the newest first.
+/// Returns the checkpoint `place`, or the checkpoints of the run there, the newest first.
 fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
     if !place.is_dir() {
         return Ok(vec![place.to_owned()]);
@@ -220,7 +220,7 @@ fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
     Ok(RunFolder::containing(place)?.checkpoints().newest_first())
 }
 
-/// Returns the single settings, including those that have their own options.
+/// Returns the single settings, including settings that have their own options.
 fn overrides(args: &TrainArgs) -> Vec<Override> {
     let options = [
         ("run.seed", args.seed),
@@ -246,7 +246,7 @@ fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result
     Ok(())
 }
 
-/// Checks that the settings in the folder are those of the checkpoint, because edits to them would be ignored.
+/// Checks that the settings in the folder match the checkpoint, because edits to them would be ignored.
 fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     let Some((path, text)) = folder.config()? else { return Ok(()) };
     let advice = format!("restore {} or delete it; to change settings, start a new run with --fork", path.display());
@@ -282,11 +282,11 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Checks that the scene is that of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
+/// Checks that the scene is the scene of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
     let same = checkpoint.is_of_scene(&Task::new(&before, &config.hand)?.scene().fingerprint());
-    ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork keeps", config.env.model);
+    ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep", config.env.model);
     Ok(())
 }

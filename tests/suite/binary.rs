@@ -94,7 +94,7 @@ fn where_there_is_no_run_the_built_in_policy_is_played_and_turns_the_cube() {
     let args = ["play", "--episodes", "32", "--json"];
     let score = json(&succeeded(program(folder.path(), &args)));
     assert_eq!(score["checkpoint"], "built into the program");
-    // 5.8 are expected, with a standard error of 0.3; a hand that hovers beside its goals, or holds still, reaches none.
+    // 5.8 are expected, with a standard error of 0.3. A hand that hovers beside its goals, or holds still, reaches none.
     assert!(score["goals_per_episode"].as_f64().unwrap() > 1.5, "{score}");
     assert!(score["drop_rate"].as_f64().unwrap() < 0.4, "{score}");
     assert!(include_bytes!("../../assets/policies/repose.safetensors").len() < 4 << 20);
@@ -264,7 +264,7 @@ fn a_file_of_an_older_version_is_refused_by_one_sentence_that_names_the_version(
     }
 }
 
-/// Puts back into a checkpoint what version 0.2.0 wrote besides.
+/// Puts back into a checkpoint what version 0.2.0 additionally wrote.
 const AS_0_2_0: &str = "
 import json, struct, sys
 sys.path.insert(0, sys.argv[1])
@@ -399,7 +399,7 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     assert!(
         svg.contains("value loss") && svg.contains("hours") && svg.contains("width=\"400\"") && !svg.contains("goals")
     );
-    // Among several runs, those without rows are left out; alone they are an error.
+    // Among several runs, runs without rows are left out. Alone they are an error.
     fs::create_dir(folder.path().join("begun")).unwrap();
     let header = fs::read_to_string(folder.path().join("run/metrics.csv")).unwrap().lines().next().unwrap().to_owned();
     fs::write(folder.path().join("begun/metrics.csv"), header + "\n").unwrap();

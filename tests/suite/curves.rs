@@ -40,7 +40,7 @@ fn by_default_a_tenth_of_the_shortest_run_is_smoothed_and_fifty_iterations_at_mo
         let table = format!("env_steps,time/collect_s,time/update_s,loss/value\n{rows}");
         fs::write(place.path().join(name), table).unwrap();
     }
-    // The numbers of points of the curves; shorter lines are those of axes and legend.
+    // The numbers of points of the curves. Shorter lines belong to axes and legend.
     let points = |tables: &[&str]| {
         succeeded(program(place.path(), &[&["plot", "--metric", "loss/value"], tables].concat()));
         let svg = fs::read_to_string(place.path().join("learning.svg")).unwrap();

@@ -1,4 +1,4 @@
-//! The documents: what they repeat of the program is true, their links lead somewhere, their lines can be read in a diff.
+//! The documents: what they repeat from the program is true, their links lead somewhere, and their lines can be read in a diff.
 
 use crate::support::task;
 use std::fs;
@@ -14,7 +14,7 @@ fn read(name: &str) -> String {
     fs::read_to_string(root().join(name)).unwrap()
 }
 
-/// Returns the documents that people read: those of the root, of docs/ and of docs/curves/.
+/// Returns the documents that people read: in the root, in docs/ and in docs/curves/.
 fn documents() -> Vec<PathBuf> {
     let is_document = |path: &PathBuf| path.extension().is_some_and(|kind| kind == "md");
     let folders = [root().to_owned(), root().join("docs"), root().join("docs/curves")];
@@ -111,7 +111,7 @@ fn every_setting_and_option_that_the_documents_name_exists() {
     for command in shadow_repose::cli::command().get_subcommands_mut() {
         help += &command.render_long_help().to_string();
     }
-    // The documents name options of this script beside those of the program.
+    // The documents name options of this script beside the program's.
     help += include_str!("../../examples/sweep/sweep.py");
     for path in documents().into_iter().filter(|path| !path.ends_with("CHANGELOG.md")) {
         let text = fs::read_to_string(&path).unwrap();
@@ -160,7 +160,8 @@ fn every_setting_and_option_that_the_documents_name_exists() {
     }
 }
 
-/// The evaluations that are nearest to these steps, by both commands of the built-in policy: goals, and for the first one drops.
+/// The evaluations that are nearest to these steps, by both commands of the built-in policy: goals, and drops for the first
+/// command.
 #[test]
 fn goals_by_time_are_those_of_the_tables() {
     let learning = read("docs/LEARNING.md");

@@ -49,8 +49,8 @@ fn an_exported_policy_sees_and_does_in_python_what_it_does_here() {
     runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--episodes", "2", "--json"]);
 }
 
-/// Steps the hand of deploy.py from each state of a trace, and prints how far it then is from the next state: the median, since the
-/// solver starts from the last step's forces, which a trace does not have.
+/// Steps the hand of deploy.py from each state of a trace, and prints how far it then is from the next state. This is the median,
+/// since the solver starts from the last step's forces, which a trace does not have.
 const REPLAY: &str = "
 import json, sys
 sys.path.insert(0, sys.argv[1])

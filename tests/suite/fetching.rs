@@ -1,4 +1,4 @@
-//! Fetching the meshes: what Python runs, and what it is told.
+//! Fetching the meshes: what Python runs, and with which arguments and variables.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;

@@ -136,7 +136,7 @@ fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
         ("ppo.activation=tanh", "ppo.activation = tanh: a fork keeps elu"),
         ("env.model=other.xml", "not the scene of the checkpoint"),
         ("ppo.hidden=[16,4]", "ppo.hidden = [16, 4]: nets of [16, 8] can only be made wider"),
-        ("run.total_steps=256", "run.total_steps = 256: the checkpoint has made 256 already"),
+        ("run.total_steps=256", "run.total_steps = 256: the checkpoint is at step 256 already"),
         ("ppo.horizont=4", "did you mean ppo.horizon?"),
     ] {
         let refused = fork(folder, "run", "fork", &["--set", "run.total_steps=512", "--set", set]);

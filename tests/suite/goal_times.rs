@@ -19,7 +19,7 @@ fn how_long_goals_take_is_what_the_trace_shows() {
     let cube = task(&[]).scene().free_body("cube").unwrap().qpos;
     let orientation = |of: &Value| -> Quat { std::array::from_fn(|i| of[i].as_f64().unwrap()) };
 
-    // Step and angle at which the goal in force was given; then episode, steps and angle of each goal that was reached.
+    // Step and angle at which the goal in force was given. Then episode, steps and angle of each goal that was reached.
     let (mut given, mut early) = ((0, 0.0), 0);
     let mut reached: Vec<(&Value, i64, f64)> = Vec::new();
     for (record, next) in records.iter().zip(records[1..].iter().chain([&Value::Null])) {

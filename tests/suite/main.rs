@@ -1,4 +1,4 @@
-//! Tests of the whole program; the name of each states the behaviour that it checks.
+//! Tests of the whole program. The name of each states the behaviour that it checks.
 
 // Some limits of the model are decimal numbers near multiples of π, on purpose.
 #![allow(clippy::approx_constant)]

@@ -104,7 +104,7 @@ fn a_trace_that_is_interrupted_leaves_nothing_behind() {
         assert!(
             Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
         );
-        // As for a program without handlers; a shell reports 128 plus the signal's number.
+        // As for a program without handlers. A shell reports 128 plus the signal's number.
         assert_eq!(child.wait().unwrap().signal(), Some(number));
         assert_eq!(names(folder), [""; 0], "{signal}");
     }
@@ -344,21 +344,21 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
     let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let own = ["--ckpt", "p.safetensors"];
     let refused: [(&[&str], &[&str], &str); 15] = [
-        (&["export"], &["--ckpt", "p.safetensors", "--out", "p.safetensors"], "is read"),
-        (&["export"], &["--ckpt", "p.safetensors", "--out", "./run/../p.safetensors"], "is read"),
-        (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "is read"),
-        (&["export"], &["--ckpt", "p.safetensors", "--out", "soft.svg"], "is read"),
-        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/best.safetensors"], "is read"),
-        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "keeps a file"),
-        (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "keeps a file"),
-        (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "keeps a file"),
-        (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "is read"),
-        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "keeps a file"),
-        (&play, &["--trace", "run/finished", "--ckpt", "builtin"], "keeps a file"),
-        (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "is read"),
-        (&["play", "--robustness", "--out", "hard.svg"], &own, "is read"),
-        (&["plot", "table.svg"], &["--out", "table.svg"], "is read"),
-        (&["bench", "--only", "iteration", "--out", "soft.svg"], &own, "is read"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "p.safetensors"], "the input"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "./run/../p.safetensors"], "the input"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "the input"),
+        (&["export"], &["--ckpt", "p.safetensors", "--out", "soft.svg"], "the input"),
+        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/best.safetensors"], "the input"),
+        (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "reserves"),
+        (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "reserves"),
+        (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "reserves"),
+        (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "the input"),
+        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "reserves"),
+        (&play, &["--trace", "run/finished", "--ckpt", "builtin"], "reserves"),
+        (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "the input"),
+        (&["play", "--robustness", "--out", "hard.svg"], &own, "the input"),
+        (&["plot", "table.svg"], &["--out", "table.svg"], "the input"),
+        (&["bench", "--only", "iteration", "--out", "soft.svg"], &own, "the input"),
     ];
     for (command, more, reason) in refused {
         let output = program(folder, &[command, more].concat());
@@ -407,7 +407,7 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
         let model = format!("env.model=scenes/{scene}");
         let output = program(folder, &[command, more, &["--set", &model]].concat());
         let said = stderr(&output);
-        assert!(output.status.code() == Some(1) && said.contains("is read"), "{more:?}: {said}");
+        assert!(output.status.code() == Some(1) && said.contains("the input"), "{more:?}: {said}");
     }
     assert_eq!(fs::read_to_string(folder.join("scenes/meshes/m.obj")).unwrap(), corners);
     assert_eq!(fs::read_to_string(folder.join("scenes/parts/more.svg")).unwrap(), more);
@@ -444,7 +444,7 @@ fn in_a_run_only_the_names_of_its_own_files_are_taken_even_before_they_are_there
         let output = export(taken);
         let said = stderr(&output);
         assert!(
-            output.status.code() == Some(1) && said.contains("the run ") && said.contains("keeps"),
+            output.status.code() == Some(1) && said.contains("the run ") && said.contains("reserves"),
             "{taken}: {said}"
         );
     }

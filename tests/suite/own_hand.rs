@@ -174,7 +174,7 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
             &["has no body `none`; has no joint `δ`"],
         ),
         (&THREE_FINGERS.to_owned(), &["hand.start=flat"], &["has no keyframe `flat`"]),
-        (&THREE_FINGERS.to_owned(), &["hand.joints=[\"α turn\",\"α turn\"]"], &["is asked for `α turn` twice"]),
+        (&THREE_FINGERS.to_owned(), &["hand.joints=[\"α turn\",\"α turn\"]"], &["`α turn` is named twice"]),
         (
             &THREE_FINGERS.replace("joint=\"α turn\" ctrl", "joint=\"α turn\" gear=\"2\" ctrl"),
             &["hand.fingertips=[\"x\"]"],

@@ -1,4 +1,4 @@
-//! What a user's scene says, and what the settings replace of it.
+//! What a user's scene says, and what the settings replace in it.
 
 use std::fs;
 use std::path::Path;

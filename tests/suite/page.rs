@@ -1,4 +1,4 @@
-//! The page that shows a hand in a browser: what a file holds, what a browser makes of it, and the server of a live page.
+//! The page that shows a hand in a browser: what a file holds, what a browser does with it, and the server of a live page.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -242,7 +242,7 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
         (changed(&[(1, &older)]), &[], "an older version wrote it"),
         (text.clone(), &["--set", "env.ctrl_dt=0.02"], "a trace has its own settings"),
         (fs::read_to_string(folder.join("own.jsonl")).unwrap(), &[], "add --set env.model=joints.xml"),
-        (text.clone(), &["--set", "env.model=joints.xml"], "it is of another hand, with other joints"),
+        (text.clone(), &["--set", "env.model=joints.xml"], "it was recorded with another hand, which has other joints"),
     ] {
         fs::write(folder.join("bad.jsonl"), text).unwrap();
         let output = program(folder, &[&["play", "--html", "x.html", "--from-trace", "bad.jsonl"], sets].concat());
@@ -257,7 +257,7 @@ fn chromium(options: &[&str], page: &str) -> Option<(String, String)> {
     let folder = tempfile::tempdir().unwrap();
     let own = format!("--user-data-dir={}", folder.path().display());
     let mut chromium = Command::new("chromium");
-    // Without a sandbox, which a container does not allow; messages of the page's console go to stderr.
+    // Without a sandbox, which a container does not allow. Messages of the page's console go to stderr.
     chromium.args(["--headless", "--no-sandbox", "--enable-logging=stderr", "--virtual-time-budget=4000", &own]);
     let output = chromium.args(["--window-size=900,700"]).args(options).arg(page).output();
     let Ok(output) = output else {
@@ -352,7 +352,7 @@ impl Drop for Live {
     }
 }
 
-/// A stream of events, and when all that is waited for must have come.
+/// A stream of events, and the time by which all awaited events must have come.
 struct Events(BufReader<TcpStream>, Instant);
 
 impl Events {

@@ -216,7 +216,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     let bare: Vec<&str> = text.lines().filter(|line| !words.iter().any(|word| line.contains(word))).collect();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bare.xml");
-    // What a class says of the mass of its geoms must not make the plates heavy.
+    // What a class says about the mass of its geoms must not make the plates heavy.
     let bare = bare.join("\n").replace("<default>\n", "<default>\n    <geom mass=\".02\"/>\n");
     assert!(bare.contains("<geom mass="));
     std::fs::write(&path, bare).unwrap();
@@ -377,7 +377,7 @@ fn the_camera_is_where_it_was_asked_to_be_with_another_mass_too() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    // The upper half shows the goal and the sky; the cube, below, moves as its mass makes it.
+    // The upper half shows the goal and the sky. The cube, below, moves according to its mass.
     let upper_half = |camera: &str, more: &[&str]| {
         let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--camera", camera];
         succeeded(program(folder.path(), &[&args[..], &["--screenshot", "x.png"], more].concat()));

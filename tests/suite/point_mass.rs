@@ -107,7 +107,7 @@ pub(crate) fn settings() -> PpoConfig {
     config(&[&settings[..], &["ppo.symmetry=none"]].concat()).ppo
 }
 
-/// Trains for 60 iterations; returns the mean distance at the end of episodes, for the first and the last iteration with any.
+/// Trains for 60 iterations. Returns the mean distance at the end of episodes, for the first and the last iteration with any.
 fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
     let mut agent = agent(settings, seed);
     let mut distances = Vec::new();
@@ -137,7 +137,7 @@ fn ppo_learns_with_candles_tensors_too() {
     assert!(first > 0.5 && last < 0.15, "{first} → {last}");
 }
 
-/// Only on a processor with a unit for bf16; on others, the tests of the program check the refusal.
+/// Only on a processor with a unit for bf16. On others, the tests of the program check the refusal.
 #[test]
 fn ppo_learns_in_bf16_where_the_processor_has_it() {
     let settings = PpoConfig { precision: Precision::Bf16, ..settings() };

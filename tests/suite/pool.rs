@@ -30,7 +30,7 @@ struct Block<'a> {
 }
 
 impl Block<'_> {
-    /// Steps the block; `actions` are those of all environments.
+    /// Steps the block. `actions` belong to all environments.
     fn step(&mut self, actions: &[f32]) {
         let actions = &actions[self.first * 20..][..self.envs.count() * 20];
         self.envs.step(actions, &mut self.rewards, &mut self.observations).unwrap();
@@ -41,7 +41,7 @@ impl Block<'_> {
             // Where an episode ended, a new one has begun: only there is the previous action zero.
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
             if end.is_some() {
-                // The final observation is that of this environment: it shows its last action.
+                // The final observation belongs to this environment: it shows its last action.
                 let action = &actions[i * 20..][..20];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
                 assert_eq!(self.envs.final_observations[rows][137..], last);

@@ -310,7 +310,7 @@ fn randomised_episodes_begin_with_their_ramp_and_those_under_way_stay_what_they_
     let ends = |row: &&Vec<String>| !row[length].is_empty() && row[length] != "NaN";
     let first = table[1..].iter().find(ends).expect("randomised episodes end")[steps].parse::<u64>().unwrap();
     assert!((1281..5120).contains(&first), "they begin after 1280 steps: the first one ended at {first}");
-    // The hands are in the middle of episodes that began before the ramp.
+    // The environments are in the middle of episodes that began before the ramp.
     trained("part", "1408");
     succeeded(program(folder, &["train", "--resume", "part", "--total-steps", "5120"]));
     assert!(latest("whole") == latest("part"));

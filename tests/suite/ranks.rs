@@ -24,7 +24,7 @@ struct Seat {
 
 struct Table {
     barrier: Barrier,
-    /// What each rank has put down.
+    /// What each rank has sent.
     put: Mutex<Vec<Vec<u8>>>,
 }
 
@@ -89,7 +89,7 @@ fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Exchange)
     })
 }
 
-/// The weights as bits; figures of each update and the statistics of the normaliser, as bits; and the episodes that ended.
+/// The weights as bits, figures of each update and the statistics of the normaliser as bits, and the episodes that ended.
 type Learnt<T> = (Vec<u32>, Vec<u64>, Vec<T>);
 
 fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode> {
@@ -214,7 +214,7 @@ fn all_ranks_together_send_no_more_than_a_ring_would() {
         let all = on_ranks(ranks, 8, work);
         let sent = all.iter().map(|(bytes, _, _)| bytes).sum::<f64>() as u64;
         let (_, parameters, steps) = all[0];
-        // A ring sends each value 2 (n - 1) times; the rest are losses, norms and statistics.
+        // A ring sends each value 2 (n - 1) times. The rest are losses, norms and statistics.
         let ring = (8 * (ranks - 1) * parameters * steps) as u64;
         assert!((ring..ring + 2000 * (ranks * ranks * steps) as u64).contains(&sent), "{sent} against {ring}");
     }

@@ -18,7 +18,7 @@ fn run_of_ten(folder: &Path, more: &[&str]) {
     succeeded(program(folder, &train(&[&args, more].concat())));
 }
 
-/// Returns the inode number and the bytes of every file in a folder and below, by name; two names of one file share the inode.
+/// Returns the inode number and the bytes of every file in a folder and below, by name. Two names of one file share the inode.
 pub(crate) fn everything(folder: &Path) -> BTreeMap<String, (u64, Vec<u8>)> {
     let mut found = BTreeMap::new();
     for name in names(folder) {
@@ -87,7 +87,7 @@ fn rollouts_grow_by_whole_multiples_and_resume_on_either_side_of_it() {
     let rows = metrics(&folder.join("run"));
     let at = rows[0].iter().position(|name| name == "env_steps").unwrap();
     let steps: Vec<&str> = rows[1..].iter().map(|row| row[at].as_str()).collect();
-    // 16 hands make 8 steps each up to 256, 16 up to 512, and then 24.
+    // 16 environments make 8 steps each up to 256, 16 up to 512, and then 24.
     assert_eq!(steps, ["128", "256", "512", "896", "1280"]);
     let expected = result(folder, "run");
     for iteration in [1, 2, 3] {
@@ -98,10 +98,10 @@ fn rollouts_grow_by_whole_multiples_and_resume_on_either_side_of_it() {
         assert!(result(folder, "run") == expected, "from iteration {iteration}");
     }
     for (set, reason) in [
-        ("ppo.horizon={from=8,to=20}", "must be a whole number, or end with a whole multiple of it"),
-        ("ppo.horizon={from=8,to=4}", "must be a whole number, or end with a whole multiple of it"),
+        ("ppo.horizon={from=8,to=20}", "must be a whole number, or a ramp that ends at a multiple of its start"),
+        ("ppo.horizon={from=8,to=4}", "must be a whole number, or a ramp that ends at a multiple of its start"),
         ("ppo.horizon=2.5", "must be a whole number"),
-        ("ppo.horizon={from=16,to=1600000}", "must make at most 2^22 samples"),
+        ("ppo.horizon={from=16,to=1600000}", "must give at most 2^22 samples"),
     ] {
         let output = program(folder, &train(&["--set", set]));
         assert!(output.status.code() == Some(1) && stderr(&output).contains(reason), "{set}: {}", stderr(&output));

@@ -35,7 +35,7 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
     fs::write(&latest, bytes).unwrap();
     let output = succeeded(resume(folder.path(), &[]));
     let said = stderr(&output);
-    assert!(said.contains("warning: cannot use") && said.contains("checksum") && said.contains("one before"), "{said}");
+    assert!(said.contains("warning: cannot use") && said.contains("checksum") && said.contains("previous"), "{said}");
     assert!(said.contains("1 rows of metrics.csv after iteration 3 are dropped"), "{said}");
     assert!(result(folder.path(), "run") == expected);
     for name in names(&folder.path().join("run/checkpoints")) {
@@ -60,7 +60,7 @@ fn a_training_whose_folder_was_given_to_another_one_keeps_out_of_it() {
     send("CONT", &first);
     let (code, said) = ended_by("TERM", first, first_lines);
     assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("is being trained in by another program") && said.contains("instead"), "{said}");
+    assert!(said.contains("is in use by another program") && said.contains("instead"), "{said}");
     assert_eq!(ended_by("TERM", second, second_lines).0, Some(143));
     let made = iterations(folder.path());
     succeeded(resume(folder.path(), &["--total-steps", &((made + 1) * 128).to_string()]));
@@ -140,7 +140,7 @@ fn a_training_that_was_killed_before_its_first_checkpoint_is_begun_again_by_the_
         fs::create_dir_all(run.join("checkpoints")).unwrap();
         left.iter().for_each(|name| fs::write(run.join(name), "").unwrap());
         let refused = resume(folder.path(), &[]);
-        assert!(stderr(&refused).contains("begun again by the command that began it"), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains("repeat the command that started it"), "{}", stderr(&refused));
         succeeded(program(folder.path(), &args));
         assert!(!run.join("checkpoints/.shadow-repose-1-0.partial").exists());
         fs::remove_dir_all(&run).unwrap();

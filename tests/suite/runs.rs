@@ -1,4 +1,4 @@
-//! The command `runs`: what it finds in folders of runs, and what it makes of two.
+//! The command `runs`: what it finds in folders of runs, and how it compares two.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -58,7 +58,7 @@ fn the_state_of_a_run_is_found_while_it_trains_and_after_each_kind_of_end() {
     assert!(child.wait().unwrap().success());
     assert_eq!(state(), "stopped");
 
-    // An error that the training itself reports: its folder is given to somebody else.
+    // An error that the training itself reports: a file stands in place of its folder of checkpoints.
     let (mut child, lines) = resumed();
     fs::remove_dir_all(folder.join("all/run/checkpoints")).unwrap();
     fs::write(folder.join("all/run/checkpoints"), "").unwrap();
@@ -174,7 +174,7 @@ fn damaged_and_foreign_folders_are_told_or_left_out_and_no_link_or_pipe_is_follo
     let about = |name: &str| all.iter().find(|run| run["name"].as_str().unwrap().starts_with(name)).unwrap();
     let problem = |name: &str| about(name)["problems"].to_string();
     assert!(
-        problem("older").contains("not one of this version") && problem("older").contains("ppo.of_old: unknown key")
+        problem("older").contains("does not fit this version") && problem("older").contains("ppo.of_old: unknown key")
     );
     assert!(about("older")["changed"].is_null() && about("older")["env_steps"] == 7);
     assert!(problem("noise").contains("not a TOML file") && problem("noise").contains("no column env_steps"));
@@ -184,7 +184,7 @@ fn damaged_and_foreign_folders_are_told_or_left_out_and_no_link_or_pipe_is_follo
     assert!(problem("sparse").contains("larger than"), "{}", about("sparse"));
     assert!(about("odd")["env_steps"].is_null() && about("linked")["env_steps"].is_null());
     for (args, reason) in [
-        (&["runs", "all/foreign", "all/half"][..], "all/foreign holds no run; a folder of runs is named alone"),
+        (&["runs", "all/foreign", "all/half"][..], "all/foreign holds no run; to list a folder of runs, name it alone"),
         (&["runs", "all/half", "absent"], "absent: no such folder"),
         (&["runs", "absent"], "absent"),
         (&["runs", "all/letters", "all/half"], "cannot compare"),

@@ -56,7 +56,7 @@ pub(crate) fn send(signal: &str, child: &Child) {
     assert!(sent.success());
 }
 
-/// Ends a training by a signal; returns its exit code and what it printed afterwards.
+/// Ends a training by a signal. Returns its exit code and what it printed afterwards.
 pub(crate) fn ended_by(signal: &str, mut child: Child, lines: Lines<BufReader<ChildStderr>>) -> (Option<i32>, String) {
     send(signal, &child);
     let rest: Vec<String> = lines.map_while(|line| line.ok()).collect();
@@ -67,8 +67,8 @@ pub(crate) fn iterations(folder: &Path) -> u64 {
     metrics(&folder.join("run")).last().unwrap()[0].parse().unwrap_or(0)
 }
 
-/// Settings for episodes with contacts, goals that are reached and replaced, and ends, some of them in every iteration; for
-/// evaluations that are rarer than checkpoints; and for everything that training adds, with ramps that end during the run.
+/// Settings for episodes with contacts, goals that are reached and replaced, and ends, some of them in every iteration.
+/// Evaluations are rarer than checkpoints. Everything that training adds is there, with ramps that end during the run.
 const LONG: &[&str] = &[
     "--set=env.max_episode_seconds=2",
     "--set=env.success_tolerance=2",
@@ -201,7 +201,7 @@ fn each_signal_saves_the_last_whole_iteration_and_has_its_exit_code() {
     }
 }
 
-/// Returns whether this process was started with a signal ignored; its children inherit that.
+/// Returns whether this process was started with a signal ignored. Its children inherit that.
 fn ignored(signal: u32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();

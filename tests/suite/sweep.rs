@@ -129,7 +129,7 @@ fn a_sweep_keeps_the_program_that_it_began_with_and_its_folder_for_itself() {
     assert_eq!(fs::read(folder.join("runs/program")).unwrap(), fs::read(env!("CARGO_BIN_EXE_shadow-repose")).unwrap());
     let table = succeeded(sweep(folder).arg("--table").output().unwrap()).stdout;
     assert!(String::from_utf8_lossy(&table).contains("base, seed 0: "));
-    // Its training saves and ends by itself; until then the folder cannot be removed.
+    // Its training saves and ends by itself. Until then the folder cannot be removed.
     let lock = fs::File::open(folder.join("runs/base-0/run.lock")).unwrap();
     lock.lock().unwrap();
 }

@@ -97,7 +97,7 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
     let task = task(&[]);
     let (mut plain, mut observation) = started(&task);
     let (mut shaped, _) = started(&task);
-    // A tolerance so wide that, if the task used it, every step would pay the bonus.
+    // A tolerance so wide that, if the task used it, every step would get the bonus.
     let wide = ["training.tolerance=3.2"];
     let paid = ["training.task_reward=0.5", "training.progress_reward=100", "training.approach_reward=0"];
     shaped.set_lesson(lesson(0, &[&wide[..], &paid].concat()));
@@ -247,7 +247,7 @@ fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
             let shown = quat::canonical(env.goal()).map(|x| x as f32);
             assert_eq!(observation[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
         }
-        // If the time limit falls on the step that reaches the goal, the last observation is bootstrapped too.
+        // If the time limit falls on the step that reaches the goal, the last observation is also bootstrapped.
         env.skip_ahead(0.996);
         let goal = env.goal();
         let ends = [0, 1, 2, 3].map(|_| env.step(&[0.0; 20], &mut observation).end);
@@ -355,7 +355,7 @@ fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_r
     let still = ["env.reset_position_noise=0", "env.reset_dof_pos_noise=0"];
     let task = task(&still);
     let cube = task.hand().cube;
-    // The angular velocity that a falling cube gains in the first step, as a part of the most that is given.
+    // The angular velocity that a falling cube gains in the first step, as a fraction of the largest assistance.
     let gained = |env_steps: u64, episode: u64| {
         let mut env = Repose::new(&task);
         env.set_lesson(lesson(env_steps, &["training.assist={from=100,to=0,steps=1000}"]));

@@ -57,7 +57,7 @@ impl Display {
         ]);
         // The window takes the focus a little later.
         xdotool.args(["sleep", "0.5", "key", "--delay", "200"]).args(keys);
-        // xdotool reports an error if a key closes the window; the caller checks what the keys did.
+        // xdotool reports an error if a key closes the window. The caller checks what the keys did.
         xdotool.stderr(Stdio::null()).status().unwrap();
     }
 

@@ -1,4 +1,4 @@
-//! What the program says of itself: help, version, completions, and what comes next.
+//! What the program says about itself: help, version, completions, and what comes next.
 
 use crate::support::{command, program, stderr, succeeded, train};
 

@@ -1,4 +1,4 @@
-//! GIF: one palette for the whole film; each frame holds only what differs from the previous one.
+//! GIF: one palette for the whole film. Each frame holds only what differs from the previous one.
 
 use std::borrow::Cow;
 use std::io::{BufWriter, Write};
@@ -9,7 +9,7 @@ use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
 use super::format::{FilmFormat, Frames};
 
-/// The number of colours in the palette; the index after them leaves a pixel unchanged.
+/// The number of colours in the palette. The index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
 const TRANSPARENT: u8 = COLOURS as u8;
 /// The most bytes of frames kept for choosing the palette, which suits the frames at the start.

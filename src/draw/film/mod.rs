@@ -1,4 +1,4 @@
-//! Films and pictures: H.264 in MP4, GIF, PNG; in files, or a GIF in memory.
+//! Films and pictures: H.264 in MP4, GIF and PNG files, or a GIF in memory.
 //!
 //! One thread draws a film and another encodes it, which keeps both cores of a small machine busy.
 
@@ -71,7 +71,7 @@ impl FilmWriter {
         self.encoder.is_finished()
     }
 
-    /// Completes the file; unless `keep`, abandons the film and leaves an existing file as it was.
+    /// Completes the file. Without `keep`, abandons the film and leaves an existing file as it was.
     ///
     /// # Errors
     /// Fails if the encoder or the file failed, on this or an earlier frame.

@@ -25,9 +25,9 @@ pub(super) struct Batch {
     pub old_means: Tensor,
     /// `[M, 1]`: factors on the standard deviations
     pub scales: Tensor,
-    /// `[M]`: of the actions under those distributions
+    /// `[M]`: log-densities of the actions under those distributions
     pub old_log_probs: Tensor,
-    /// `[M]`: of the critic at that time
+    /// `[M]`: values of the critic at that time
     pub old_values: Tensor,
     /// `[M]`
     pub advantages: Tensor,
@@ -62,7 +62,7 @@ impl Gaussian {
 /// Returns the loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
 /// the distribution `new` and `values` `[M]`.
 ///
-/// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
+/// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7. The value is clipped in the same way.
 ///
 /// # Errors
 /// Fails if the shapes do not match.
@@ -120,7 +120,7 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The expected values are those of this program (PyTorch). Clipping takes effect on one ratio and one value; each
+    /// The expected values come from this program (PyTorch). Clipping takes effect on one ratio and one value. Each
     /// sample has its own noise scale:
     /// ```python
     /// import torch

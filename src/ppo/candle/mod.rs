@@ -1,5 +1,6 @@
-//! The same computation with candle's tensors, layers and automatic differentiation: slower, the reference for the
-//! kernels, and the place to try a change of the algorithm first. No other folder names candle's crates.
+//! The same computation with candle's tensors, layers and automatic differentiation. It is slower, but it is the
+//! reference for the kernels, and the place to try a change of the algorithm first. No other folder names candle's
+//! crates.
 
 mod loss;
 
@@ -22,7 +23,7 @@ use loss::{Batch, Gaussian};
 /// The gradient backend in candle.
 pub(super) struct Reference {
     config: PpoConfig,
-    /// Those of the groups of the last minibatch.
+    /// The gradients of the groups of the last minibatch.
     gradients: Vec<Vec<f32>>,
 }
 
@@ -85,8 +86,8 @@ impl GradientBackend for Reference {
     }
 }
 
-/// Returns what the net of these layers computes from `x` `[M, O]`. Adds to `variables` those that hold its parameters, each with
-/// the range of its values among the parameters of the policy.
+/// Returns what the net of these layers computes from `x` `[M, O]`. Adds to `variables` the variables that hold its parameters,
+/// each with the range of its values among the parameters of the policy.
 fn forward(policy: &Policy, layers: &[Layer], x: &Tensor, variables: &mut Vec<(Range<usize>, Var)>) -> Result<Tensor> {
     let mut x = x.clone();
     for (i, Layer { inputs, outputs, weight, bias }) in layers.iter().enumerate() {

@@ -6,15 +6,15 @@
 use super::super::widest::widest;
 use crate::config::Activation;
 
-/// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|); x is clamped to [-87, 88].
+/// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|). The argument x is clamped to [-87, 88].
 ///
 /// With x = n ln 2 + r, |r| ≤ ln 2 / 2: e^x - 1 = 2ⁿ (e^r - 1) + (2ⁿ - 1), which loses no precision near 0. The
-/// polynomial for (e^r - 1 - r) / r² is that of `expf` in Cephes (S. L. Moshier).
+/// polynomial for (e^r - 1 - r) / r² is taken from `expf` in Cephes (S. L. Moshier).
 #[inline(always)]
 fn exp_m1(x: f32) -> f32 {
     /// 1.5 · 2²³: adding it rounds to a whole number, which is then in the low bits.
     const ROUND: f32 = 12_582_912.0;
-    /// ln 2 in two parts; the first has so few digits that its product with n is exact.
+    /// ln 2 in two parts. The first has so few digits that its product with n is exact.
     const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
     let x = x.clamp(-87.0, 88.0);
     let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);

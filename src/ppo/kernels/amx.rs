@@ -21,7 +21,7 @@ struct Tiles(());
 /// Checks that there are tiles for bf16, and requests the kernel's permission for this process to use them.
 ///
 /// # Errors
-/// Fails if the tiles are missing or may not be used; the message says which.
+/// Fails if the tiles are missing or may not be used. The message says which.
 pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
     const OSXSAVE: u32 = 1 << 27;
     const BF16_AND_TILE: u32 = 1 << 22 | 1 << 24;
@@ -36,13 +36,13 @@ pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
         return Err("the kernel does not save the processor's tiles (AMX)");
     }
     let (low, high): (u32, u32);
-    // SAFETY: OSXSAVE guarantees that the instruction exists; it only reads.
+    // SAFETY: OSXSAVE guarantees that the instruction exists. It only reads.
     unsafe { asm!("xgetbv", in("ecx") 0, out("eax") low, out("edx") high, options(nomem, nostack)) };
     if (u64::from(high) << 32 | u64::from(low)) & TILE_STATE != TILE_STATE {
         return Err("the kernel does not save the processor's tiles (AMX)");
     }
     let answer: i64;
-    // SAFETY: this call does not change memory of the process; the kernel allocates the state in its own memory.
+    // SAFETY: this call does not change memory of the process. The kernel allocates the state in its own memory.
     unsafe {
         asm!("syscall", inlateout("rax") ARCH_PRCTL => answer, in("rdi") ARCH_REQ_XCOMP_PERM,
             in("rsi") XFEATURE_XTILEDATA, lateout("rcx") _, lateout("r11") _, options(nostack));

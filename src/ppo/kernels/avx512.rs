@@ -13,8 +13,8 @@ use std::mem::transmute;
 use super::bf16::{BLOCK, DEPTH, LINES, Order, Packed, Tile, Unit, depth_of_block, in_blocks};
 use super::product::Matrix;
 
-/// Rows of a block that are computed together. With the two columns of tiles of a block, this takes 16 of the 32 registers
-/// for sums, enough to hide the delay of the instruction.
+/// Rows of a block that are computed together. With the two columns of tiles of a block, sums take 16 of the 32 registers.
+/// This is enough to hide the delay of the instruction.
 const ROWS: usize = 8;
 
 /// The permission to use the dot products.
@@ -31,7 +31,7 @@ pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
 }
 
 impl Unit for Dots {
-    /// Dot products read either order: what is taken is the one that needs no transposition.
+    /// Dot products read either order. The result is the order that needs no transposition.
     fn order_of_left(&self, lhs: Matrix) -> Order {
         let [_, along] = lhs.strides();
         if along == 1 { Order::Lines } else { Order::Pairs }
@@ -45,7 +45,7 @@ impl Unit for Dots {
                 let lhs = &lhs[first / LINES * depth..][..depth];
                 let out = &mut out[first * columns..];
                 // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `out` has
-                // eight more rows of 32 values at that distance; both halves of `rhs` have as many tiles as `lhs`.
+                // eight more rows of 32 values at that distance. Both halves of `rhs` have as many tiles as `lhs`.
                 unsafe {
                     match left {
                         Order::Lines => rows::<DEPTH, 2>(out, columns, lhs, first % LINES, rhs, add),
@@ -57,7 +57,7 @@ impl Unit for Dots {
     }
 }
 
-/// Computes eight rows of a block, from row `first` of the tiles `lhs` on, whose values are `LINE` apart from line to line
+/// Computes eight rows of a block, from row `first` of the tiles `lhs` on. Their values are `LINE` apart from line to line
 /// and `PAIR` from pair to pair.
 #[target_feature(enable = "avx512f,avx512bf16")]
 unsafe fn rows<const LINE: usize, const PAIR: usize>(

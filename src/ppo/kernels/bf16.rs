@@ -1,4 +1,4 @@
-//! bf16, the upper half of an f32: rounding, and packing of operands into tiles, and products of these block by block.
+//! bf16, the upper half of an f32: rounding, packing of operands into tiles, and products of tiles block by block.
 
 use std::fmt::Debug;
 
@@ -16,7 +16,7 @@ pub(super) const DEPTH: usize = 32;
 #[repr(C, align(64))]
 pub(super) struct Tile(pub [u16; LINES * DEPTH]);
 
-/// Rounds to the nearest bf16, ties to even; NaN stays NaN.
+/// Rounds to the nearest bf16, ties to even. NaN stays NaN.
 #[inline(always)]
 pub(super) fn round(x: f32) -> u16 {
     let bits = x.to_bits();
@@ -63,7 +63,7 @@ where
     let pair = 2 * depth;
     assert_eq!(lhs.tiles.len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
     assert_eq!(rhs.tiles.len(), columns.div_ceil(BLOCK) * pair, "tiles of the right matrix");
-    // The tiles of the right matrix in use stay in the cache while those of the left one stream past.
+    // The tiles of the right matrix in use stay in the cache while the tiles of the left one stream past.
     for (j, rhs) in rhs.tiles.chunks_exact(pair).enumerate() {
         for (i, lhs) in lhs.tiles.chunks_exact(pair).enumerate() {
             let (height, width) = ((rows - i * BLOCK).min(BLOCK), (columns - j * BLOCK).min(BLOCK));
@@ -103,8 +103,8 @@ pub enum Order {
     Pairs,
 }
 
-/// A matrix in tiles, padded with zeros: first all tiles along the first sixteen lines, then along the next sixteen, up
-/// to an even number of such groups.
+/// A matrix in tiles, padded with zeros. First come all tiles along the first sixteen lines, then along the next
+/// sixteen, up to an even number of such groups.
 #[derive(Default)]
 pub struct Packed {
     tiles: Vec<Tile>,

@@ -1,6 +1,6 @@
 //! The losses of PPO and their gradients with respect to the outputs of the nets, sample by sample.
 //!
-//! J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7; the value is clipped likewise.
+//! J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7. The value is clipped in the same way.
 
 use std::iter::repeat_n;
 
@@ -30,7 +30,7 @@ pub(super) struct Loss<'a> {
 pub(super) struct Sums {
     /// All but the KL divergence.
     losses: Losses,
-    /// `[A]`: squared differences of the means from those that acted, divided by the squared noise scales.
+    /// `[A]`: squared differences of the means from the means that acted, divided by the squared noise scales.
     squared_shifts: Vec<f32>,
 }
 
@@ -130,8 +130,8 @@ mod tests {
         assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
     }
 
-    /// The expected values are those of the formulas in the PyTorch program in `candle/loss.rs`, with a logarithm of -0.5 for both
-    /// actions, in doubles; gradients by central differences.
+    /// The expected values come from the formulas of the PyTorch program in `candle/loss.rs`, in doubles, with gradients by
+    /// central differences. Both actions have a standard deviation with the logarithm -0.5.
     #[test]
     fn losses_and_gradients_are_those_of_the_formulas() {
         let spaces = Spaces { observation_size: 1, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };

@@ -1,13 +1,12 @@
 //! Custom kernels: the gradient of a minibatch in one pass over its samples, without an autograd graph.
 //!
-//! The network inputs of all samples are computed once per rollout. The samples of a minibatch come in
-//! groups, and each (group, net) is one job for one thread. The job gathers a block of rows at a time, runs the
-//! forward pass, the loss and the backward pass while all of it is in the cache of that core, and accumulates the
-//! gradient of its group. Then the gradients of the groups are added as a binary tree, chunk by chunk, each with its
-//! squares for the norm. All threads meet after each of these parts (see [`super::clock`]). The grouping depends only on the
-//! settings, so the result is the same for any number of threads. After the first minibatch, the
-//! only float arrays that are allocated are the packing buffers of gemm and small temporaries of the sums; bf16 also
-//! packs the weights anew for each minibatch.
+//! The network inputs of all samples are computed once per rollout. The samples of a minibatch come in groups, and each
+//! (group, net) is one job for one thread. The job gathers a block of rows at a time, which stays in the cache of that core.
+//! It runs the forward pass, the loss and the backward pass on it, and accumulates the gradient of its group. Then the
+//! gradients of the groups are added as a binary tree, chunk by chunk, each with its squares for the norm. All threads wait
+//! for each other after each of these parts (see [`super::clock`]). The grouping depends only on the settings, so the result
+//! is the same for any number of threads. After the first minibatch, the only float arrays that are allocated are the
+//! packing buffers of gemm and small temporaries of the sums. bf16 also packs the weights anew for each minibatch.
 
 mod activation;
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]

@@ -88,9 +88,9 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. They are for forward and backward
-    /// passes if `learning`, else for many forward passes of few rows, where making them would take longer than the product. The
-    /// results are the same, bit for bit.
+    /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. With `learning`, they are for
+    /// forward and backward passes. Otherwise they are for many forward passes of few rows, where making them would take longer
+    /// than the product. The results are the same, bit for bit.
     pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learning: bool, clock: &Clock) {
         let mut parts = Vec::new();
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
@@ -126,7 +126,7 @@ impl<'a> Net<'a> {
         self.layers.last().expect("a net has layers").outputs
     }
 
-    /// Returns the activation after layer `l`; none after the last one.
+    /// Returns the activation after layer `l`, or none after the last one.
     fn activation_of(&self, l: usize) -> Option<Activation> {
         (l + 1 < self.layers.len()).then_some(self.activation)
     }

@@ -1,5 +1,5 @@
 //! Matrix products of slices on the calling thread. Callers run many of them in parallel, each on data that stays in
-//! the cache of one core, which is faster than one product on all threads.
+//! the cache of one core. This is faster than one product on all threads.
 
 #![expect(unsafe_code, reason = "the matrix product of gemm takes pointers")]
 
@@ -35,7 +35,7 @@ impl<'a> Matrix<'a> {
         self.size
     }
 
-    /// Returns the distances in the data between neighbours in a column and in a row; one of them is 1.
+    /// Returns the distances in the data between neighbours in a column and in a row. One of them is 1.
     pub fn strides(&self) -> [isize; 2] {
         self.strides
     }

@@ -27,12 +27,12 @@ fn dots() -> Answer<&'static str> {
 /// Requests the fastest unit of this processor, once per process.
 ///
 /// # Errors
-/// Fails if no unit is there and may be used and multiplies rightly; the message says why for each of them.
+/// Fails if no unit is present, permitted and correct. The message gives the reason for each unit.
 pub(super) fn request() -> Result<&'static dyn Unit> {
     static ANSWER: OnceLock<Answer<String>> = OnceLock::new();
     let answer = ANSWER.get_or_init(|| {
-        checked(tiles(), "the tiles (AMX) of this processor are wrong").or_else(|no_tiles| {
-            let dots = checked(dots(), "its dot products (AVX-512 BF16) are wrong");
+        checked(tiles(), "the tiles (AMX) of this processor multiply wrongly").or_else(|no_tiles| {
+            let dots = checked(dots(), "its dot products (AVX-512 BF16) are computed wrongly");
             dots.map_err(|no_dots| format!("{no_tiles}, and {no_dots}"))
         })
     });

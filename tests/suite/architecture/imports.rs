@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use syn::punctuated::Punctuated;
 use syn::visit::{self, Visit};
 
-/// The path of a module from the root of the crate; empty for the root.
+/// The path of a module from the root of the crate, empty for the root.
 type Module = Vec<String>;
 
 /// Returns the files that each file uses, as paths within src/.
@@ -159,7 +159,7 @@ impl<'ast> Visit<'ast> for Written {
     }
 
     fn visit_macro(&mut self, item: &'ast syn::Macro) {
-        // Arguments that are expressions between commas, as of `format!`, `assert!` and `vec!`; others are skipped.
+        // Arguments that are expressions between commas, as of `format!`, `assert!` and `vec!`. Others are skipped.
         let expressions = item.parse_body_with(Punctuated::<syn::Expr, syn::Token![,]>::parse_terminated);
         for expression in expressions.into_iter().flatten() {
             let mut inside = Written::default();
@@ -176,7 +176,7 @@ impl<'ast> Visit<'ast> for Written {
     }
 }
 
-/// Calls `tell` with the path and the local name of everything that a `use` imports; a glob has no name.
+/// Calls `tell` with the path and the local name of everything that a `use` imports. A glob has no name.
 fn imported(tree: &syn::UseTree, before: &mut Vec<String>, tell: &mut dyn FnMut(Vec<String>, Option<String>)) {
     match tree {
         syn::UseTree::Path(part) => {

@@ -33,7 +33,7 @@ const FENCES: [(&str, &[&str]); 15] = [
     ("plotters", &["draw"]),
 ];
 
-/// The files that may contain unsafe code; each allows it with a reason.
+/// The files that may contain unsafe code. Each allows it with a reason.
 const UNSAFE: [&str; 7] = [
     "ppo/kernels/amx.rs",
     "ppo/kernels/avx512.rs",
