@@ -1,8 +1,8 @@
-//! Where the time of an iteration goes, in the hands of a policy that grasps.
+//! Where the time of an iteration goes while a trained policy acts.
 //!
-//! A policy that grasps makes other contacts than a new one, and contacts are what the physics takes its time for. So a trained
-//! policy acts, whatever nets the settings ask for; these are timed on what it has seen. The environments' own
-//! time is computed by subtraction, so its error is that of the three measured times together.
+//! A trained policy grasps the cube, so it makes other contacts than a new one, and the physics spends its time on contacts. So
+//! a trained policy acts, whatever nets the settings define. Those nets are timed on the observations that it collects. The
+//! environments' own time is computed by subtraction, so it contains the errors of all three measured times.
 
 use std::time::Instant;
 
@@ -18,13 +18,13 @@ use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
 use crate::schedule::in_rounds;
 
-/// The control steps before measuring: from the catch of the cube until most hands turn it.
+/// The control steps before measuring: from the catch of the cube until most environments turn it.
 const BEFORE: usize = 160;
 
 /// The number of iterations that are measured.
 const ROUNDS: usize = 9;
 
-/// The parts of an iteration: what a reader is told that it is, and its key in JSON.
+/// The parts of an iteration: the name of each for a reader, and its key in JSON.
 pub(super) const PARTS: [(&str, &str); 4] = [
     ("physics (MuJoCo)", "iteration_physics_s"),
     ("observe, reward, reset", "iteration_environments_s"),
@@ -33,7 +33,7 @@ pub(super) const PARTS: [(&str, &str); 4] = [
 ];
 
 /// Returns the seconds of each of the [`PARTS`] of an iteration with these settings, as medians, while the policy of `origin`
-/// acts. The environments are without their physics.
+/// acts. The time of the environments excludes their physics.
 ///
 /// # Errors
 /// Fails if there is no such policy, or if it does not fit the task.

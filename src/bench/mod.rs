@@ -1,6 +1,7 @@
 //! Measuring the speed of this machine: the physics alone, the environments around it, the learner, whole iterations and their
 //! parts.
 
+mod environments;
 mod iteration;
 mod measure;
 mod replay;
@@ -26,8 +27,9 @@ use crate::repose::{Lesson, Randomization, Task};
 use crate::rng;
 use crate::run;
 use crate::schedule::in_rounds;
+use environments::environments;
 use iteration::{PARTS, seconds_of_parts};
-use measure::{NEVER, median};
+use measure::{Found, NEVER, median};
 use replay::{RecordingEnv, replay};
 
 /// The number of rounds of measuring physics and pool.
@@ -78,8 +80,12 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
         lines += &text;
     };
-    let measures: [(Part, Measure); 3] =
-        [(Part::Physics, physics_and_pool), (Part::Learner, learner), (Part::Training, end_to_end)];
+    let measures: [(Part, Measure); 4] = [
+        (Part::Physics, physics_and_pool),
+        (Part::Learner, learner),
+        (Part::Training, end_to_end),
+        (Part::Environments, environments),
+    ];
     for (_, measure) in measures.into_iter().filter(|(part, _)| args.only.is_none_or(|only| only == *part)) {
         tell(measure(&task, &config)?);
     }
@@ -90,9 +96,6 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     }
     os::print(&if args.json { format!("{figures}\n") } else { lines })
 }
-
-/// Figures by their keys in JSON, and lines that tell them.
-type Found = (Vec<(&'static str, f64)>, String);
 
 /// The measurement of a part.
 type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
@@ -145,7 +148,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
         drop(stepped);
         start.elapsed().as_secs_f64()
     };
-    // Unmeasured steps first, so that most cubes lie in the hand; fewer of them for many environments.
+    // Unmeasured steps first, so that most cubes lie in the hand. Many environments take fewer of them.
     for _ in 0..(2 * STEPS / envs).clamp(4, 64) / BURST {
         burst(&mut pool);
     }

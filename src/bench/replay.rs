@@ -13,7 +13,7 @@ use crate::schedule::in_rounds;
 use crate::sim::{Scene, Simulation, SimulationState};
 use crate::spaces::Spaces;
 
-/// A state from which the physics goes on: at the beginning of a burst, or of an episode in it.
+/// A state from which the physics continues: at the beginning of a burst, or of an episode in it.
 struct Start {
     /// The number of recorded steps before it.
     after: usize,
@@ -22,7 +22,7 @@ struct Start {
     draw: Option<EpisodePhysics>,
 }
 
-/// An environment that records the input of its physics, and can replay that. This is the only difference from the environment of a
+/// An environment that records the input of its physics and can replay it. This is the only difference from the environment of a
 /// training.
 pub(super) struct RecordingEnv {
     env: Repose,
@@ -94,7 +94,7 @@ impl RecordingEnv {
         self.go_on(step + 1);
     }
 
-    /// Goes on from the state that was started from after so many steps, if there is one.
+    /// Continues from the recorded state after this number of steps, if there is one.
     fn go_on(&mut self, steps: usize) {
         if let Some(i) = self.starts.iter().position(|start| start.after == steps) {
             self.bare.start_replay(&self.starts[i].state, &self.scenes[i]);

@@ -67,7 +67,7 @@ pub enum Command {
     /// Plot the learning curves of runs as SVG or PNG
     #[command(after_help = examples!("plot runs/shadow-hand-repose/*", "plot RUN --metric eval/goals --out goals.png"))]
     Plot(PlotArgs),
-    /// List runs: state, time left, steps, goals and settings; or compare two
+    /// List runs with state, time left, steps, goals and settings, or compare two runs
     #[command(after_help = examples!("runs --watch", "runs RUN RUN"))]
     Runs(RunsArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
@@ -79,7 +79,7 @@ pub enum Command {
         "completions zsh > ~/.zfunc/_shadow-repose"
     ))]
     Completions {
-        /// The shell that completes
+        /// Shell to print completions for
         shell: clap_complete::Shell,
     },
     /// Print a manual page
@@ -162,7 +162,7 @@ pub struct TrainArgs {
     /// Number of worker threads; 0: one per core [default: {threads}]
     #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,
-    /// Total control steps over all hands, counted from the start of the run [default: {total_steps}]
+    /// Total control steps over all environments, counted from the start of the run [default: {total_steps}]
     #[arg(long, value_name = "STEPS", value_parser = steps, help_heading = SETTINGS)]
     pub total_steps: Option<u64>,
     /// Suffix of the name of the run folder
@@ -174,15 +174,15 @@ pub struct TrainArgs {
     /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
-    /// Start a new run from an existing policy: a checkpoint, a run folder, or the built-in `builtin` or `robust`. Network sizes are
-    /// taken from it; everything else starts afresh
+    /// Start a new run from an existing policy (fine-tuning): a checkpoint, a run folder, or the built-in `builtin` or `robust`.
+    /// Weights and network sizes come from the policy; everything else starts anew
     #[arg(long, value_name = "FILE|RUN|NAME", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
-    /// Start a new run from the full state of this run or checkpoint (weights, hands, counters; ramps continue), with changed
-    /// settings
+    /// Start a new run from the full state of this run or checkpoint (weights, environments, counters), with changed settings;
+    /// ramps continue
     #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
-    /// Use the policy of the hand on the other side: this hand is its mirror image
+    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
     #[arg(long, requires = "init", help_heading = START)]
     pub mirror: bool,
     /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
@@ -191,7 +191,7 @@ pub struct TrainArgs {
     /// Save and exit with code 0 after this time, e.g. 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
     pub stop_after: Option<Duration>,
-    /// Hide progress and hints about settings; warnings, evaluations and the final line are still printed
+    /// Hide progress and notes; still print warnings, evaluations and the final line
     #[arg(long)]
     pub quiet: bool,
     /// Write the last steps of every episode whose physics diverged, for replay
@@ -202,14 +202,14 @@ pub struct TrainArgs {
 /// The options of `play`.
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest), or one that comes with
-    /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
+    /// builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Use the policy of the hand on the other side: this hand is its mirror image
+    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
     #[arg(long, help_heading = POLICY)]
     pub mirror: bool,
-    /// Number of episodes to play, each to its end [default: 256; in a window, until it is closed; in a film or an HTML file, 1]
+    /// Number of episodes to play, each to its end [default: 256; 1 in a film or an HTML file; no limit in a window]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
     /// Random seed; episode k is drawn from (seed, k)
@@ -236,33 +236,33 @@ pub struct PlayArgs {
     /// Print only the score, as one JSON object
     #[arg(long, help_heading = OUTPUT)]
     pub json: bool,
-    /// Play under changed physics, noise and delays, one change at a time, and print a table of what is kept
+    /// Play under changed physics, noise and delays, one change at a time, and print a table of the share of goals retained
     #[arg(long, conflicts_with_all = ["window", "trace", "video", "policy"], help_heading = OUTPUT)]
     pub robustness: bool,
-    /// Picture of that table to write: .svg or .png
+    /// Write the table of --robustness as a picture, .svg or .png
     #[arg(long, value_name = "FILE", requires = "robustness", help_heading = OUTPUT)]
     pub out: Option<PathBuf>,
     /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
     pub trace: Option<PathBuf>,
-    /// Write at most 20 episodes as one HTML file, which any browser shows without a network
+    /// Write at most 20 episodes as one HTML file, which any browser shows offline
     #[arg(long, value_name = "FILE", conflicts_with_all = ["window", "robustness"], help_heading = OUTPUT)]
     pub html: Option<PathBuf>,
-    /// Show the episodes of this trace in the HTML file, without playing anew
+    /// Write the episodes of this trace to the HTML file, without playing again
     #[arg(long, value_name = "FILE", requires = "html", help_heading = OUTPUT,
         conflicts_with_all = [
             "trace", "video", "json", "headless", "episodes", "policy", "ckpt", "mirror", "stochastic", "seed", "threads", "fps", "out",
         ])]
     pub from_trace: Option<PathBuf>,
-    /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free one) [default port: 7070]
+    /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free port) [default port: 7070]
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT,
         conflicts_with_all = ["window", "headless", "json", "trace", "html", "video", "robustness", "episodes"])]
     pub web: Option<u16>,
-    /// Number of hands on that page, at most 16 [default: 1]
+    /// Number of hands on the page of --web, at most 16 [default: 1]
     #[arg(long, value_name = "N", requires = "web", help_heading = OUTPUT,
         value_parser = clap::value_parser!(u64).range(1..=16))]
     pub hands: Option<u64>,
-    /// Follow a training: each episode is played by the newest policy of the run
+    /// Follow a training run: its newest policy plays each episode
     #[arg(long, requires = "web", conflicts_with = "policy", help_heading = OUTPUT)]
     pub follow: bool,
     /// Film the episodes one after another, as .mp4 or .gif; needs no display
@@ -279,14 +279,14 @@ pub struct PlayArgs {
 /// The options of `export`.
 #[derive(Args, Debug)]
 pub struct ExportArgs {
-    /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or one that comes with
-    /// the program: builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
+    /// builtin, or robust for other hands [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Use the policy of the hand on the other side: this hand is its mirror image
+    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
     #[arg(long, help_heading = POLICY)]
     pub mirror: bool,
-    /// Change one env.* setting that the file tells, e.g. env.model=my_scene.xml; repeatable
+    /// Change one env.* setting that the file records, e.g. env.model=my_scene.xml; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,
     /// File to write
@@ -309,7 +309,7 @@ pub struct ViewArgs {
     /// Write one PNG picture and exit, without opening a window; needs no display
     #[arg(long, value_name = "FILE", help_heading = PICTURE)]
     pub screenshot: Option<PathBuf>,
-    /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free one) [default port:
+    /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free port) [default port:
     /// 7070]
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot",
         help_heading = PICTURE)]
@@ -388,13 +388,13 @@ pub struct BenchArgs {
     /// Number of worker threads; 0: one per core [default: {threads}]
     #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,
-    /// Measure only this part: physics and environments, gradient steps, whole iterations, or the parts of an iteration
+    /// Measure only this part
     #[arg(long, value_enum, value_name = "PART")]
     pub only: Option<Part>,
     /// Policy that acts in `--only iteration`: a checkpoint, a run, builtin or robust [default: builtin]
     #[arg(long, value_name = "FILE|RUN|NAME")]
     pub ckpt: Option<PathBuf>,
-    /// Picture of the parts of an iteration to write, as .svg or .png
+    /// Write the parts of an iteration as a picture, .svg or .png
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
     /// Print only the results, as one JSON object
@@ -411,6 +411,8 @@ pub enum Part {
     Learner,
     /// Whole iterations of training
     Training,
-    /// The parts of an iteration, while a trained policy acts; only if asked for
+    /// Trainings with different numbers of environments, and which of them learns most in the same time
+    Environments,
+    /// The parts of an iteration, while a trained policy acts; only on request
     Iteration,
 }

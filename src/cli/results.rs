@@ -23,11 +23,11 @@ pub struct PlotArgs {
     /// Quantity on the x axis: control steps, or hours of collecting and learning
     #[arg(long, value_enum, default_value_t = Along::Steps)]
     pub along: Along,
-    /// Iterations averaged into each point, by default up to 50 and a tenth of the shortest run; if runs differ in iteration length,
-    /// the shortest counts
+    /// Number of iterations averaged into each point; if runs differ in iteration length, the shortest length counts [default: a
+    /// tenth of the shortest run, at most 50]
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
     pub smooth: Option<usize>,
-    /// Draw the mean of all runs, which are seeds of one setting, with a band from the lowest to the highest
+    /// Draw the mean of all runs (seeds of one setting), with a band from the lowest to the highest
     #[arg(long)]
     pub seeds: bool,
     /// Size of the picture in pixels [default: width 800, height 260 per panel]
@@ -47,10 +47,10 @@ pub enum Along {
 /// The options of `runs`.
 #[derive(Args, Debug)]
 pub struct RunsArgs {
-    /// Folder of runs to list, or a run; two runs are compared, more are listed [default: runs/shadow-hand-repose]
+    /// Folder of runs to list, or single runs: two are compared, any other number is listed [default: runs/shadow-hand-repose]
     #[arg(value_name = "DIR|RUN")]
     pub places: Vec<PathBuf>,
-    /// Print one JSON array; of two runs that are compared, one object
+    /// Print one JSON array, or one object if two runs are compared
     #[arg(long)]
     pub json: bool,
     /// Refresh the table every few seconds until Ctrl-C

@@ -471,11 +471,20 @@ fn bench_prints_every_figure() {
         "matmul_gflops",
         "end_to_end_steps_per_s",
         "default_training_hours",
+        "steps_per_s_of_512",
+        "steps_per_s_of_1024",
+        "steps_per_s_of_2048",
     ] {
         assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
     }
     let waits = figures["learner_waits"].as_f64().unwrap();
     assert!((0.0..1.0).contains(&waits), "a share of the time: {waits}");
+    let speed = |envs: u64| figures[format!("steps_per_s_of_{envs}")].as_f64().unwrap();
+    let advised = figures["advised_num_envs"].as_f64().unwrap();
+    assert!(
+        advised == 1024.0 || (advised == 2048.0 && speed(2048) > speed(1024)) || speed(512) > speed(1024),
+        "{figures}"
+    );
     assert_eq!((figures["threads"].as_u64(), figures["num_envs"].as_u64()), (Some(2), Some(64)));
     assert_eq!(figures["hidden"], serde_json::json!([16]));
 }
