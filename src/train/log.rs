@@ -108,6 +108,19 @@ mod tests {
         assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");
     }
 
+    /// The row of the test below: every column with a value of its own.
+    const ROW: &str = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, episode/drop_rate 1, \
+        episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
+        reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, \
+        training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, \
+        training/randomized 0, training/act_moving_average 0.25, training/assist 0, eval/goals 2, \
+        eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, eval/return 36.666666666666664, \
+        eval/success_rate 0.6666666666666666, eval/success_rate_5 0.3333333333333333, \
+        eval/seconds_per_goal 2.0833333333333335, eval/turned 1.344, loss/policy 1, loss/value 2, policy/entropy 4, \
+        policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, value/explained_variance 11, \
+        optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, time/steps_per_s 2, \
+        time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
+
     /// All logged values are different, so that swapped values are detected.
     #[test]
     fn each_value_of_a_row_stands_beside_its_own_name() {
@@ -138,17 +151,6 @@ mod tests {
         let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], 0.01, randomizes);
         let whole = EpisodeStats { turned: 16.8, ..episode(TaskReward::default(), 1000, 5) };
         let evaluation = Score::of(&[whole, episode(TaskReward::default(), 200, 1), episode(reward, 50, 0)], 0.01);
-        let expected = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, episode/drop_rate 1, \
-            episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
-            reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, \
-            training/drop 27, training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, \
-            training/drop_reward 0, training/randomized 0, training/act_moving_average 0.25, training/assist 0, eval/goals 2, eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, \
-            eval/return 36.666666666666664, \
-            eval/success_rate 0.6666666666666666, eval/success_rate_5 0.3333333333333333, eval/seconds_per_goal 2.0833333333333335, \
-            eval/turned 1.344, \
-            loss/policy 1, loss/value 2, policy/entropy 4, policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, \
-            policy/std 10, policy/excess 3, value/explained_variance 11, optim/learning_rate 12, optim/grad_norm 9, \
-            time/collect_s 13, time/update_s 17, time/steps_per_s 2, time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
         let traffic = [("exchange_s", 29.0), ("exchange_bytes", 30.0)];
         let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
         let row = |randomizes| {
@@ -157,13 +159,13 @@ mod tests {
         };
         let names =
             |row: &str| row.split(", ").map(|cell| cell.split_once(' ').unwrap().0.to_owned()).collect::<Vec<_>>();
-        assert_eq!(row(false), expected);
-        assert_eq!(tags(false), names(expected));
+        assert_eq!(row(false), ROW);
+        assert_eq!(tags(false), names(ROW));
         // Randomised episodes are apart, in columns that only such a training has.
         let apart = "randomized/return 0, randomized/length 200, randomized/goals 8, randomized/in_tolerance 0.25, \
             randomized/drop_rate 0, randomized/rot_dist 1.5, randomized/steps_per_goal 25, ";
-        let place = expected.find("reward/").unwrap();
-        let expected = format!("{}{apart}{}", &expected[..place], &expected[place..]);
+        let place = ROW.find("reward/").unwrap();
+        let expected = format!("{}{apart}{}", &ROW[..place], &ROW[place..]);
         assert_eq!(row(true), expected);
         assert_eq!(tags(true), names(&expected));
         let shown =
