@@ -71,7 +71,7 @@ def fails(rule, pairs, window):
         return None
     found = ", ".join(f"{ratio:.2f}" for ratio in ratios)
     limit = f"below {rule['below']}" if below else f"above {rule['above']}"
-    return f"{rule['metric']} at {rule['at']:,} steps is {found} times the base's, seed by seed: {limit} in all"
+    return f"{rule['metric']} at {rule['at']:,} steps is {found} times the base's, {limit} in all seeds"
 
 
 def spread(values, digits):

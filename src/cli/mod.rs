@@ -203,7 +203,7 @@ pub struct TrainArgs {
 #[derive(Args, Debug)]
 pub struct PlayArgs {
     /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
-    /// builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
@@ -221,7 +221,7 @@ pub struct PlayArgs {
     /// Sample actions from the policy's distribution instead of using its mean
     #[arg(long, conflicts_with = "policy", help_heading = POLICY)]
     pub stochastic: bool,
-    /// Change one env.* setting of the task; repeatable
+    /// Change one env.* or hand.* setting of the task; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,
     /// Play a baseline instead of a checkpoint: actions of 0, or uniformly random ones
@@ -280,7 +280,7 @@ pub struct PlayArgs {
 #[derive(Args, Debug)]
 pub struct ExportArgs {
     /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
-    /// builtin, or robust for other hands [default: the newest run, or builtin if there is none]
+    /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
     /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
