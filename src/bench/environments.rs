@@ -11,7 +11,7 @@ use crate::ranks::Exchange;
 use crate::repose::{Repose, Task};
 
 /// The numbers of environments that are compared, the key of their speed in JSON, and how much a step brings compared with a step of
-/// 1024 environments. For the last number, 15 M steps of the default training were made with each; `docs/RECIPES.md` shows the goals.
+/// 1024 environments. The worth of a step comes from trainings of 15 M steps with the default settings (`docs/RECIPES.md`).
 const COMPARED: [(usize, &str, f64); 3] =
     [(512, "steps_per_s_of_512", 0.56), (1024, "steps_per_s_of_1024", 1.0), (2048, "steps_per_s_of_2048", 0.74)];
 
@@ -19,7 +19,7 @@ const COMPARED: [(usize, &str, f64); 3] =
 const ITERATIONS: usize = 2;
 
 /// Measures trainings with different numbers of environments and tells which learns most in the same time. A number that the settings do
-/// not allow is left out, for instance by `run.shards`.
+/// not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
 pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut trainings: Vec<(usize, &str, f64, Agent<Repose>)> = Vec::new();
     for (envs, key, share) in COMPARED {
