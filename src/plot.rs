@@ -24,7 +24,7 @@ const DEFAULT: [Metric; 4] = [
     ("episode/drop_rate", Some("randomized/drop_rate")),
 ];
 
-/// The columns that every run must have: control steps at the end of each iteration, and the seconds of its two parts.
+/// The columns that a run must have: control steps at the end of each iteration, and along hours the seconds of its two parts.
 const ALONG: [&str; 3] = ["env_steps", "time/collect_s", "time/update_s"];
 
 /// The group of the metrics of evaluations.
@@ -103,13 +103,17 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
 fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
     let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
     let mut known = HashSet::new();
+    let required = match args.along {
+        Along::Steps => &ALONG[..1],
+        Along::Hours => &ALONG,
+    };
     for (i, place) in args.runs.iter().enumerate() {
         // A run by two names, e.g. through a link `latest`, is one run.
         let whole = run::table_of(place).canonicalize();
         if whole.is_ok_and(|whole| !known.insert(whole)) {
             continue;
         }
-        let rows = run::read_metrics(place, &ALONG, wanted).and_then(|table| {
+        let rows = run::read_metrics(place, required, wanted).and_then(|table| {
             ensure!(!table.columns[ALONG[0]].is_empty(), "{}: no rows yet", place.display());
             Ok(table)
         });
@@ -126,12 +130,11 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
     let in_row = steps.filter_map(|steps| Some(steps.get(1)? - steps[0]));
     let window = smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
     let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
-        let [steps, collect_s, update_s] = ALONG.map(|name| &columns[name]);
         let along = match args.along {
-            Along::Steps => steps.iter().map(|steps| steps / 1e6).collect(),
-            Along::Hours => hours(collect_s, update_s),
+            Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
+            Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
         };
-        let windows = lengths_of_windows(steps, window);
+        let windows = lengths_of_windows(&columns[ALONG[0]], window);
         Run { name: name_of(place), along, windows, names, columns }
     };
     Ok(tables.into_iter().map(run).collect())

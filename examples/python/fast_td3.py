@@ -5,6 +5,7 @@
 
 After Seo, Sferrazza et al., "FastTD3: Simple, fast, and capable reinforcement learning for humanoid control" (2025). The rewards are the
 same as in `shadow-repose train`. An evaluation plays whole episodes and scores the task itself. Rows go to standard output as CSV.
+`shadow-repose plot` draws such a table.
 """
 import argparse
 import copy
@@ -116,7 +117,7 @@ def main():
     noise = low + (high - low) * torch.rand(n, 1, device=device)
     row = torch.from_numpy(envs.reset()[0]).to(device)
     began, steps, said = time.time(), args.total_steps // n, []
-    print("steps,seconds,reward,goals,rot_dist,drops,value", flush=True)
+    print("env_steps,seconds,reward,eval/goals,eval/rot_dist,eval/drop_rate,value", flush=True)
     for step in range(1, steps + 1):
         at = (step - 1) % kept
         normal.see(row)

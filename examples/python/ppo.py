@@ -4,7 +4,7 @@
     python ppo.py --total-steps 10_000_000 --device cuda
 
 The rewards are the same as in `shadow-repose train`, so the curves can be compared. An evaluation plays whole episodes with mean
-actions and scores the task itself. Rows go to standard output as CSV.
+actions and scores the task itself. Rows go to standard output as CSV. `shadow-repose plot` draws such a table.
 """
 import argparse
 import time
@@ -98,7 +98,7 @@ def main():
     values = torch.zeros(steps + 1, n, device=device)
     row = torch.from_numpy(envs.reset()[0]).to(device)
     began, iterations = time.time(), args.total_steps // (n * steps)
-    print("steps,seconds,reward,goals,rot_dist,drops,std,kl", flush=True)
+    print("env_steps,seconds,reward,eval/goals,eval/rot_dist,eval/drop_rate,policy/std,policy/kl", flush=True)
     for iteration in range(1, iterations + 1):
         paid = 0.0
         for t in range(steps):

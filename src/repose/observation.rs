@@ -46,19 +46,19 @@ impl Layout {
     /// Returns the layout for a hand with this many joints, fingertips and actuators.
     #[rustfmt::skip]
     pub fn new(joints: usize, fingertips: usize, actuators: usize) -> Self {
-        const JOINTS: &[usize] = &[];
+        const NOTHING: &[usize] = &[];
         // Points and velocities change their y, axes their x and z, and so do quaternions.
         const POINT: &[usize] = &[1];
         const AXIS: &[usize] = &[0, 2];
         const QUATERNION: &[usize] = &[1, 3];
         const TIP: &[usize] = &[1, 4, 6, 8, 10, 12];
         let table = [
-            ("joint_pos", joints, "rad", JOINTS), ("joint_vel", joints, "rad/s * vel_obs_scale", JOINTS),
+            ("joint_pos", joints, "rad", NOTHING), ("joint_vel", joints, "rad/s * vel_obs_scale", NOTHING),
             ("cube_pos", 3, "m", POINT), ("cube_quat", 4, "1", QUATERNION),
             ("cube_linvel", 3, "m/s", POINT), ("cube_angvel", 3, "rad/s * vel_obs_scale", AXIS),
             ("goal_pos", 3, "m", POINT), ("goal_quat", 4, "1", QUATERNION), ("relative_quat", 4, "1", QUATERNION),
             ("fingertips", TIP_SIZE * fingertips, OF_FINGERTIPS, TIP),
-            ("previous_action", actuators, "1", JOINTS),
+            ("previous_action", actuators, "1", NOTHING),
         ];
         let mut size = 0;
         let groups = table.map(|(name, length, unit, mirrored)| {

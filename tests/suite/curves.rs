@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{program, succeeded, train};
+use crate::support::{program, stderr, succeeded, train};
 
 /// Fails unless a file is XML. Without Python, only its characters are checked.
 #[track_caller]
@@ -52,4 +52,17 @@ fn by_default_a_tenth_of_the_shortest_run_is_smoothed_and_fifty_iterations_at_mo
     assert_eq!(points(&["short.csv"]), [10]);
     assert_eq!(points(&["long.csv"]), [12]);
     assert_eq!(points(&["long.csv", "short.csv"]), [10, 300]);
+}
+
+#[test]
+fn a_table_of_another_learner_needs_only_its_steps_and_the_metric() {
+    let place = tempfile::tempdir().unwrap();
+    fs::write(place.path().join("ours.csv"), "env_steps,time/collect_s,time/update_s,eval/goals\n1,1,1,0\n2,1,1,1\n")
+        .unwrap();
+    fs::write(place.path().join("theirs.csv"), "env_steps,eval/goals\n1,0\n2,3\n").unwrap();
+    let plot = ["plot", "ours.csv", "theirs.csv", "--metric", "eval/goals"];
+    let said = stderr(&succeeded(program(place.path(), &plot)));
+    assert!(said.contains(": 2 runs") && !said.contains("warning"), "{said}");
+    let said = stderr(&succeeded(program(place.path(), &[&plot[..], &["--along", "hours"]].concat())));
+    assert!(said.contains("theirs.csv has no column time/collect_s") && said.contains(": 1 run"), "{said}");
 }
