@@ -10,7 +10,7 @@ use super::values::size;
 /// The options of `plot`.
 #[derive(Args, Debug)]
 pub struct PlotArgs {
-    /// Run folders or their metrics.csv files
+    /// Run folders, or tables such as their metrics.csv
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
     /// Picture to write, as .svg or .png
