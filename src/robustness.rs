@@ -16,9 +16,10 @@ use crate::os::{self, OutputFile, Requests, number};
 use crate::repose::{Score, Task};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
-const CHANGES: [(&str, &str, &[&str]); 8] = [
+const CHANGES: [(&str, &str, &[&str]); 9] = [
     ("friction", FRICTION, &["0.5", "0.7", "1.3"]),
     ("cube mass", MASS, &["0.5", "2.0"]),
+    ("cube size", "env.cube_size_scale", &["0.8", "0.9", "1.1", "1.2"]),
     ("gains", "env.gains_scale", &["0.75", "1.5"]),
     ("damping", "env.damping_scale", &["0.3", "3.0"]),
     ("delay", "env.action_delay", &["1", "2", "3"]),
@@ -60,10 +61,11 @@ struct Row {
     kept: f64,
 }
 
-/// Plays the policy under each condition and prints the table. If interrupted, prints the rows so far.
+/// Plays the policy under each condition and prints the table. If interrupted, prints the rows so far. Leaves out a condition that
+/// the task cannot take, such as another size of an object with a mesh, and says so.
 ///
 /// # Errors
-/// Fails if a setting does not fit the policy's task, if an episode panics, or if the picture cannot be written.
+/// Fails if the task cannot be loaded without a change, if an episode panics, or if the picture cannot be written.
 pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
     let output = args.out.as_deref().map(OutputFile::create).transpose()?;
     output.as_ref().map(draw::picture_format).transpose()?;
@@ -71,15 +73,21 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         let sets = [&args.set[..], &condition.sets].concat();
         loaded.task(&sets).with_context(|| format!("row `{}`", condition.name))
     };
-    let conditions = conditions();
     // Problems are found now rather than after minutes.
-    let tasks: Vec<Arc<Task>> = conditions.iter().map(task).collect::<Result<_>>()?;
-    let configs: Vec<EnvConfig> = tasks.iter().map(|task| task.config().clone()).collect();
+    let mut playable: Vec<(Condition, Arc<Task>)> = Vec::new();
+    for condition in conditions() {
+        match task(&condition) {
+            Ok(task) => playable.push((condition, task)),
+            Err(reason) if playable.is_empty() => return Err(reason),
+            Err(reason) => os::say(&format!("left out: {reason:#}")),
+        }
+    }
+    let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config().clone()).collect();
     let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
     let bar = os::progress_bar((different * count) as u64, "episodes", "robustness");
     let (mut rows, episodes): (Vec<Row>, _) = (Vec::new(), Episodes::scored(args.seed, count));
-    for ((condition, config), task) in conditions.into_iter().zip(configs).zip(tasks) {
+    for ((condition, task), config) in playable.into_iter().zip(configs) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
         bar.set_message(condition.name.clone());
         let played = match known {
@@ -206,14 +214,14 @@ mod tests {
     #[test]
     fn the_rows_are_those_that_are_published_and_each_changes_the_task() {
         let conditions = conditions();
-        let names: Vec<&str> = conditions[..18].iter().map(|condition| condition.name.as_str()).collect();
-        let expected = "nominal, friction 0.5, friction 0.7, friction 1.3, cube mass 0.5, cube mass 2.0, gains 0.75, gains 1.5, \
-                        damping 0.3, damping 3.0, delay 1, delay 2, delay 3, noise, twice the noise, sim_dt 0.005, \
-                        sim_dt 0.002, cone elliptic";
+        let names: Vec<&str> = conditions[..22].iter().map(|condition| condition.name.as_str()).collect();
+        let expected = "nominal, friction 0.5, friction 0.7, friction 1.3, cube mass 0.5, cube mass 2.0, cube size 0.8, \
+                        cube size 0.9, cube size 1.1, cube size 1.2, gains 0.75, gains 1.5, damping 0.3, damping 3.0, \
+                        delay 1, delay 2, delay 3, noise, twice the noise, sim_dt 0.005, sim_dt 0.002, cone elliptic";
         assert_eq!(names.join(", "), expected);
-        assert_eq!(conditions.len(), 18 + 12);
+        assert_eq!(conditions.len(), 22 + 12);
         let nominal = Config::resolve(None, &[]).unwrap();
-        for condition in &conditions[1..18] {
+        for condition in &conditions[1..22] {
             assert_ne!(Config::resolve(None, &condition.sets).unwrap(), nominal, "{}", condition.name);
         }
     }
@@ -223,7 +231,7 @@ mod tests {
         let conditions = conditions();
         let kept = [1.0, 0.5, 1.2];
         let mut rows: Vec<Row> = conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
-        rows.push(row(conditions[20].clone(), 2, 0.1));
+        rows.push(row(conditions[24].clone(), 2, 0.1));
         assert_eq!(mean_kept(&rows), 0.75);
         let of_nothing: Vec<Row> = conditions[..3].iter().map(|of| row(of.clone(), 0, f64::NAN)).collect();
         assert!(mean_kept(&of_nothing).is_nan() && as_json(&of_nothing, 2, 3, "x")["mean_kept"].is_null());
