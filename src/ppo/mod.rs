@@ -12,7 +12,6 @@ mod checkpoint;
 mod clock;
 mod format;
 mod gae;
-mod growth;
 mod kernels;
 mod learning_rate;
 mod measure;

@@ -125,7 +125,7 @@ impl Plan {
     }
 
     /// Plans a new run that starts from the newest undamaged checkpoint of another, or from the given one. Settings may
-    /// change unless they determine the size of the state or the kind of policy. Nets may become wider.
+    /// change unless they determine the size of the state or the kind of policy.
     ///
     /// # Errors
     /// Fails if the checkpoint cannot be resumed from, or if the settings do not fit it.
@@ -149,8 +149,6 @@ impl Plan {
         let plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
-        let spaces = load::record(&checkpoint, &parent.ppo.net())?.spaces();
-        checkpoint.grow(&parent.ppo.net(), &config.ppo.net(), spaces, config.run.seed)?;
         let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
         let progress = &mut checkpoint.progress;
         ensure!(
@@ -272,10 +270,11 @@ fn expect_net(checkpoint: &Checkpoint, policy: &NetConfig, config: &Config) -> R
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     let of = |config: &Config| {
         let net = config.ppo.net();
-        let kept = [format!("{}", config.env.num_envs), format!("{:?}", net.symmetry), format!("{:?}", net.activation)];
-        kept.map(|value| value.to_lowercase())
+        let [hands, hidden] = [format!("{}", config.env.num_envs), format!("{:?}", net.hidden)];
+        [hands, hidden, format!("{:?}", net.symmetry), format!("{:?}", net.activation)]
+            .map(|value| value.to_lowercase())
     };
-    let keys = ["env.num_envs", "ppo.symmetry", "ppo.activation"];
+    let keys = ["env.num_envs", "ppo.hidden", "ppo.symmetry", "ppo.activation"];
     for (key, (before, now)) in keys.into_iter().zip(of(parent).into_iter().zip(of(config))) {
         ensure!(before == now, "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
     }
