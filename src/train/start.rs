@@ -270,12 +270,14 @@ fn expect_net(checkpoint: &Checkpoint, policy: &NetConfig, config: &Config) -> R
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     let of = |config: &Config| {
         let net = config.ppo.net();
-        let [hands, hidden] = [format!("{}", config.env.num_envs), format!("{:?}", net.hidden)];
-        [hands, hidden, format!("{:?}", net.symmetry), format!("{:?}", net.activation)]
-            .map(|value| value.to_lowercase())
+        [
+            ("env.num_envs", config.env.num_envs.to_string()),
+            ("ppo.hidden", format!("{:?}", net.hidden)),
+            ("ppo.symmetry", format!("{:?}", net.symmetry).to_lowercase()),
+            ("ppo.activation", format!("{:?}", net.activation).to_lowercase()),
+        ]
     };
-    let keys = ["env.num_envs", "ppo.hidden", "ppo.symmetry", "ppo.activation"];
-    for (key, (before, now)) in keys.into_iter().zip(of(parent).into_iter().zip(of(config))) {
+    for ((key, before), (_, now)) in of(parent).into_iter().zip(of(config)) {
         ensure!(before == now, "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
     }
     Ok(())
