@@ -41,7 +41,12 @@ pub enum Actor<'a> {
     Random,
     /// Slow swings of each actuator around the middle of its range, each a little later than the previous actuator's.
     Wave,
+    /// A function from outside the program. It writes the actions `[N, A]` for the observations `[N, O]`.
+    Outside(&'a Outside<'a>),
 }
+
+/// A function that chooses actions.
+pub type Outside<'a> = dyn Fn(&[f32], &mut [f32]) + Sync + 'a;
 
 /// A set of episodes.
 #[derive(Clone, Copy, Debug)]
@@ -252,7 +257,7 @@ impl Actor<'_> {
     /// Returns the actor's name as shown beside its score.
     pub fn name(&self) -> &'static str {
         match self {
-            Actor::Mean(_) => "policy",
+            Actor::Mean(_) | Actor::Outside(_) => "policy",
             Actor::Stochastic(_) => "policy, stochastic",
             Actor::Zero => "zero actions",
             Actor::Random => "random actions",
@@ -263,7 +268,7 @@ impl Actor<'_> {
     fn policy(&self) -> Option<&FrozenPolicy<'_>> {
         match self {
             Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
-            Actor::Zero | Actor::Random | Actor::Wave => None,
+            Actor::Zero | Actor::Random | Actor::Wave | Actor::Outside(_) => None,
         }
     }
 
@@ -272,10 +277,16 @@ impl Actor<'_> {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
         }
-        let Some(size) = lanes.first().map(|lane| lane.env.spaces().action_size) else { return };
+        let Some(Spaces { observation_size, action_size: size, .. }) = lanes.first().map(|lane| lane.env.spaces())
+        else {
+            return;
+        };
+        if let Actor::Outside(act) = self {
+            act(&observations[..lanes.len() * observation_size], &mut actions[..lanes.len() * size]);
+        }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
-                Actor::Mean(_) => {}
+                Actor::Mean(_) | Actor::Outside(_) => {}
                 Actor::Stochastic(policy) => {
                     for action in row {
                         let drawn: f32 = StandardNormal.sample(&mut lane.noise);

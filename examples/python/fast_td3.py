@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from shadow_repose import VectorEnv
+from shadow_repose import VectorEnv, evaluate
 
 GAMMA, TAU, REWARD_SCALE = 0.99, 0.1, 0.01
 LOW, HIGH, ATOMS = -10.0, 30.0, 101  # the values that the critics distinguish
@@ -73,21 +73,6 @@ class Twins(nn.Module):
         return target.scatter_add_(1, index, chosen * (1 - share)).scatter_add_(1, index + 1, chosen * share)
 
 
-def evaluate(act, device, hands=64):
-    """Returns goals per episode, the mean rotation error and the share of drops, of one episode in each environment."""
-    envs = VectorEnv(hands, seed=1_000_003)
-    rows, _ = envs.reset()
-    found, left = [], np.ones(hands, bool)
-    while left.any():
-        with torch.no_grad():
-            rows, _, _, _, info = envs.step(act(torch.from_numpy(rows).to(device)).cpu().numpy())
-        if "final_info" in info:
-            over, episode = info["_final_info"] & left, info["final_info"]["episode"]
-            found += list(zip(episode["goals"][over], episode["rot_dist"][over], episode["dropped"][over], strict=True))
-            left &= ~over
-    return np.mean(found, axis=0)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--total-steps", type=int, default=10_000_000)
@@ -109,6 +94,11 @@ def main():
     nn.init.normal_(actor[0][-1].weight, 0, 0.01)
     for net in (normal, actor, critic):
         net.to(device)
+
+    def act(rows):
+        with torch.no_grad():
+            return actor(normal(torch.from_numpy(rows).to(device))).cpu().numpy()
+
     slow = copy.deepcopy(critic)
     optimizers = [torch.optim.AdamW(net.parameters(), 3e-4, weight_decay=0.1) for net in (actor, critic)]
     seen, following = (torch.zeros(kept, n, size, device=device) for _ in range(2))
@@ -153,7 +143,8 @@ def main():
                 for old, new in zip(slow.parameters(), critic.parameters(), strict=True):
                     old.lerp_(new, TAU)
         if step % 800 == 0 or step == steps:
-            scores = evaluate(lambda rows: actor(normal(rows)), device)
+            score = evaluate(act, episodes=64, seed=1_000_003)
+            scores = (score["goals_per_episode"], score["rot_dist"], score["drop_rate"])
             facts = (rewards.mean().item() / REWARD_SCALE, *scores, float(np.mean(said[-100:])))
             print(step * n, f"{time.time() - began:.0f}", *(f"{fact:.4f}" for fact in facts), sep=",", flush=True)
 

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from shadow_repose import VectorEnv
+from shadow_repose import VectorEnv, evaluate
 
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, REWARD_SCALE = 0.995, 0.95, 0.2, 4, 4, 0.01
 
@@ -56,21 +56,10 @@ class Agent(nn.Module):
     def value(self, rows):
         return self.critic(self.normal(rows))[..., 0]
 
-
-def evaluate(agent, device, hands=64):
-    """Returns goals per episode, the mean rotation error and the share of drops, of one episode in each environment."""
-    envs = VectorEnv(hands, seed=1_000_003)
-    rows, _ = envs.reset()
-    found, left = [], np.ones(hands, bool)
-    while left.any():
+    def act(self, rows):
+        """Returns mean actions of rows of NumPy."""
         with torch.no_grad():
-            actions = agent.actor(agent.normal(torch.from_numpy(rows).to(device))).cpu().numpy()
-        rows, _, _, _, info = envs.step(actions)
-        if "final_info" in info:
-            over, episode = info["_final_info"] & left, info["final_info"]["episode"]
-            found += list(zip(episode["goals"][over], episode["rot_dist"][over], episode["dropped"][over], strict=True))
-            left &= ~over
-    return np.mean(found, axis=0)
+            return self.actor(self.normal(torch.from_numpy(rows).to(self.mean.device))).cpu().numpy()
 
 
 def main():
@@ -144,8 +133,9 @@ def main():
         rate *= 1 / 1.5 if divergence > 0.032 else 1.5 if divergence < 0.008 else 1
         optimizer.param_groups[0]["lr"] = min(max(rate, 1e-5), 2e-3)
         if iteration % 50 == 0 or iteration == iterations:
-            goals, error, drops = evaluate(agent, device)
-            facts = (paid, goals, error, drops, agent.log_std.exp().mean().item(), divergence)
+            score = evaluate(agent.act, episodes=64, seed=1_000_003)
+            scores = (score["goals_per_episode"], score["rot_dist"], score["drop_rate"])
+            facts = (paid, *scores, agent.log_std.exp().mean().item(), divergence)
             print(iteration * n * steps, f"{time.time() - began:.0f}", *(f"{fact:.4f}" for fact in facts), sep=",", flush=True)
     if args.save:
         torch.save(agent.state_dict(), args.save)

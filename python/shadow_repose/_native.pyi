@@ -1,4 +1,5 @@
 """The extension module. Use the other modules, which wrap it."""
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -38,4 +39,7 @@ class Policy:
     def actions(self, observations: np.ndarray) -> np.ndarray: ...
     def values(self, observations: np.ndarray) -> np.ndarray: ...
 
-def evaluate(policy: Policy, set: list[tuple[str, str]], episodes: int, seed: int, threads: int) -> str: ...
+def evaluate(
+    scored: Policy | Callable[[np.ndarray], np.ndarray], set: list[tuple[str, str]], episodes: int, seed: int, threads: int,
+    trace: str | None,
+) -> str: ...

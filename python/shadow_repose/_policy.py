@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -130,26 +130,46 @@ def _reload(place: str, set: Mapping[str, Any], checksum: int) -> Policy:
 
 
 def evaluate(
-    policy: Policy | str | os.PathLike[str] = "builtin",
+    policy: Policy | str | os.PathLike[str] | Callable[[np.ndarray], ArrayLike] = "builtin",
     *,
     episodes: int = 256,
     seed: int = 0,
     set: Mapping[str, Any] | None = None,
     threads: int = 0,
+    trace: str | os.PathLike[str] | None = None,
 ) -> dict[str, Any]:
     """Returns the score of a policy over whole episodes by mean actions: the object that `shadow-repose play --json` prints.
 
     Args:
-        policy: a policy, or a place that `Policy.load` takes.
+        policy: a policy, a place that `Policy.load` takes, or a function of your own. The function gets observations `[N, O]`, float32,
+            of up to 64 episodes, and returns actions `[N, A]`. It is called from another thread.
         episodes: how many episodes are played.
         seed: the seed from which they are drawn.
-        set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`.
+        set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`. The task of a function has the default settings.
         threads: worker threads. 0 means one per core.
+        trace: a file for the steps of the first episodes. `shadow-repose play --from-trace TRACE --html FILE` shows them in a browser.
 
-    Ctrl-C interrupts it. Raises ValueError as `Policy.load` does.
+    Ctrl-C interrupts it. Raises ValueError as `Policy.load` does, or if actions have another shape or are not finite, and what the
+    function raises.
     """
-    if not isinstance(policy, Policy):
-        policy, set = Policy.load(policy, set=set), None
     counts = number("episodes", episodes, 1, 2**20), number("seed", seed), number("threads", threads, most=65536)
-    text = _native.evaluate(policy._native, pairs(set), *counts)
+    if callable(policy) and not isinstance(policy, Policy):
+        scored: Any = _acting(policy)
+    else:
+        if not isinstance(policy, Policy):
+            policy, set = Policy.load(policy, set=set), None
+        scored = policy._native
+    text = _native.evaluate(scored, pairs(set), *counts, None if trace is None else os.fspath(trace))
     return dict(json.loads(text))
+
+
+def _acting(act: Callable[[np.ndarray], ArrayLike]) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns the function with its actions as float32."""
+
+    def acting(observations: np.ndarray) -> np.ndarray:
+        actions = np.asarray(act(observations))
+        if actions.dtype.kind not in "fiub":
+            raise TypeError(f"actions must be numbers, not {actions.dtype}")
+        return actions.astype(np.float32, copy=False)
+
+    return acting

@@ -72,7 +72,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     ) -> None:
         self._hands: _native.Hands | None = None
         if render_mode is not None:
-            raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; `shadow-repose play --video` films them")
+            raise ValueError(f"render_mode = {render_mode!r}: these hands cannot be rendered; evaluate(…, trace=…) writes what a page shows")
         if goal_change not in ("continue", "truncate"):
             raise ValueError(f'goal_change = {goal_change!r}: must be "continue" or "truncate"')
         modes = {name: mode for mode in AutoresetMode for name in (mode.name, mode.value)}
@@ -87,7 +87,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             policy = Policy.load(policy, set=of_task)
         self._made: dict[str, Any] = {
             "threads": number("threads", threads, most=65536), "seed": number("seed", seed), "set": absolute(set), "policy": policy,
-            "config": None if config is None else os.path.abspath(os.fspath(config)), "training": bool(training),
+            "config": None if config is None else _found(os.fspath(config)), "training": bool(training),
             "mode": mode.value, "truncates": goal_change == "truncate", "terms": bool(reward_terms),
         }  # fmt: skip
         self.num_envs = number("num_envs", num_envs, 1, 65536)
@@ -245,6 +245,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def __repr__(self) -> str:
         return f"<shadow_repose.VectorEnv of {self.num_envs} hands>"
+
+
+def _found(config: str) -> str:
+    """Returns the path of a file wherever the process goes. The program knows the files that come with it by their names."""
+    return os.path.abspath(config) if os.path.exists(config) else config
 
 
 def _numbers(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:

@@ -2,19 +2,26 @@
 
 use std::path::PathBuf;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::{
+    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use shadow_repose::config::Override;
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
 use shadow_repose::load::Loaded;
+use shadow_repose::os::OutputFile;
 use shadow_repose::play::json_score;
 use shadow_repose::ppo::{FixedPolicy, GROUP};
 use shadow_repose::repose::Score;
+use shadow_repose::run;
+use shadow_repose::spaces::Spaces;
+use shadow_repose::trace::Trace;
 
-use crate::settings::{Set, overrides, text};
+use crate::settings::{Set, overrides, resolve, text};
 use crate::workers::Workers;
 use crate::{guarded, refused};
 
@@ -137,33 +144,89 @@ impl Policy {
     }
 }
 
-/// The score that `play --json` prints, as JSON.
+/// Who is scored.
+#[derive(FromPyObject)]
+pub(crate) enum Scored {
+    /// A policy of the program.
+    Policy(Py<Policy>),
+    /// A function that returns the actions `[N, A]`, float32, for the observations `[N, O]`.
+    Function(Py<PyAny>),
+}
+
+/// Lets the function write `actions`, a row for each row of observations. At an exception it sets `stop`.
+fn ask(
+    act: &Py<PyAny>,
+    spaces: Spaces,
+    (observations, actions): (&[f32], &mut [f32]),
+    stop: &AtomicBool,
+) -> PyResult<()> {
+    let (rows, size) = (actions.len() / spaces.action_size, spaces.action_size);
+    let asked = Python::attach(|py| {
+        let seen = observations.to_vec().into_pyarray(py).reshape([rows, spaces.observation_size])?;
+        let chosen: PyReadonlyArrayDyn<f32> = act.call1(py, (seen,))?.extract(py)?;
+        if chosen.shape() != [rows, size] {
+            let text = format!("actions have the shape {:?}, expected [{rows}, {size}]", chosen.shape());
+            return Err(PyValueError::new_err(text));
+        }
+        actions.iter_mut().zip(chosen.as_array()).for_each(|(action, chosen)| *action = *chosen);
+        Ok(())
+    });
+    stop.fetch_or(asked.is_err(), Ordering::Relaxed);
+    asked
+}
+
+/// The score that `play --json` prints, as JSON. The first episodes are written to the file `trace`.
 #[pyfunction]
 pub(crate) fn evaluate(
     py: Python,
-    policy: Py<Policy>,
+    scored: Scored,
     set: Set,
     episodes: usize,
     seed: u64,
     threads: usize,
+    trace: Option<PathBuf>,
 ) -> PyResult<String> {
     let most = 1 << 20;
     if !(1..=most).contains(&episodes) {
         return Err(PyValueError::new_err(format!("episodes = {episodes}: must lie in [1, {most}]")));
     }
+    let raised = Mutex::new(None);
     let played = Workers::new(threads).long(py, |stop| {
-        let loaded = policy.get().loaded();
-        let task = loaded.task(&policy.get().with(&overrides(set, false)?))?;
-        let (actor, mut goal_times) = (Actor::Mean(loaded.policy.freeze()), GoalTimes::new(task.config()));
+        let set = overrides(set, false)?;
+        let loaded = match &scored {
+            Scored::Policy(policy) => Some(policy.get()),
+            Scored::Function(_) => None,
+        };
+        let task = match loaded {
+            Some(policy) => policy.loaded().task(&policy.with(&set))?,
+            None => resolve(1, None, None, &set, false)?.1,
+        };
+        let loaded = loaded.map(Policy::loaded);
+        let outside = |observations: &[f32], actions: &mut [f32]| {
+            if let Scored::Function(act) = &scored
+                && let Err(error) = ask(act, task.spaces(), (observations, actions), stop)
+            {
+                *raised.lock().expect("no panic while it is held") = Some(error);
+            }
+        };
+        let actor = loaded.map_or(Actor::Outside(&outside), |loaded| Actor::Mean(loaded.policy.freeze()));
+        let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
+        if let Some(path) = &trace {
+            run::expect_output(path, loaded.and_then(|loaded| loaded.origin.file()), task.config().model_file())?;
+        }
+        let output = trace.as_deref().map(OutputFile::create).transpose()?;
+        let mut output = output.map(|file| (file, Trace::new(&task, actor.name(), checkpoint.as_deref(), seed)));
+        let mut goal_times = GoalTimes::new(task.config());
         let trial = Trial { task: &task, actor: &actor, episodes: Episodes::scored(seed, episodes), stop };
         let played = trial.play(&mut |moment| {
             goal_times.observe(&moment);
+            output.iter_mut().for_each(|(_, trace)| trace.record(&moment));
             Ok(())
         })?;
-        let checkpoint = loaded.origin.to_string();
-        let score = played.map(|played| Score::of(&played, task.config().ctrl_dt));
-        let score = score.map(|score| json_score(&score, &goal_times, Some(&checkpoint), seed));
-        anyhow::Ok(score.map_or(String::new(), |score| score.to_string()))
+        let Some(played) = played else { return anyhow::Ok(String::new()) };
+        output.map_or(Ok(()), |(file, trace)| file.finish(trace.finish().as_bytes()))?;
+        let score = Score::of(&played, task.config().ctrl_dt);
+        Ok(json_score(&score, &goal_times, checkpoint.as_deref(), seed).to_string())
     })?;
-    played.map_err(refused)
+    raised.into_inner().ok().flatten().map_or_else(|| played.map_err(refused), Err)
 }

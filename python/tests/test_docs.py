@@ -18,7 +18,8 @@ def missing(code):
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_the_code_of_the_document_runs(number):
+def test_the_code_of_the_document_runs(number, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     code = BLOCKS[number]
     if missing(code):
         pytest.skip(f"not installed: {missing(code)}")

@@ -1,14 +1,16 @@
 """Policies and their scores."""
 import copy
+import json
 import pathlib
 import pickle
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
 
 import shadow_repose
-from shadow_repose import Policy, VectorEnv, evaluate
+from shadow_repose import Policy, VectorEnv, evaluate, program
 
 
 def observations(rows):
@@ -87,6 +89,44 @@ def test_a_score_has_the_keys_of_the_program_and_follows_seed_and_settings():
     for wrong in ({"episodes": 0}, {"episodes": 2**30}, {"seed": -1}, {"set": {"env.x": 1}}, {"threads": 10**6}):
         with pytest.raises(ValueError):
             evaluate("builtin", **wrong)
+
+
+def test_a_function_of_the_user_is_scored_as_a_policy_and_its_steps_are_written(tmp_path):
+    policy = Policy.load("builtin")
+    short = {"episodes": 70, "seed": 3, "set": {"env.max_episode_seconds": 0.2, "env.act_moving_average": 0.5}}
+    traces = [tmp_path / "own.jsonl", tmp_path / "builtin.jsonl"]
+    sizes = []
+
+    def act(observations):
+        sizes.append(observations.shape)
+        return policy(observations).tolist()
+
+    own, built_in = evaluate(act, trace=traces[0], **short), evaluate(policy, trace=traces[1], **short)
+    assert own.pop("checkpoint") is None and built_in.pop("checkpoint") is not None
+    assert own == built_in and set(sizes) == {(64, 157)}
+    header, *steps = traces[0].read_text().splitlines()
+    assert json.loads(header)["actor"] == "policy" and steps == traces[1].read_text().splitlines()[1:]
+    html = tmp_path / "own.html"
+    subprocess.run([program(), "play", "--from-trace", traces[0], "--html", html], check=True)
+    assert html.stat().st_size > 100_000
+
+
+def test_what_goes_wrong_in_a_function_of_the_user_is_raised(tmp_path):
+    def broken(observations):
+        raise KeyError("mine")
+
+    trace = tmp_path / "x.jsonl"
+    for act, error, text in [
+        (broken, KeyError, "mine"),
+        (lambda seen: seen[:, :19], ValueError, r"shape \[2, 19\], expected \[2, 20\]"),
+        (lambda seen: np.full((2, 20), np.nan), ValueError, "not finite"),
+        (lambda seen: [["x"] * 20] * 2, TypeError, "numbers"),
+    ]:
+        with pytest.raises(error, match=text):
+            evaluate(act, episodes=2, trace=trace)
+        assert not trace.exists()
+    with pytest.raises(ValueError, match="nowhere does not exist"):
+        evaluate(lambda seen: seen[:, :20], trace=tmp_path / "nowhere" / "x.jsonl")
 
 
 def test_names_are_listed_and_unknown_ones_refused():
