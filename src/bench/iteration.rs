@@ -45,8 +45,9 @@ pub(super) fn seconds_of_parts(config: &Config, origin: &PolicySource) -> Result
     (acting.hidden, acting.activation, acting.symmetry) = (net.hidden, net.activation, net.symmetry);
     let randomization = Randomization::new(task, &config.randomization)?;
     let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
-    // The lesson at the end of a training.
-    let at_end = Lesson::at(config.run.total_steps, config);
+    // The lesson at the end of a training, without the torque of an assist, which is not recorded.
+    let mut at_end = Lesson::at(config.run.total_steps, config);
+    at_end.assist = 0.0;
     let exchange = || Exchange::alone(config.shards());
     let mut agent = Agent::new(envs, &acting, config.run.seed, exchange(), move |_| at_end)?;
     agent.ppo.begin_with(&checkpoint)?;

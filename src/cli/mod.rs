@@ -175,7 +175,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
     /// Start a new run from an existing policy (fine-tuning): a checkpoint, a run folder, or the built-in `builtin` or `robust`.
-    /// Weights and network sizes come from the policy; everything else starts anew
+    /// Weights, normaliser and structure of the nets come from the policy; everything else starts anew
     #[arg(long, value_name = "FILE|RUN|NAME", conflicts_with = "resume", help_heading = START)]
     pub init: Option<PathBuf>,
     /// Start a new run from the full state of this run or checkpoint (weights, environments, counters), with changed settings;

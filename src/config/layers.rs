@@ -7,11 +7,11 @@ use anyhow::{Result, anyhow, bail};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::BASE;
 use super::overlay::{DEFAULTS, lookup, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use super::smoothing::{expect_one_smoothing, smoothing_named_alone};
+use super::{BASE, SHIPPED};
 use crate::os;
 use crate::sim::Parts;
 
@@ -64,7 +64,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        layered(Table::new(), checked(user)?, overrides)
+        over(Table::new(), user, overrides)
     }
 
     /// Returns the settings of a task and of its lesson, as [`Config::resolve`] does. Other settings in the user's file are
@@ -87,7 +87,7 @@ impl Config {
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let ppo = Value::try_from(net).expect("the structure of a net is a table");
-        layered(Table::from_iter([("ppo".into(), ppo)]), checked(user)?, overrides)
+        over(Table::from_iter([("ppo".into(), ppo)]), user, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
@@ -101,15 +101,16 @@ impl Config {
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
-    /// settings, because no path in a checkpoint is followed. The number of shards is kept if it still fits.
+    /// settings, because no path in a checkpoint is followed. The critic does not learn alone once more. The number of shards is
+    /// kept if it still fits.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let mut own = self.clone();
-        (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
+        (own.env.model, own.ppo.critic_first, own.run.shards) = (BUILTIN_MODEL.into(), 0, 0);
         let own = Table::try_from(own).expect("a configuration is a tree of tables");
-        let mut changed = layered(own, checked(user)?, overrides)?;
+        let mut changed = over(own, user, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
         }
@@ -155,13 +156,22 @@ impl PolicyConfig {
     }
 }
 
-/// Reads the user's configuration file, if one was given.
+/// Reads the user's configuration file, if one was given. If it is called as one that comes with the program and is not there, it is
+/// taken from the program. So the documented commands work in any folder.
 ///
 /// # Errors
 /// Fails if the file cannot be read.
 pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
-    let read = |path: &Path| Ok(Source { path: path.to_owned(), text: os::read_text(path)? });
-    path.map(read).transpose()
+    let Some(path) = path else { return Ok(None) };
+    let own = SHIPPED.into_iter().find(|(place, _)| path == Path::new(place) && !path.exists());
+    let text = match own {
+        Some((place, text)) => {
+            os::say(&format!("note: there is no {place} here: using the one in the program"));
+            text.to_owned()
+        }
+        None => os::read_text(path)?,
+    };
+    Ok(Some(Source { path: path.to_owned(), text }))
 }
 
 impl Source {
@@ -178,11 +188,13 @@ impl Source {
     }
 }
 
-/// Returns the table of a file that a user has written.
-fn checked(user: Option<&Source>) -> Result<Option<(&Path, Table)>> {
+/// As [`layered`], with a file that a user has written.
+fn over(under: Table, user: Option<&Source>, overrides: &[Override]) -> Result<Config> {
     let table = user.map(Source::table).transpose()?;
-    expect_one_smoothing(table.as_ref())?;
-    Ok(table)
+    if let Some((path, table)) = &table {
+        expect_one_smoothing(path, table, &under)?;
+    }
+    layered(under, table, overrides)
 }
 
 /// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error

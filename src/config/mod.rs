@@ -18,6 +18,18 @@ mod smoothing;
 /// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
 
+/// The settings files that come with the program: their places in the repository, and their texts.
+pub const SHIPPED: [(&str, &str); 8] = [
+    ("configs/repose.toml", BASE),
+    ("configs/finetune.toml", include_str!("../../configs/finetune.toml")),
+    ("configs/isaac-lab.toml", include_str!("../../configs/isaac-lab.toml")),
+    ("configs/other-hand.toml", include_str!("../../configs/other-hand.toml")),
+    ("configs/randomization-all.toml", include_str!("../../configs/randomization-all.toml")),
+    ("configs/randomization-source.toml", include_str!("../../configs/randomization-source.toml")),
+    ("configs/repose-continue.toml", include_str!("../../configs/repose-continue.toml")),
+    ("configs/repose-robust.toml", include_str!("../../configs/repose-robust.toml")),
+];
+
 pub use applicability::expect_used;
 pub use differences::{Difference, short};
 pub use layers::{Override, PolicyConfig, Source, user_file};
@@ -36,19 +48,36 @@ mod tests {
 
     use super::*;
 
-    fn shipped(text: &str) -> Config {
+    fn shipped(name: &str) -> Config {
+        let (_, text) = SHIPPED.into_iter().find(|(place, _)| *place == format!("configs/{name}.toml")).unwrap();
         Config::resolve(Some(&source(text)), &[]).unwrap()
     }
 
     #[test]
+    fn the_program_contains_every_settings_file_and_uses_it_where_the_folder_has_none() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+        let mut names: Vec<String> =
+            folder.read_dir().unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort_unstable();
+        let mut places = SHIPPED.map(|(place, _)| place.strip_prefix("configs/").unwrap());
+        places.sort_unstable();
+        assert_eq!(names, places);
+        let here = tempfile::tempdir().unwrap();
+        for (place, text) in SHIPPED {
+            assert_eq!(user_file(Some(Path::new(place))).unwrap().unwrap().text, text);
+            assert!(user_file(Some(&here.path().join(place))).is_err(), "a path of another folder is not replaced");
+        }
+    }
+
+    #[test]
     fn the_other_files_that_come_with_the_program_say_what_differs() {
-        let published = shipped(include_str!("../../configs/isaac-lab.toml"));
+        let published = shipped("isaac-lab");
         let EnvConfig { reach_goal_bonus, max_consecutive_successes, .. } = published.env;
         assert_eq!((published.env.max_episode_steps(), published.env.substeps()), (600, 2));
         assert_eq!((reach_goal_bonus, max_consecutive_successes), (250.0, 1));
         assert_eq!((published.training.task_reward, published.training.hold_reward), (Ramp::constant(1.0), 0.0));
-        let all = shipped(include_str!("../../configs/randomization-all.toml"));
-        let source = shipped(include_str!("../../configs/randomization-source.toml"));
+        let all = shipped("randomization-all");
+        let source = shipped("randomization-source");
         let varied = |config: &Config| -> Vec<String> {
             let nothing = |value: &Value| ["0.0", "[1.0, 1.0]", "[0, 0]", "{}"].contains(&value.to_string().trim());
             let keys = Table::try_from(&config.randomization).unwrap();
@@ -73,9 +102,9 @@ mod tests {
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
         let [horizon, desired_kl, std, away_std] = [ppo.horizon, ppo.desired_kl, ppo.std, ppo.away_std].map(ended);
         let learnt = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };
-        let tuning = shipped(include_str!("../../configs/finetune.toml"));
-        let robust = shipped(include_str!("../../configs/repose-robust.toml"));
-        let continuing = shipped(include_str!("../../configs/repose-continue.toml"));
+        let tuning = shipped("finetune");
+        let robust = shipped("repose-robust");
+        let continuing = shipped("repose-continue");
         let priced = TrainingConfig { drop_reward: robust.training.drop_reward, ..trained.clone() };
         let slower = PpoConfig { critic_first: tuning.ppo.critic_first, ..learnt.clone() };
         for (found, training, ppo) in
@@ -116,6 +145,12 @@ mod tests {
         let two = BASE.replace("act_moving_average = 0.25 ", "act_moving_average = 0.6 ");
         let refused = Config::resolve(Some(&source(&two)), &[]).unwrap_err().to_string();
         assert!(refused.contains("begins with 0.25: set only one of them"), "{refused}");
+        let half = "[env]\nact_moving_average = 0.6\n[training.act_moving_average]\nto = 0.7";
+        let refused = Config::resolve(Some(&source(half)), &[]).unwrap_err().to_string();
+        assert!(refused.contains("= 0.6, but training.act_moving_average begins with 0.25"), "{refused}");
+        // What the program writes can be read, even if the ramp takes no steps.
+        let jump = Config::resolve(None, &[set("training.act_moving_average={from=0.2,to=0.7,steps=0}")]).unwrap();
+        assert_eq!(Config::resolve(Some(&source(&jump.to_text())), &[]).unwrap(), jump);
         assert!(
             errors("env.act_moving_average=1.5")
                 .contains("env.act_moving_average = 1.5: must be above 0 and at most 1")
@@ -132,6 +167,13 @@ mod tests {
         let played = PolicyConfig::from_text(path, &stored, &[set("env.act_moving_average=0.6")]).unwrap();
         assert_eq!(played.env.act_moving_average, 0.6);
         assert_eq!(Config::from_text(path, &stored, &[]).unwrap(), config);
+    }
+
+    #[test]
+    fn in_a_fork_the_critic_learns_alone_only_if_that_is_set_again() {
+        let parent = Config::resolve(None, &[set("ppo.critic_first=5")]).unwrap();
+        let forked = |sets: &[Override]| parent.changed(None, sets).unwrap().ppo.critic_first;
+        assert_eq!([forked(&[]), forked(&[set("ppo.critic_first=2")])], [0, 2]);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use super::files::PageFile;
 use crate::cli::PlayArgs;
 use crate::config::{Config, Source};
 use crate::evaluate::{Actor, Player};
-use crate::load::{Loaded, MODEL, expect_named_scene};
+use crate::load::{Loaded, MODEL, expect_named_scene, for_playing};
 use crate::os::{self, Stamp};
 use crate::ppo::FixedPolicy;
 use crate::repose::Task;
@@ -83,14 +83,12 @@ pub(super) fn live(
     let (mut about, mut acting) = match &loaded {
         Some(loaded) => {
             let name = actor_of(loaded, args).name();
-            (
-                about(name, Some((&loaded.origin.to_string(), &loaded.name)), Some(args.seed)),
-                acting_of(loaded, args.stochastic),
-            )
+            (about(name, Some((&loaded.origin.to_string(), &loaded.name)), Some(args.seed)), acting_of(loaded, args)?)
         }
         None => {
             let about = about(baseline.name(), None, Some(args.seed));
-            (about, Acting { step: Rc::new(move |player| player.step(&baseline)), policy: None })
+            let step = Rc::new(move |player: &mut Player| player.step(&baseline));
+            (about, Acting { step, policy: None, smoothing: task.config().act_moving_average })
         }
     };
     if let Some(followed) = &followed {
@@ -103,10 +101,13 @@ pub(super) fn live(
         if let Some(followed) = &mut followed
             && followed.has_changed()
         {
-            let place = followed.path.display();
-            match Loaded::find(Some(&followed.path), &args.set) {
-                Ok(newer) if Some(&newer.record) == record.as_ref() => acting = acting_of(&newer, args.stochastic),
-                Ok(_) => os::say(&format!("warning: {place} is for another hand; the previous policy continues")),
+            let newer = Loaded::find(Some(&followed.path), &args.set).and_then(|newer| {
+                let same = Some(&newer.record) == record.as_ref();
+                ensure!(same, "{} is for another hand", followed.path.display());
+                acting_of(&newer, args)
+            });
+            match newer {
+                Ok(newer) => acting = newer,
                 Err(error) => os::say(&format!("warning: {error:#}\n  The previous policy continues.")),
             }
         }
@@ -114,13 +115,15 @@ pub(super) fn live(
     })
 }
 
-fn acting_of(loaded: &Loaded, stochastic: bool) -> Acting {
-    let policy = FixedPolicy::new(loaded.policy.clone());
+/// Returns the policy as an actor. Its smoothing is part of it: in a training, each checkpoint has its own.
+fn acting_of(loaded: &Loaded, args: &PlayArgs) -> Result<Acting> {
+    let config = for_playing(&loaded.checkpoint, loaded.origin.path(), &args.set)?;
+    let (policy, stochastic) = (FixedPolicy::new(loaded.policy.clone()), args.stochastic);
     let step = move |player: &mut Player| {
         let frozen = policy.frozen();
         player.step(&if stochastic { Actor::Stochastic(frozen) } else { Actor::Mean(frozen) })
     };
-    Acting { step: Rc::new(step), policy: Some(loaded.name.clone()) }
+    Ok(Acting { step: Rc::new(step), policy: Some(loaded.name.clone()), smoothing: config.env.act_moving_average })
 }
 
 /// Writes the episodes of the trace in the file `path` as the file `html`.

@@ -75,7 +75,7 @@ impl Conditions {
     }
 
     /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. With full
-    /// assistance, the nominal object gets an angular acceleration of `most` for each rad.
+    /// assistance, the task's object gets an angular acceleration of `most` for each rad.
     pub(super) fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let factor = self.assisted * most * task.hand.cube.inertia;
         if factor == 0.0 && !self.twisted {

@@ -56,8 +56,9 @@ impl Task {
             parts.goal = GOAL.into();
         }
         let nominal = if compilation.keeps_all() { as_it_is } else { Scene::load(file, &compilation)? };
-        let hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
+        let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
+        hand.cube = scene.free_body(&hand.parts.object)?;
         config.goal_position.settle(hand.place());
         let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
         ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);

@@ -34,6 +34,8 @@ pub struct Acting {
     pub step: Rc<Stepping>,
     /// The page's name for the policy, if it differs from the name for the whole page.
     pub policy: Option<String>,
+    /// The smoothing of its actions: `env.act_moving_average` of its task.
+    pub smoothing: f64,
 }
 
 /// Hands on a page of this machine.
@@ -131,7 +133,8 @@ impl Live {
 
     fn begin(&mut self, hand: usize, episode: usize, acting: Acting) {
         let own = &mut self.hands[hand];
-        own.player.start(self.episodes, episode);
+        let task = self.task.smoothed(acting.smoothing);
+        own.player = Player::new(&task, Episodes { first: episode, ..self.episodes });
         (own.acting, own.episode, own.has_ended) = (acting, episode, false);
         own.reward = TaskReward::default();
         let mut about = own.about(self.episodes.seed);
@@ -186,4 +189,23 @@ fn hello(key: &str, seed: u64, hands: &[Hand], sliders: Option<&Sliders>) -> Str
 /// Returns an event as the protocol writes it.
 fn event(name: &str, data: &Value) -> String {
     format!("event: {name}\ndata: {data}\n\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn each_episode_has_the_smoothing_of_the_policy_that_acts() {
+        let config = Config::resolve(None, &[]).unwrap();
+        let task = Task::new(&config.env, &config.hand).unwrap();
+        let acting = |smoothing| Acting { step: Rc::new(|_| None), policy: None, smoothing };
+        let about = About { title: "A hand".into(), policy: None, seed: None };
+        let mut live = Live::open(0, &task, (&about, None), 1, &acting(0.25), None).unwrap();
+        let smoothing = |live: &Live| live.hands[0].player.env().config().act_moving_average;
+        assert_eq!(smoothing(&live), 0.25);
+        live.begin(0, 1, acting(0.8));
+        assert_eq!((smoothing(&live), live.hands[0].episode), (0.8, 1));
+    }
 }

@@ -502,6 +502,7 @@ fn bench_tells_where_the_time_of_an_iteration_goes() {
     for part in ["physics (MuJoCo)", "observe, reward, reset", "policy acts", "learner", "nets [16]"] {
         assert!(svg.contains(part), "{part}: {svg}");
     }
+    succeeded(bench(&["--set", "training.assist=100"]));
     let refused = bench(&["--out", "parts.pdf"]);
     assert!(stderr(&refused).contains("must end in .svg or .png"), "{}", stderr(&refused));
     let refused = bench(&["--ckpt", "nowhere"]);

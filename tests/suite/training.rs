@@ -352,8 +352,17 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
 
 #[test]
 fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_ramp_lasts() {
-    let still = ["env.reset_position_noise=0", "env.reset_dof_pos_noise=0"];
-    let task = task(&still);
+    for mass in ["1", "3"] {
+        expect_help(&[
+            "env.reset_position_noise=0",
+            "env.reset_dof_pos_noise=0",
+            &format!("env.cube_mass_scale={mass}"),
+        ]);
+    }
+}
+
+fn expect_help(sets: &[&str]) {
+    let task = task(sets);
     let cube = task.hand().cube;
     // The angular velocity that a falling cube gains in the first step, as a fraction of the largest assistance.
     let gained = |env_steps: u64, episode: u64| {
@@ -374,11 +383,30 @@ fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_r
     let first: Vec<f64> = (0..40).map(|episode| gained(0, episode)).collect();
     assert!(first.iter().all(|part| (-1e-9..1.0).contains(part)), "{first:?}");
     assert!((10..30).contains(&first.iter().filter(|part| part.abs() < 1e-9).count()), "{first:?}");
-    assert!(first.iter().any(|part| *part > 0.7), "{first:?}");
+    assert!(first.iter().any(|part| *part > 0.7), "{sets:?}: {first:?}");
     for (episode, part) in (0..).zip(&first) {
         assert!((gained(500, episode) - 0.5 * part).abs() < 1e-6, "half of it in the middle of the ramp");
         assert!(gained(1000, episode).abs() < 1e-9, "nothing after it");
     }
+}
+
+#[test]
+fn a_settings_file_of_the_program_can_be_named_in_any_folder_and_an_own_one_of_its_name_comes_first() {
+    let folder = tempfile::tempdir().unwrap();
+    let name = "configs/repose-robust.toml";
+    let each = |run: &str| {
+        let said =
+            succeeded(program(folder.path(), &train(&["--config", name, "--total-steps", "64", "--run-dir", run])));
+        let config = fs::read_to_string(folder.path().join(run).join("config.toml")).unwrap();
+        let value = config.parse::<toml::Table>().unwrap()["randomization"]["each"].as_float();
+        (value, stderr(&said).contains("there is no configs/repose-robust.toml here: using the one in the program"))
+    };
+    assert_eq!(each("first"), (Some(0.4), true));
+    fs::create_dir(folder.path().join("configs")).unwrap();
+    fs::write(folder.path().join(name), "[randomization]\neach = 0.9").unwrap();
+    assert_eq!(each("second"), (Some(0.9), false));
+    let none = program(folder.path(), &train(&["--config", "configs/none.toml"]));
+    assert!(none.status.code() == Some(1) && stderr(&none).contains("configs/none.toml"), "{}", stderr(&none));
 }
 
 #[test]
