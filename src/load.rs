@@ -11,7 +11,7 @@ use anyhow::{Context, Error, Result, bail};
 
 use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
 use crate::os;
-use crate::ppo::{Checkpoint, Damaged, Policy, expect_safetensors};
+use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
 use crate::repose::{Record, Task};
 use crate::run;
 
@@ -243,7 +243,7 @@ pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]
 }
 
 /// Returns two configurations: of the training that wrote a checkpoint in the file `path`, and of a fork of it. The latter is
-/// overlaid with the `user`'s file and `overrides`.
+/// overlaid with the `user`'s file and `overrides`. If the critic has learnt alone, this is not repeated.
 ///
 /// # Errors
 /// Fails as [`for_training`] does.
@@ -255,7 +255,13 @@ pub fn for_fork(
 ) -> Result<(Config, Config)> {
     let parent = Config::from_text(path, &checkpoint.config, &[])?;
     expect_policy(checkpoint, &parent.ppo.net())?;
-    let config = parent.changed(user, overrides)?;
+    let Progress { iteration, ref fork, .. } = checkpoint.progress;
+    let made = iteration - fork.as_ref().map_or(0, |fork| fork.iteration).min(iteration);
+    let mut own = parent.clone();
+    if made > own.ppo.critic_first {
+        own.ppo.critic_first = 0;
+    }
+    let config = own.changed(user, overrides)?;
     expect_named_scene(&parent.env, config.env.model_file().is_some())?;
     Ok((parent, config))
 }

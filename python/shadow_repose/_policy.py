@@ -149,8 +149,8 @@ def evaluate(
         threads: worker threads. 0 means one per core.
         trace: a file for the steps of the first episodes. `shadow-repose play --from-trace TRACE --html FILE` shows them in a browser.
 
-    Ctrl-C interrupts it. Raises ValueError as `Policy.load` does, or if actions have another shape or are not finite, and what the
-    function raises.
+    Ctrl-C interrupts it, after the present call of a function. Raises ValueError as `Policy.load` does, and for actions of another shape
+    or that are not finite. Raises TypeError for actions that are not numbers, and whatever the function raises.
     """
     counts = number("episodes", episodes, 1, 2**20), number("seed", seed), number("threads", threads, most=65536)
     if callable(policy) and not isinstance(policy, Policy):

@@ -206,7 +206,7 @@ pub(crate) fn evaluate(
             if let Scored::Function(act) = &scored
                 && let Err(error) = ask(act, task.spaces(), (observations, actions), stop)
             {
-                *raised.lock().expect("no panic while it is held") = Some(error);
+                raised.lock().expect("no panic while it is held").get_or_insert(error);
             }
         };
         let actor = loaded.map_or(Actor::Outside(&outside), |loaded| Actor::Mean(loaded.policy.freeze()));
@@ -223,7 +223,8 @@ pub(crate) fn evaluate(
             output.iter_mut().for_each(|(_, trace)| trace.record(&moment));
             Ok(())
         })?;
-        let Some(played) = played else { return anyhow::Ok(String::new()) };
+        let failed = raised.lock().expect("no panic while it is held").is_some();
+        let Some(played) = played.filter(|_| !failed) else { return anyhow::Ok(String::new()) };
         output.map_or(Ok(()), |(file, trace)| file.finish(trace.finish().as_bytes()))?;
         let score = Score::of(&played, task.config().ctrl_dt);
         Ok(json_score(&score, &goal_times, checkpoint.as_deref(), seed).to_string())

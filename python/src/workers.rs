@@ -75,7 +75,8 @@ impl Workers {
                 }
                 if raised.is_ok() {
                     raised = py.check_signals();
-                    stop.store(raised.is_err(), Ordering::Relaxed);
+                    // The work may have set the flag itself.
+                    stop.fetch_or(raised.is_err(), Ordering::Relaxed);
                 }
             }
             let done = py.detach(|| running.join()).map_err(|panic| panicked(&*panic));

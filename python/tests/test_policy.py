@@ -5,6 +5,7 @@ import pathlib
 import pickle
 import shutil
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -115,6 +116,15 @@ def test_what_goes_wrong_in_a_function_of_the_user_is_raised(tmp_path):
     def broken(observations):
         raise KeyError("mine")
 
+    calls = []
+
+    def slowly_broken_at_the_end(observations):
+        calls.append(len(calls))
+        if len(calls) >= 20:
+            time.sleep(0.2)
+            raise KeyError(f"call {len(calls)}")
+        return observations[:, :20]
+
     trace = tmp_path / "x.jsonl"
     for act, error, text in [
         (broken, KeyError, "mine"),
@@ -125,6 +135,9 @@ def test_what_goes_wrong_in_a_function_of_the_user_is_raised(tmp_path):
         with pytest.raises(error, match=text):
             evaluate(act, episodes=2, trace=trace)
         assert not trace.exists()
+    with pytest.raises(KeyError, match="call 20"):
+        evaluate(slowly_broken_at_the_end, episodes=2, trace=trace, set={"env.max_episode_seconds": 0.2})
+    assert len(calls) == 20 and not trace.exists()
     with pytest.raises(ValueError, match="nowhere does not exist"):
         evaluate(lambda seen: seen[:, :20], trace=tmp_path / "nowhere" / "x.jsonl")
 

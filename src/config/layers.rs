@@ -64,7 +64,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        over(Table::new(), user, overrides)
+        over(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Returns the settings of a task and of its lesson, as [`Config::resolve`] does. Other settings in the user's file are
@@ -78,7 +78,7 @@ impl Config {
             table.retain(|section, _| !matches!(section, "ppo" | "run"));
             table.get_mut("env").and_then(Value::as_table_mut).map(|env| env.remove("num_envs"));
         }
-        layered(Table::new(), user, overrides)
+        over(Table::new(), user, overrides)
     }
 
     /// Returns the settings of a training that begins with a policy of this net. As [`Config::resolve`], but the base has this net.
@@ -87,7 +87,7 @@ impl Config {
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let ppo = Value::try_from(net).expect("the structure of a net is a table");
-        over(Table::from_iter([("ppo".into(), ppo)]), user, overrides)
+        over(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
@@ -101,16 +101,15 @@ impl Config {
     }
 
     /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
-    /// settings, because no path in a checkpoint is followed. The critic does not learn alone once more. The number of shards is
-    /// kept if it still fits.
+    /// settings, because no path in a checkpoint is followed. The number of shards is kept if it still fits.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
     pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let mut own = self.clone();
-        (own.env.model, own.ppo.critic_first, own.run.shards) = (BUILTIN_MODEL.into(), 0, 0);
+        (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
         let own = Table::try_from(own).expect("a configuration is a tree of tables");
-        let mut changed = over(own, user, overrides)?;
+        let mut changed = over(own, user.map(Source::table).transpose()?, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
         }
@@ -189,12 +188,11 @@ impl Source {
 }
 
 /// As [`layered`], with a file that a user has written.
-fn over(under: Table, user: Option<&Source>, overrides: &[Override]) -> Result<Config> {
-    let table = user.map(Source::table).transpose()?;
-    if let Some((path, table)) = &table {
+fn over(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
+    if let Some((path, table)) = &user {
         expect_one_smoothing(path, table, &under)?;
     }
-    layered(under, table, overrides)
+    layered(under, user, overrides)
 }
 
 /// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error

@@ -148,6 +148,7 @@ mod tests {
         let half = "[env]\nact_moving_average = 0.6\n[training.act_moving_average]\nto = 0.7";
         let refused = Config::resolve(Some(&source(half)), &[]).unwrap_err().to_string();
         assert!(refused.contains("= 0.6, but training.act_moving_average begins with 0.25"), "{refused}");
+        assert!(Config::resolve_task(Some(&source(half)), &[]).is_err(), "nor in Python");
         // What the program writes can be read, even if the ramp takes no steps.
         let jump = Config::resolve(None, &[set("training.act_moving_average={from=0.2,to=0.7,steps=0}")]).unwrap();
         assert_eq!(Config::resolve(Some(&source(&jump.to_text())), &[]).unwrap(), jump);
@@ -167,13 +168,6 @@ mod tests {
         let played = PolicyConfig::from_text(path, &stored, &[set("env.act_moving_average=0.6")]).unwrap();
         assert_eq!(played.env.act_moving_average, 0.6);
         assert_eq!(Config::from_text(path, &stored, &[]).unwrap(), config);
-    }
-
-    #[test]
-    fn in_a_fork_the_critic_learns_alone_only_if_that_is_set_again() {
-        let parent = Config::resolve(None, &[set("ppo.critic_first=5")]).unwrap();
-        let forked = |sets: &[Override]| parent.changed(None, sets).unwrap().ppo.critic_first;
-        assert_eq!([forked(&[]), forked(&[set("ppo.critic_first=2")])], [0, 2]);
     }
 
     #[test]

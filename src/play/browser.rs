@@ -24,6 +24,9 @@ use crate::sim::Quality;
 /// The text for the origin of a built-in policy.
 const BUILT_IN: &str = "built into the program";
 
+/// The key of the smoothing of actions, which changes in the course of a training.
+const SMOOTHING: &str = "env.act_moving_average";
+
 /// Returns what a page says about an actor, the place and the description of its policy, and a seed.
 pub(super) fn about(actor: &str, policy: Option<(&str, &str)>, seed: Option<u64>) -> About {
     let title = match policy.map(|(place, _)| place) {
@@ -104,7 +107,12 @@ pub(super) fn live(
             let newer = Loaded::find(Some(&followed.path), &args.set).and_then(|newer| {
                 let same = Some(&newer.record) == record.as_ref();
                 ensure!(same, "{} is for another hand", followed.path.display());
-                acting_of(&newer, args)
+                let mut newer = acting_of(&newer, args)?;
+                // The page shows the settings of the first policy.
+                if newer.smoothing != task.config().act_moving_average {
+                    newer.policy.iter_mut().for_each(|name| *name += &format!(", {SMOOTHING} {}", newer.smoothing));
+                }
+                Ok(newer)
             });
             match newer {
                 Ok(newer) => acting = newer,

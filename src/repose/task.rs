@@ -58,7 +58,7 @@ impl Task {
         let nominal = if compilation.keeps_all() { as_it_is } else { Scene::load(file, &compilation)? };
         let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
-        hand.cube = scene.free_body(&hand.parts.object)?;
+        hand.cube.inertia *= config.cube_mass_scale;
         config.goal_position.settle(hand.place());
         let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
         ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);

@@ -15,7 +15,7 @@ const MUCH: usize = 2 << 30;
 pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
     let mut hints = Vec::new();
     let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
-    // The penalty for drops may still grow at the end, and a share of randomised episodes has its own note.
+    // The penalty for drops and the share of randomised episodes may still grow at the end.
     let ramps = [
         ("training.act_moving_average", training.act_moving_average),
         ("training.assist", training.assist),

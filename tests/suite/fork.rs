@@ -100,6 +100,20 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
 }
 
 #[test]
+fn the_critic_does_not_learn_alone_once_more_in_a_fork_unless_it_was_learning_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let alone = ["--set", "ppo.critic_first=1", "--total-steps", "384", "--run-dir", "run", "--keep", "9"];
+    succeeded(program(folder, &train(&[&alone[..], &["--set", "run.checkpoint_every=1"]].concat())));
+    for (iteration, left) in [(0, 1), (1, 1), (2, 0)] {
+        let (from, to) = (format!("run/checkpoints/iteration-0000000{iteration}.safetensors"), format!("{iteration}"));
+        succeeded(fork(folder, &from, &to, &["--total-steps", "512"]));
+        let own = config(folder, &to);
+        assert!(own.contains(&format!("critic_first = {left}\n")), "{iteration}: {own}");
+    }
+}
+
+#[test]
 fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();

@@ -536,7 +536,8 @@ fn live_reads(live: &Live) -> bool {
 fn a_training_is_followed_by_its_newest_policy_and_is_not_changed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    let ramp = ["--set", "training.act_moving_average={from=0.2,to=0.8,steps=200}"];
+    succeeded(program(folder, &train(&[&ramp[..], &["--total-steps", "128", "--run-dir", "run"]].concat())));
     let before = names(&folder.join("run"));
     let live = Live::start(folder, &["play", "--ckpt", "run", "--web", "0", "--follow", "--plain"]);
     let mut events = live.events();
@@ -545,7 +546,8 @@ fn a_training_is_followed_by_its_newest_policy_and_is_not_changed() {
     assert_eq!(names(&folder.join("run")), before);
     succeeded(program(folder, &["train", "--resume", "run", "--total-steps", "256"]));
     let began = Instant::now();
-    while !events.next("episode")["policy"].as_str().unwrap().contains("256 control steps") {
+    while !events.next("episode")["policy"].as_str().unwrap().ends_with("256 control steps, env.act_moving_average 0.8")
+    {
         assert!(began.elapsed() < Duration::from_secs(20));
     }
     // A file that cannot be used is no reason to stop.
