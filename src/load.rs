@@ -295,11 +295,16 @@ fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
 /// # Errors
 /// Fails if it was not. The message says how to name it.
 pub fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
-    if let Some(model) = env.model_file().filter(|_| !named) {
-        let set = os::quoted(&format!("{MODEL}={}", model.display()));
-        bail!("it uses a custom scene, and no path in a file is followed: add --set {set} to use that scene");
+    if env.model_file().is_some() && !named {
+        bail!("it uses a custom scene, and no path in a file is followed: add{} to use that scene", scene_option(env));
     }
     Ok(())
+}
+
+/// Returns the option that names the scene, with a space before it, or nothing for the built-in scene.
+pub fn scene_option(env: &EnvConfig) -> String {
+    let set = env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
+    set.map_or(String::new(), |set| format!(" --set {set}"))
 }
 
 #[cfg(test)]

@@ -19,8 +19,9 @@ use std::sync::Arc;
 use anyhow::{Context, Error, Result, anyhow, ensure};
 
 use crate::cli::TrainArgs;
-use crate::config::Config;
+use crate::config::{Config, EnvConfig};
 use crate::evaluate::{Actor, Episodes, Trial};
+use crate::load::scene_option;
 use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
@@ -87,7 +88,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     let code = code?;
     if session.finished() && !args.quiet {
-        say_what_next(Path::new(&place));
+        say_what_next(Path::new(&place), &session.config.env);
     }
     Ok(code)
 }
@@ -292,10 +293,11 @@ impl Session {
 }
 
 /// Prints how to look at a run that has finished.
-fn say_what_next(run: &Path) {
+fn say_what_next(run: &Path, env: &EnvConfig) {
     let (program, run_word) = (os::called_as(), os::quoted_path(run));
     let all = os::quoted_path(run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new(".")));
-    os::say(&format!("  {program} play --ckpt {run_word}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
+    let play = format!("{program} play --ckpt {run_word}{}", scene_option(env));
+    os::say(&format!("  {play}\n  {program} plot {run_word}\n  tensorboard --logdir {all}"));
 }
 
 /// Runs what may panic. A panic becomes an error.

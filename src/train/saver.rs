@@ -7,7 +7,7 @@ use anyhow::{Error, Result, anyhow};
 
 use crate::cli::TrainArgs;
 use crate::config::Config;
-use crate::load::{self, MODEL};
+use crate::load;
 use crate::os::{self, Locked, Requests};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
@@ -57,9 +57,8 @@ impl Saver {
         initial: Checkpoint,
         from_newest: bool,
     ) -> Self {
-        let model = config.env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
-        let model = model.map_or(String::new(), |set| format!(" --set {set}"));
-        let options = format!("{model}{}", if args.dump_diverged { " --dump-diverged" } else { "" });
+        let options =
+            format!("{}{}", load::scene_option(&config.env), if args.dump_diverged { " --dump-diverged" } else { "" });
         // The newest, and one more in case that is damaged.
         let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
         let initial = Arc::new(initial);

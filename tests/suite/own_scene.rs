@@ -61,6 +61,11 @@ fn a_training_records_where_its_cube_started_and_goes_on_there() {
     let folder = moved_scene();
     let folder = folder.path();
     trained(folder, "scenes", &["--set", MOVED]);
+    let said =
+        stderr(&succeeded(program(folder, &train(&["--set", MOVED, "--run-dir", "said", "--total-steps", "128"]))));
+    let scene = folder.canonicalize().unwrap().join("moved.xml");
+    let next = format!("play --ckpt said --set env.model={}", scene.display());
+    assert!(said.lines().any(|line| line.ends_with(&next)), "{next} is not in\n{said}");
     assert_eq!(place_in(folder, "scenes"), "[1.33, 0.0, 0.295]");
     fs::write(folder.join("own.toml"), "[env]\ngoal_position = [0.33, 0, 0.295]\n").unwrap();
     trained(folder, "named", &["--config", "own.toml", "--set", MOVED]);
