@@ -1,8 +1,8 @@
 //! The extension module of the Python package: environments that step together, and policies.
 //!
 //! It follows five rules. Every array that goes out is new memory, and every array that comes in is copied. Work runs without
-//! Python's lock on threads of its own, except for calls of a function of the user. A fork gets threads of its own. A panic becomes a `RuntimeError`. No call waits for a lock
-//! that another thread of the user may hold: the second call fails.
+//! Python's lock on threads of its own, except while it calls a function of the user. A fork gets threads of its own. A panic becomes
+//! a `RuntimeError`. No call waits for a lock that another thread of the user may hold: the second call fails.
 
 mod episodes;
 mod hands;
