@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise() {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
@@ -100,7 +100,9 @@ mod tests {
             [act_moving_average, assist, drop_reward, tolerance, hold].map(ended);
         let trained = TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, ..training };
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
-        let [horizon, desired_kl, std, away_std] = [ppo.horizon, ppo.desired_kl, ppo.std, ppo.away_std].map(ended);
+        let [horizon, desired_kl] = [ppo.horizon, ppo.desired_kl].map(ended);
+        let [std, away_std] = [0.13, 0.2].map(Ramp::constant);
+        assert!(std.to < ppo.std.to && away_std.to < ppo.away_std.to);
         let learnt = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };
         let tuning = shipped("finetune");
         let robust = shipped("repose-robust");
