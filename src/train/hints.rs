@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
-        let ramps = "training.act_moving_average, training.tolerance, training.hold, ppo.horizon, ppo.std";
+        let ramps = "training.act_moving_average, training.tolerance, training.hold, ppo.horizon";
         assert!(line.contains(&format!("{ramps}, which last up to 80000000 steps")), "{line}");
         assert!(!line.contains("assist"), "its ramp ends in time: {line}");
         assert!(hints_for(&["run.total_steps=9000000"])[0].contains("training.assist"));
