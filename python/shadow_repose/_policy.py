@@ -87,7 +87,7 @@ class Policy:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings of the task that it was trained for, by dotted key: `{"env.act_moving_average": 0.5, ...}`."""
+        """The settings of the task that it was trained for, by dotted key: `{"env.act_moving_average": 0.7, ...}`."""
         return flat(self._native.settings())
 
     @property

@@ -304,7 +304,7 @@ def test_the_task_is_that_of_the_policy():
     policy = Policy.load("builtin")
     envs = policy.make_env(4, seed=1)
     assert envs.settings == policy.settings != VectorEnv(1).settings
-    assert envs.settings["env.act_moving_average"] == 0.5
+    assert envs.settings["env.act_moving_average"] == 0.7
     changed = VectorEnv(4, policy="builtin", set={"env.friction_scale": 0.5})
     assert {key for key, value in changed.settings.items() if policy.settings[key] != value} == {"env.friction_scale"}
     learning = VectorEnv(4, policy="builtin", training=True)

@@ -21,7 +21,7 @@ def test_one_hand_passes_the_check_of_environments():
 
 def test_many_hands_are_made_by_name():
     envs = gymnasium.make_vec("ShadowRepose-v0", num_envs=4, policy="builtin")
-    assert isinstance(envs, VectorEnv) and envs.num_envs == 4 and envs.settings["env.act_moving_average"] == 0.5
+    assert isinstance(envs, VectorEnv) and envs.num_envs == 4 and envs.settings["env.act_moving_average"] == 0.7
     env = gymnasium.make("ShadowRepose-v0", seed=3)
     assert np.array_equal(env.reset(seed=1)[0], VectorEnv(1).reset(seed=1)[0][0])
 

@@ -91,13 +91,15 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise_and_smoothing() {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
         let TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, .. } = training;
-        let [act_moving_average, assist, drop_reward, tolerance, hold] =
+        let [smoothing, assist, drop_reward, tolerance, hold] =
             [act_moving_average, assist, drop_reward, tolerance, hold].map(ended);
+        let act_moving_average = Ramp::constant(0.6);
+        assert!(act_moving_average.to > smoothing.to);
         let trained = TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, ..training };
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
         let [horizon, desired_kl] = [ppo.horizon, ppo.desired_kl].map(ended);
@@ -107,13 +109,14 @@ mod tests {
         let tuning = shipped("finetune");
         let robust = shipped("repose-robust");
         let continuing = shipped("repose-continue");
-        let priced = TrainingConfig { drop_reward: robust.training.drop_reward, ..trained.clone() };
+        let drop_reward = robust.training.drop_reward;
+        let smoother = TrainingConfig { act_moving_average: smoothing, drop_reward, ..trained.clone() };
         let slower = PpoConfig { critic_first: tuning.ppo.critic_first, ..learnt.clone() };
         for (found, training, ppo) in
-            [(&continuing, &trained, &learnt), (&tuning, &trained, &slower), (&robust, &priced, &learnt)]
+            [(&continuing, &trained, &slower), (&tuning, &trained, &slower), (&robust, &smoother, &learnt)]
         {
             assert_eq!((&found.training, &found.ppo), (training, ppo));
-            let act_moving_average = act_moving_average.to;
+            let act_moving_average = training.act_moving_average.to;
             assert_eq!(found.env, EnvConfig { act_moving_average, ..default.env.clone() });
         }
     }
