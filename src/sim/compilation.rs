@@ -9,10 +9,13 @@ use std::ptr;
 
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
-use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase};
+use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
 use serde::{Deserialize, Serialize};
+
+use super::placing::{frames_within, geom_within};
+use crate::quat;
 
 /// The group of geoms that are drawn and by convention collide with nothing.
 pub(super) const VISUAL: i32 = 2;
@@ -102,7 +105,8 @@ impl Compilation {
             resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))?;
         }
         if let Some(goal) = self.adds_goal {
-            add_goal(&mut spec, name, goal)?;
+            let without_goal = Self { adds_goal: None, ..self.clone() };
+            add_goal(&mut spec, &without_goal.compile(file)?, name, goal)?;
         }
         Ok(spec)
     }
@@ -144,21 +148,30 @@ pub fn origin(file: Option<&Path>) -> String {
     file.map_or("the built-in scene".into(), |path| path.display().to_string())
 }
 
-/// Adds a mocap body in the shape of the body `name`, where that is, which touches nothing.
-fn add_goal(spec: &mut MjSpec, name: &str, goal: &str) -> Result<()> {
+/// Adds a mocap body that touches nothing, in the shape and at the place of the body `name` of the compiled scene. Only there do
+/// all shapes have a position and an orientation: a file can give them in many ways.
+fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Result<()> {
     ensure!(spec.body_mut(goal).is_none(), "has a body `{goal}` that is no mocap body");
-    let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
-    let pos = *body.pos();
-    let shapes: Vec<_> = body
-        .geom_iter_mut(false)
-        .map(|geom| (geom.type_(), *geom.size(), *geom.pos(), *geom.quat(), *geom.fromto(), geom.meshname().to_owned()))
-        .collect();
+    let no_body = || format!("has no body `{name}`");
+    let object = compiled.name_to_id(MjtObjBase::mjOBJ_BODY, name).with_context(no_body)?;
+    let frames = frames_within(compiled, object);
     let shown = spec.world_body_mut().add_body();
-    shown.with_name(goal).with_pos(pos).with_mocap(true);
-    for (kind, size, pos, quat, fromto, mesh) in shapes {
-        let geom = shown.add_geom();
-        geom.with_type(kind).with_size(size).with_pos(pos).with_quat(quat).with_fromto(fromto).with_meshname(&mesh);
-        geom.with_contype(0).with_conaffinity(0).with_group(VISUAL).with_mass(0.0).with_rgba([0.2, 0.8, 0.2, 0.4]);
+    shown.with_name(goal).with_pos(compiled.body_pos()[object]).with_mocap(true);
+    for geom in 0..compiled.ngeom() as usize {
+        let Some((mut pos, mut quat)) = geom_within(compiled, &frames, geom) else { continue };
+        let (kind, mut mesh_name) = (compiled.geom_type()[geom], "");
+        if matches!(kind, MjtGeomBase::mjGEOM_MESH | MjtGeomBase::mjGEOM_SDF) {
+            // MuJoCo has moved the vertices of the mesh to its centre, and its geoms with them. It will do so with this one.
+            let mesh = compiled.geom_dataid()[geom] as usize;
+            mesh_name = compiled.id_to_name(MjtObjBase::mjOBJ_MESH, mesh).unwrap_or_default();
+            quat = quat::mul(quat, quat::conj(compiled.mesh_quat()[mesh]));
+            let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
+            pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
+        }
+        let (size, group) = (compiled.geom_size()[geom], compiled.geom_group()[geom]);
+        let copy = shown.add_geom();
+        copy.with_type(kind).with_size(size).with_pos(pos).with_quat(quat).with_meshname(mesh_name).with_group(group);
+        copy.with_contype(0).with_conaffinity(0).with_mass(0.0).with_rgba([0.2, 0.8, 0.2, 0.4]);
     }
     Ok(())
 }
@@ -189,4 +202,56 @@ fn resize(body: &mut MjsBody, factor: f64) -> Result<()> {
         resize(child, factor)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_goal_that_is_added_has_the_shapes_of_the_object_in_their_places() {
+        let box_in = |more: &str| format!("<geom type='box' size='.02 .03 .04' {more}/>");
+        for (size, shapes) in [
+            (1.0, box_in("pos='.01 0 0' quat='.6 .8 0 0'")),
+            (1.0, box_in("axisangle='0 0 1 30'")),
+            (1.2, box_in("pos='.01 0 0' xyaxes='0 1 0 1 0 0'")),
+            (1.2, "<geom type='capsule' size='.02 .04' euler='90 0 0'/>".into()),
+            (1.2, "<geom type='capsule' size='.02' fromto='0 0 0 .02 .03 .01'/>".into()),
+            (1.2, format!("<frame pos='.05 0 0' euler='0 90 0'>{}</frame>", box_in("euler='10 20 30'"))),
+            (1.2, format!("{}<body pos='0 .03 0' euler='0 0 40'>{}</body>", box_in(""), box_in("pos='.01 0 0'"))),
+            (1.0, "<geom type='mesh' mesh='part' pos='.01 .02 0' axisangle='0 0 1 90'/>".into()),
+            (1.0, "<geom type='box' mesh='part' euler='0 0 45'/>".into()),
+        ] {
+            let text = format!(
+                "<mujoco><asset><mesh name='part' vertex='0 0 0 .05 0 0 0 .03 0 0 0 .02 .05 .03 .01'/></asset>
+                 <worldbody><geom type='plane' size='1 1 1'/>
+                 <body name='cube' pos='.3 .1 .2'><freejoint/>{shapes}</body></worldbody></mujoco>"
+            );
+            let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
+            file.write_all(text.as_bytes()).unwrap();
+            let plain = Compilation::plain(0.01, Cone::Scene);
+            let compilation = Compilation { object: "cube".into(), size, adds_goal: Some("goal"), ..plain };
+            let model = compilation.compile(Some(file.path())).unwrap();
+            let shapes_of = |name: &str| -> Vec<_> {
+                let body = model.name_to_id(MjtObjBase::mjOBJ_BODY, name).unwrap();
+                let frames = frames_within(&model, body);
+                let placed = (0..model.ngeom() as usize)
+                    .filter_map(|geom| Some((geom, geom_within(&model, &frames, geom)?)))
+                    .map(|(geom, (pos, quat))| {
+                        let turn = quat::rotation_vector(quat::canonical(quat));
+                        let kind = (model.geom_type()[geom], model.geom_dataid()[geom]);
+                        (kind, [model.geom_size()[geom], pos, turn].concat())
+                    });
+                placed.collect()
+            };
+            let (object, goal) = (shapes_of("cube"), shapes_of("goal"));
+            assert!(!object.is_empty() && object.len() == goal.len(), "{shapes}");
+            for ((kind, place), (same_kind, same_place)) in object.iter().zip(&goal) {
+                let near = place.iter().zip(same_place).all(|(a, b)| (a - b).abs() < 1e-9);
+                assert!(near && kind.0 == same_kind.0, "{shapes}: {place:?} {same_place:?}");
+            }
+        }
+    }
 }

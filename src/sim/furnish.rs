@@ -2,6 +2,7 @@
 //!
 //! Nothing here changes the physics: what is added has no mass, collides with nothing, and comes after the existing objects.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Result, anyhow};
@@ -12,8 +13,15 @@ use mujoco_rs::wrappers::mj_model::MjtTexture;
 
 use super::compilation::{Compilation, VISUAL};
 
-/// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours.
-const CUBES: [(&str, f32); 2] = [("cube", 1.0), ("target", 0.7)];
+/// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours. The object and a goal that is added
+/// are coloured too.
+const CUBES: [(&str, f32); 2] = [("cube", SOLID), ("target", CLEAR)];
+
+/// The opacity of an object.
+const SOLID: f32 = 1.0;
+
+/// The opacity of a goal.
+const CLEAR: f32 = 0.7;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
 const FACES: [[f32; 3]; 6] =
@@ -29,8 +37,11 @@ const PLATE: f64 = 0.02;
 pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&MjtTexture::mjTEXTURE_SKYBOX);
+    let parts = [(Some(&*compilation.object), SOLID), (compilation.adds_goal, CLEAR)];
+    let parts = parts.into_iter().filter_map(|(name, opacity)| Some((name?, opacity)));
+    let cubes: BTreeMap<&str, f32> = CUBES.into_iter().chain(parts).collect();
     let boxes: Vec<_> =
-        CUBES.iter().filter_map(|&(name, opacity)| Some((name, plain_box(model, name)?, opacity))).collect();
+        cubes.into_iter().filter_map(|(name, opacity)| Some((name, plain_box(model, name)?, opacity))).collect();
     if !is_dark && !has_no_sky && boxes.is_empty() {
         return Ok(None);
     }

@@ -15,6 +15,7 @@ mod graphics;
 mod look;
 #[cfg(feature = "viewer")]
 mod panel;
+mod placing;
 #[cfg(feature = "video")]
 mod renderer;
 mod scene;

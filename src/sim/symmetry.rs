@@ -2,6 +2,7 @@
 
 use mujoco_rs::prelude::{MjModel, MjtGeomBase};
 
+use super::placing::{Placed, frames_within, geom_within, inside};
 use super::{Body, Scene};
 use crate::quat::{self, CUBE_ROTATIONS, Quat};
 
@@ -52,23 +53,16 @@ impl Scene {
     }
 
     fn form(&self, Body(top): Body) -> Form {
-        let model = &self.model;
-        let mut frames: Vec<Option<([f64; 3], Quat)>> = vec![None; model.nbody() as usize];
-        frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
+        let (model, frames) = (&self.model, frames_within(&self.model, top));
         let (mut inertia, mut moves) = (Inertia::default(), false);
-        // Every body has a higher number than its parent.
-        for body in top..frames.len() {
-            if let Some(parent) = frames[model.body_parentid()[body] as usize].filter(|_| body > top) {
-                frames[body] = Some(inside(parent, model.body_pos()[body], model.body_quat()[body]));
-                moves |= model.body_jntnum()[body] > 0;
-            }
-            if let Some(frame) = frames[body] {
+        for (body, frame) in frames.iter().enumerate() {
+            if let Some(frame) = *frame {
                 inertia.add(model, body, frame);
+                moves |= body > top && model.body_jntnum()[body] > 0;
             }
         }
         let shape = |geom: usize| {
-            let frame = frames[model.geom_bodyid()[geom] as usize]?;
-            let (position, orientation) = inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]);
+            let (position, orientation) = geom_within(model, &frames, geom)?;
             let (kind, data, size) = (model.geom_type()[geom], model.geom_dataid()[geom], model.geom_size()[geom]);
             touches(model, geom).then_some(Shape { kind, data, size, position, orientation })
         };
@@ -90,12 +84,6 @@ fn touches(model: &MjModel, geom: usize) -> bool {
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0
         || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
-}
-
-/// Returns a pose that is given in a frame as a pose in the surroundings of that frame.
-fn inside((origin, axes): ([f64; 3], Quat), position: [f64; 3], orientation: Quat) -> ([f64; 3], Quat) {
-    let [x, y, z] = quat::rotate(axes, position);
-    ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))
 }
 
 /// Returns the rotation as a matrix: its columns are the rotated axes.
@@ -141,7 +129,7 @@ impl Shape {
 }
 
 impl Inertia {
-    fn add(&mut self, model: &MjModel, body: usize, frame: ([f64; 3], Quat)) {
+    fn add(&mut self, model: &MjModel, body: usize, frame: Placed) {
         let (mass, principal) = (model.body_mass()[body], model.body_inertia()[body]);
         let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
         let (axes, square) = (matrix(axes), centre.iter().map(|x| x * x).sum::<f64>());

@@ -235,6 +235,15 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
 }
 
 #[test]
+fn a_plain_box_and_a_goal_that_is_added_have_faces_that_can_be_told_apart() {
+    let model = concat!("env.model=", env!("CARGO_MANIFEST_DIR"), "/tests/suite/three_fingers.xml");
+    let plain = task(&[model]);
+    let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
+    let geoms = [&plain, &plain.for_display(&look).unwrap()].map(|task| task.scene().geoms());
+    assert_eq!(geoms[1], geoms[0] + 12);
+}
+
+#[test]
 fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
     let look = Look {
         meshes: vec![b"rubbish".to_vec(); mesh_files().len()],
