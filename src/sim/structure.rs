@@ -34,7 +34,7 @@ const NO_OBJECT: &str = "has no body with a free joint that the hand could turn;
 impl Scene {
     /// Returns `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
     /// limited hinges of the trees that they move. The fingertips are the last bodies of these trees. The object is the only
-    /// other body with a free joint, and the goal the only other mocap body.
+    /// other body with a free joint. The goal is the only other mocap body that no equality constraint ties to something.
     ///
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
@@ -69,7 +69,8 @@ impl Scene {
             found.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
         };
         let free = others(&|body| self.free_joint(body).is_some());
-        let goals = others(&|body| self.model.body_mocapid()[body] >= 0);
+        let held = self.bodies_of_constraints();
+        let goals = others(&|body| self.model.body_mocapid()[body] >= 0 && !held.contains(&body));
         for (found, part, none, what, setting) in [
             (free, &mut parts.object, Some(NO_OBJECT), "bodies with a free joint", "hand.object"),
             (goals, &mut parts.goal, None, "mocap bodies", "hand.goal"),
@@ -90,6 +91,19 @@ impl Scene {
             bail!(problems.join("; "));
         }
         Ok(parts)
+    }
+
+    /// Returns the bodies that equality constraints tie to each other, e.g. a mocap body that guides a hand.
+    fn bodies_of_constraints(&self) -> BTreeSet<usize> {
+        let model = &self.model;
+        let ids = model.eq_objtype().iter().zip(model.eq_obj1id().iter().zip(model.eq_obj2id()));
+        let tied = ids.flat_map(|(&kind, (&a, &b))| [a, b].map(|id| (kind, id as usize)));
+        let bodies = tied.filter_map(|(kind, id)| match kind {
+            MjtObjBase::mjOBJ_BODY => Some(id),
+            MjtObjBase::mjOBJ_SITE => Some(model.site_bodyid()[id] as usize),
+            _ => None,
+        });
+        bodies.collect()
     }
 
     /// Returns the bodies that one of these hinges moves and that carry no other body.

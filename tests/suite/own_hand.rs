@@ -8,7 +8,7 @@ use shadow_repose::env::Env;
 use shadow_repose::repose::{Repose, Task};
 use shadow_repose::rng;
 
-use crate::support::{SCENE, env_config, program, stderr, succeeded, train};
+use crate::support::{SCENE, env_config, program, stderr, succeeded, task, train};
 
 /// A hand of three fingers: nine joints, six actuators, tendons, sites, and a box.
 const THREE_FINGERS: &str = include_str!("three_fingers.xml");
@@ -147,6 +147,21 @@ fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
     let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let said = stderr(&succeeded(program(folder.path(), &[&play[..], &["--set", &model]].concat())));
     assert!(said.contains("ranges or the tendons of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"), "{said}");
+}
+
+#[test]
+fn a_mocap_body_that_guides_something_is_not_the_goal() {
+    let guide = "<body name=\"guide\" mocap=\"true\"/></worldbody>";
+    let tied = |constraint: &str| format!("<equality>{constraint}</equality></mujoco>");
+    let site = "<site name=\"grip\"/></body></worldbody>";
+    for (bodies, constraint) in [
+        (guide.to_owned(), "<weld body1=\"guide\" body2=\"palm\"/>"),
+        (guide.replace("/></worldbody>", &format!(">{site}")), "<connect site1=\"grip\" site2=\"α end\"/>"),
+    ] {
+        let scene = THREE_FINGERS.replace("</worldbody>", &bodies).replace("</mujoco>", &tied(constraint));
+        let (_folder, model) = placed(&scene);
+        assert_eq!(task(&[&model]).hand().parts.goal, "goal of shadow-repose", "{constraint}");
+    }
 }
 
 #[test]
