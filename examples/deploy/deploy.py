@@ -212,8 +212,13 @@ def varied_model(env, scene, policy, drawn=None):
     if size != 1:
         if cube.bodies or cube.frames or any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in cube.geoms):
             sys.exit(f"error: {scene}: this program resizes only cubes of simple shapes")
+        cube.ipos *= size
+        cube.inertia *= size**2
+        cube.fullinertia *= size**2
         for geom in cube.geoms:
-            geom.size, geom.pos, geom.density = geom.size * size, geom.pos * size, geom.density / size**3
+            dimensions = 2 if geom.typeinertia == mujoco.mjtGeomInertia.mjINERTIA_SHELL else 3
+            geom.size, geom.pos, geom.density = geom.size * size, geom.pos * size, geom.density / size**dimensions
+            geom.fromto *= size
     model = spec.compile()
     model.opt.timestep = env["sim_dt"]
     model.opt.gravity += offset["gravity"]

@@ -46,6 +46,7 @@ pub(crate) fn resolve(
     ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
     let Some(policy) = policy else {
         let config = Config::resolve_task(user_file(config)?.as_ref(), overrides)?;
+        ensure!(!config.env.mirror, "env.mirror: it mirrors for a policy, and here is none");
         let task = Task::new(&config.env, &config.hand)?;
         return Ok((Config { env: task.config().clone(), ..config }, task));
     };

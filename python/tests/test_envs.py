@@ -356,6 +356,7 @@ def test_one_hand_is_a_gymnasium_environment():
         ({"autoreset_mode": "never"}, ValueError, "SAME_STEP"),
         ({"autoreset_mode": [1]}, ValueError, "SAME_STEP"),
         ({"policy": "builtin", "set": {"env.model": "builtin", "env.mirror": True}}, ValueError, "mirror"),
+        ({"set": {"env.mirror": True}}, ValueError, "mirrors for a policy"),
         ({"render_mode": "human"}, ValueError, "cannot be rendered"),
         ({"nonsense": 1}, TypeError, "nonsense"),
     ],

@@ -131,7 +131,7 @@ impl Config {
 
 impl PolicyConfig {
     /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
-    /// added and removed between versions. Values that came from the built-in scene do not apply to another scene.
+    /// added and removed between versions. Values that came from one scene do not apply to another scene.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -139,12 +139,16 @@ impl PolicyConfig {
         let source = Source { path: path.into(), text: text.into() };
         let (path, mut table) = source.table()?;
         table.retain(|section, _| matches!(section, "env" | "hand" | "ppo"));
-        let of_builtin = lookup(&table, "env.model").is_none_or(|model| model.as_str() == Some(BUILTIN_MODEL));
+        let stored = lookup(&table, "env.model").and_then(Value::as_str).unwrap_or(BUILTIN_MODEL).to_owned();
+        let asked = overrides.iter().rfind(|set| set.key == "env.model").map(|set| Path::new(&set.value));
+        // The stored path is absolute.
+        let is_same = asked.is_none_or(|asked| asked.canonicalize().is_ok_and(|file| file == Path::new(&stored)));
         for (section, keys) in &mut table {
             let is_used = |key: &str, value: &Value| match section.as_str() {
                 // The sizes of its hand are part of the policy.
                 "env" if ["num_envs", "num_hand_dofs", "num_actuators"].contains(&key) => false,
-                "env" if key == "goal_position" => !of_builtin || *value != DEFAULTS["env"][key],
+                "env" if key == "goal_position" && stored == BUILTIN_MODEL => *value != DEFAULTS["env"][key],
+                "env" if key == "goal_position" => is_same,
                 "env" | "hand" => true,
                 _ => OF_NETS.contains(&key),
             };

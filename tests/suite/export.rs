@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::{program, stderr, succeeded, train};
+use crate::support::{SCENE, program, stderr, succeeded, train};
 
 /// Returns the Python that .ci/run has prepared with mujoco, onnx and onnxruntime.
 fn python() -> Option<OsString> {
@@ -105,6 +105,29 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
         .output()
         .unwrap();
     assert!(!output.status.success() && stderr(&output).contains("noise or bias"), "{}", stderr(&output));
+}
+
+#[test]
+fn an_own_object_is_resized_in_python_as_it_is_here() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let examples = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy");
+    let cube = "<geom name=\"cube\" type=\"box\" size=\".025 .025 .025\" mass=\".028\"";
+    assert!(SCENE.contains(cube));
+    let replay = REPLAY.replace("deploy.SCENE", "'own.xml'");
+    for object in [
+        "<geom type=\"capsule\" size=\".02\" fromto=\"-.01 0 0 .02 .01 0\" mass=\".028\"",
+        "<geom type=\"box\" size=\".02 .025 .03\" shellinertia=\"true\" density=\"5\"",
+        "<inertial pos=\".003 0 .001\" mass=\".03\" diaginertia=\"2e-5 1e-5 2e-5\"/><geom type=\"box\" size=\".02 .025 .03\"",
+        "<inertial pos=\"0 0 0\" mass=\".03\" fullinertia=\"2e-5 1e-5 2e-5 1e-6 0 0\"/><geom type=\"sphere\" size=\".03\"",
+    ] {
+        std::fs::write(folder.path().join("own.xml"), SCENE.replace(cube, object)).unwrap();
+        let sets = ["--set", "env.model=own.xml", "--set", "env.cube_size_scale=1.2"];
+        succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
+        let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+        succeeded(program(folder.path(), &[&play[..], &sets].concat()));
+        runs(&python, folder.path(), &["-c", &replay, examples]);
+    }
 }
 
 /// Writes copies of a policy and a trace with a NaN in them, in the way that the first argument names.

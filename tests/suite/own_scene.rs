@@ -82,6 +82,21 @@ fn a_training_records_where_its_cube_started_and_goes_on_there() {
 }
 
 #[test]
+fn a_policy_starts_its_cube_where_another_scene_has_it() {
+    let folder = moved_scene();
+    let folder = folder.path();
+    trained(folder, "run", &["--set", MOVED]);
+    let other = fs::read_to_string(folder.join("moved.xml")).unwrap().replace("pos=\"1.33 0 ", "pos=\"1.33 -.01 ");
+    fs::write(folder.join("other.xml"), other).unwrap();
+    for (scene, place) in
+        [("moved.xml", "[1.33,0.0,0.295]"), ("other.xml", "[1.33,-0.01,0.295]"), ("builtin", "[0.33,0.0,0.295]")]
+    {
+        let model = format!("env.model={scene}");
+        assert_eq!(played(folder, &["--ckpt", "run", "--set", &model]).0, place);
+    }
+}
+
+#[test]
 fn what_is_replaced_of_a_users_scene_is_said_at_the_start() {
     let folder = moved_scene();
     let folder = folder.path();
