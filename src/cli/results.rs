@@ -16,7 +16,7 @@ pub struct PlotArgs {
     /// Picture to write, as .svg or .png
     #[arg(long, value_name = "FILE", default_value = "learning.svg")]
     pub out: PathBuf,
-    /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, rotation error and
+    /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, turning and
     /// drop rate in training]
     #[arg(long, value_name = "COLUMN")]
     pub metric: Vec<String>,

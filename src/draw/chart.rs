@@ -56,6 +56,9 @@ pub(super) const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 0, 0),
 ];
 
+/// The extent of the y axis below which its labels have an exponent. Others have five decimals.
+const SMALL: f64 = 1e-4;
+
 /// Pixels between two dashes.
 const GAP: i32 = 3;
 
@@ -228,6 +231,7 @@ impl Subplot {
         along: Option<&str>,
     ) -> Result<()> {
         let y = range(self.curves.iter().flat_map(Curve::values));
+        let extent = y.end - y.start;
         let mut chart = ChartBuilder::on(part)
             .caption(printable(&self.title), ("sans-serif", 17))
             .margin(8)
@@ -236,6 +240,10 @@ impl Subplot {
             .build_cartesian_2d(x, y)?;
         let mut mesh = chart.configure_mesh();
         mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", LABEL));
+        let small = |value: &f64| if *value == 0.0 { "0".to_owned() } else { format!("{value:.1e}") };
+        if extent < SMALL {
+            mesh.y_label_formatter(&small);
+        }
         if let Some(along) = along {
             mesh.x_desc(along);
         }
@@ -324,6 +332,13 @@ mod tests {
         };
         assert_eq!(lines(COLOURS[1]), 2, "{svg}");
         assert!(lines(COLOURS[0]) > 20, "{svg}");
+    }
+
+    #[test]
+    fn an_axis_of_very_small_values_has_labels_that_differ() {
+        let svg = svg(vec![panel("a", vec![line(&[[0.0, 0.0], [1.0, 3e-6]])])]);
+        let labels = ["0", "5.0e-7", "1.0e-6", "1.5e-6", "3.0e-6"];
+        assert!(labels.iter().all(|label| svg.lines().any(|line| line.trim() == *label)), "{svg}");
     }
 
     #[test]

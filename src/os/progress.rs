@@ -155,13 +155,15 @@ impl Status {
     }
 }
 
-/// Returns the steps made out of all steps, e.g. `10.01/200M`.
+/// Returns the steps made out of all steps, e.g. `10.01/200M`. The total has no zeros at its end.
 pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
-    match total_steps {
-        0..10_000 => format!("{env_steps}/{total_steps}"),
-        10_000..1_000_000 => format!("{:.1}/{:.0}k", env_steps as f64 / 1e3, total_steps as f64 / 1e3),
-        _ => format!("{:.2}/{:.0}M", env_steps as f64 / 1e6, total_steps as f64 / 1e6),
-    }
+    let (digits, unit, name) = match total_steps {
+        0..10_000 => return format!("{env_steps}/{total_steps}"),
+        10_000..1_000_000 => (1, 1e3, "k"),
+        _ => (2, 1e6, "M"),
+    };
+    let [made, total] = [env_steps, total_steps].map(|steps| format!("{:.digits$}", steps as f64 / unit));
+    format!("{made}/{}{name}", total.trim_end_matches('0').trim_end_matches('.'))
 }
 
 /// Returns a time as hours, minutes and seconds, e.g. `2:05:33`.
@@ -199,8 +201,10 @@ mod tests {
         assert_eq!(line(62), short);
         assert_eq!(line(79), format!("{short}  drops 34%"));
         let k = Status { env_steps: 12_544, goals: 0.0, drop_rate: 1.0, evaluation: 0.0, ..status };
-        let expected = "12.5/26k  12346 steps/s  ETA 0:00:00  goals 0.00 (eval 0.00)  drops 100%";
+        let expected = "12.5/25.6k  12346 steps/s  ETA 0:00:00  goals 0.00 (eval 0.00)  drops 100%";
         assert_eq!(k.line(25_600, Duration::ZERO, 79), expected);
+        let total = |steps| steps_of_all(steps, steps);
+        assert_eq!([2_500_000, 999_999].map(total), ["2.50/2.5M", "1000.0/1000k"]);
         let few = Status { env_steps: 256, evaluation: f64::NAN, goals: f64::NAN, ..status };
         assert!(few.line(1280, Duration::ZERO, 79).starts_with("256/1280  12346 steps/s  ETA 0:00:00  goals -  drops"));
     }

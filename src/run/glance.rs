@@ -4,7 +4,7 @@ use std::fs::{self, Metadata};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, ensure};
 
 use super::folder::{CONFIG, FINISHED, METRICS, RUNS};
 use crate::os::{Cannot, Hold, LOCK};
@@ -49,14 +49,16 @@ impl Glance {
     }
 }
 
-/// Returns the folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out.
+/// Returns the folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out. Someone who
+/// `waits` for the first run finds no folders where the default folder does not exist yet.
 ///
 /// # Errors
 /// Fails if the folder cannot be read.
-pub fn folders_of_runs(folder: Option<&Path>) -> Result<Vec<PathBuf>> {
+pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf>> {
     let path = folder.unwrap_or(Path::new(RUNS));
     if folder.is_none() && !path.exists() {
-        bail!("there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder");
+        ensure!(waits, "there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder");
+        return Ok(Vec::new());
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
     let entries = entries.collect::<std::io::Result<Vec<_>>>().with_context(|| path.display().to_string())?;

@@ -35,7 +35,7 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
     let default = Config::resolve(None, &[])?;
     let (mut screen, mut before) = (Screen::default(), Vec::new());
     loop {
-        let runs = read(&args.places, &default, &before)?;
+        let runs = read(args, &default, &before)?;
         let compared = match &runs[..] {
             [a, b] if args.places.len() == 2 => Some(Comparison::of(a, b)?),
             _ => None,
@@ -62,15 +62,17 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
     }
 }
 
-/// Reads the runs at these places: one folder of runs, or runs themselves. Runs of a folder come newest first. A table that
+/// Reads the runs at the places of `args`: one folder of runs, or runs themselves. Runs of a folder come newest first. A table that
 /// has not changed since it was read `before` is not read again.
-fn read(places: &[PathBuf], default: &Config, before: &[Run]) -> Result<Vec<Run>> {
+fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
-    let mut found: Vec<(PathBuf, Glance)> = match places {
-        [] => run::folders_of_runs(None)?.into_iter().filter_map(seen).collect(),
-        [place] if Glance::of(place).is_none() => {
-            run::folders_of_runs(Some(place))?.into_iter().filter_map(seen).collect()
-        }
+    let places = &args.places;
+    let all = |folder| -> Result<Vec<_>> {
+        Ok(run::folders_of_runs(folder, args.watch)?.into_iter().filter_map(seen).collect())
+    };
+    let mut found: Vec<(PathBuf, Glance)> = match &places[..] {
+        [] => all(None)?,
+        [place] if Glance::of(place).is_none() => all(Some(place))?,
         places => {
             let runs = places.iter().map(|place| {
                 ensure!(place.exists(), "{}: no such folder", place.display());

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-/// The maximum lag, in seconds, of a machine that cannot keep up.
+/// The maximum lag, in seconds, of a machine that cannot keep up. A longer control step is still played.
 const LARGEST_LAG: f64 = 0.25;
 
 /// A clock that converts elapsed time into control steps.
@@ -22,7 +22,7 @@ impl Clock {
     pub(super) fn steps_due(&mut self, speed: f64) -> u32 {
         let passed = self.last.elapsed().as_secs_f64();
         self.last = Instant::now();
-        self.owed = (self.owed + passed * speed).min(LARGEST_LAG * speed.max(1.0));
+        self.owed = (self.owed + passed * speed).min((LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt));
         let steps = (self.owed / self.ctrl_dt).floor();
         self.owed -= steps * self.ctrl_dt;
         steps as u32
@@ -53,5 +53,8 @@ mod tests {
         let mut clock = Clock::new(0.01);
         clock.last -= Duration::from_secs(60);
         assert_eq!(clock.steps_due(1.0), 25);
+        let mut slow = Clock::new(0.3);
+        slow.last -= Duration::from_secs(60);
+        assert_eq!(slow.steps_due(0.5), 1, "a control step may be longer than the lag");
     }
 }

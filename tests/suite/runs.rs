@@ -219,3 +219,17 @@ fn the_table_is_printed_again_until_a_signal_or_until_nobody_reads_it() {
     assert!(unread.wait().unwrap().success(), "a closed pipe is no error");
     assert_eq!(program(folder, &["runs", "--watch", "--json"]).status.code(), Some(2));
 }
+
+#[test]
+fn a_table_that_is_watched_waits_for_the_first_run() {
+    let place = tempfile::tempdir().unwrap();
+    let mut child = command(place.path(), &["runs", "--watch"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map_while(Result::ok);
+    assert!(lines.next().unwrap().starts_with("run "), "the table has only its head");
+    let run = place.path().join("runs/shadow-hand-repose/first");
+    fs::create_dir_all(&run).unwrap();
+    fs::write(run.join("metrics.csv"), "env_steps\n1\n").unwrap();
+    assert!(lines.any(|line| line.starts_with("first ")));
+    send("INT", &child);
+    assert!(!child.wait().unwrap().success());
+}
