@@ -11,7 +11,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::{env, fs, io};
 
 /// The settings of pip that say where packages come from.
-const SOURCES: [&str; 6] = ["index-url", "extra-index-url", "trusted-host", "cert", "client-cert", "proxy"];
+const SOURCES: [&str; 8] =
+    ["index-url", "extra-index-url", "no-index", "find-links", "trusted-host", "cert", "client-cert", "proxy"];
 
 /// The variable that names pip's configuration file.
 const CONFIG: &str = "PIP_CONFIG_FILE";
@@ -61,11 +62,21 @@ fn sources(folder: &Path) -> Vec<(String, String)> {
     let variable = |name: &str| format!("PIP_{}", name.replace('-', "_").to_uppercase());
     let found = SOURCES.into_iter().filter_map(|name| {
         let value = env::var(variable(name)).ok().or_else(|| in_files(name))?;
-        // The certificates are files, and pip runs in another folder.
-        let file = name.contains("cert").then(|| std::path::absolute(&value).ok()).flatten();
-        Some((variable(name), file.map_or(value, |file| file.display().to_string())))
+        let value = match name {
+            "cert" | "client-cert" => absolute(&value),
+            "find-links" => value.split_whitespace().map(absolute).collect::<Vec<_>>().join(" "),
+            _ => value,
+        };
+        Some((variable(name), value))
     });
     found.collect()
+}
+
+/// Returns the absolute path of what exists here, since pip runs in another folder. Anything else, e.g. an address, stays as it is.
+fn absolute(place: &str) -> String {
+    let path = Path::new(place);
+    let found = path.exists().then(|| std::path::absolute(path).ok()).flatten();
+    found.map_or_else(|| place.to_owned(), |path| path.display().to_string())
 }
 
 /// The id of the running process, or 0. It leads its own process group, since python3 may be a script that starts another one.

@@ -60,13 +60,20 @@ fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
     fs::write(&python, script).unwrap();
     fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", bin.display(), std::env::var("PATH").unwrap());
-    let kept =
-        [("PIP_INDEX_URL", "http://index"), ("PIP_CERT", "ca.pem"), ("PIP_CONFIG_FILE", "pip.conf"), ("PATH", &path)];
+    fs::create_dir(folder.join("wheels")).unwrap();
+    fs::write(folder.join("ca.pem"), "").unwrap();
+    let kept = [
+        ("PIP_INDEX_URL", "http://index"),
+        ("PIP_NO_INDEX", "1"),
+        ("PIP_FIND_LINKS", "wheels http://links"),
+        ("PIP_CERT", "ca.pem"),
+        ("PIP_CONFIG_FILE", "pip.conf"),
+        ("PATH", &path),
+    ];
     let dropped = [
         ("PIP_CONSTRAINT", "c"),
         ("PIP_REQUIRE_VIRTUALENV", "1"),
         ("PIP_TARGET", "t"),
-        ("PIP_NO_INDEX", "1"),
         ("PYTHONPATH", "p"),
         ("PYTHONHOME", "h"),
     ];
@@ -82,12 +89,18 @@ fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
     }
     let conf = folder.join("pip.conf");
     assert!(list.contains(&format!("PIP_CONFIG_FILE={}\n", conf.display())), "{list}");
-    let told =
-        ["CONFIG_FILE=/dev/null", "INDEX_URL=http://index", "EXTRA_INDEX_URL=http://a http://b", "PROXY=http://proxy"];
+    let told = [
+        "CONFIG_FILE=/dev/null",
+        "INDEX_URL=http://index",
+        "EXTRA_INDEX_URL=http://a http://b",
+        "NO_INDEX=1",
+        &format!("FIND_LINKS={} http://links", folder.join("wheels").display()),
+        &format!("CERT={}", folder.join("ca.pem").display()),
+        "PROXY=http://proxy",
+    ];
     for line in told.map(|line| format!("PIP_{line}\n")) {
         assert!(download.contains(&line), "{line}{download}");
     }
-    assert!(download.contains(&format!("PIP_CERT={}\n", folder.join("ca.pem").display())), "{download}");
 }
 
 #[test]
