@@ -53,6 +53,7 @@ pub(super) fn seconds_of_parts(config: &Config, origin: &PolicySource) -> Result
     agent.ppo.begin_with(&checkpoint)?;
     let mut learner = Ppo::new(&config.ppo, task.spaces(), config.run.seed, exchange())?;
     let mut seen = learner.rollout(&agent.pool.block_sizes());
+    learner.follow_ramps(0, &mut seen);
     let mut found: [Vec<f64>; 4] = Default::default();
     let before = BEFORE.div_ceil(config.ppo.first_horizon());
     for round in 0..before + ROUNDS {

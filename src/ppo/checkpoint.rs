@@ -92,7 +92,8 @@ impl Checkpoint {
         content.to_bytes()
     }
 
-    /// Returns only the parts that playing needs. The fork's path is dropped: shared files must not reveal local paths.
+    /// Returns only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
+    /// settings, where it tells scenes apart.
     pub fn policy_alone(&self) -> Self {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));

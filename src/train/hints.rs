@@ -1,6 +1,6 @@
 //! Notes about settings that are valid but rarely intended, printed before a training starts.
 
-use crate::config::Config;
+use crate::config::{Config, Ramp};
 
 /// The number of samples below which a minibatch gives a noisy gradient and a step that is short for its cost.
 const SMALL_MINIBATCH: usize = 1024;
@@ -13,6 +13,48 @@ const MUCH: usize = 2 << 30;
 
 /// Returns the notes about these settings, compared with the `default`, for a scene of this size in bytes.
 pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
+    let (mut hints, total) = (of_ramps(config), config.run.total_steps);
+    let samples = config.samples_per_minibatch();
+    if samples < SMALL_MINIBATCH {
+        hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
+    }
+    let (env, usual, weight) = (&config.env, &default.env, config.training.task_reward.to);
+    for (key, value, usual) in [
+        ("env.rot_reward_scale", env.rot_reward_scale, usual.rot_reward_scale),
+        ("env.dist_reward_scale", env.dist_reward_scale, usual.dist_reward_scale),
+        ("env.action_penalty_scale", env.action_penalty_scale, usual.action_penalty_scale),
+        ("env.reach_goal_bonus", env.reach_goal_bonus, usual.reach_goal_bonus),
+        ("env.fall_penalty", env.fall_penalty, usual.fall_penalty),
+    ] {
+        if value != usual && weight < LITTLE {
+            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight}"));
+        }
+    }
+    let models = scene.saturating_mul(env.num_envs);
+    let share = config.randomization.share;
+    let randomizes = [0, total].into_iter().any(|steps| share.by_equal_steps(steps) > 0.0);
+    let mut usual = default.randomization.clone();
+    if config.env.model_file().is_some() {
+        // By default, the size of an own object does not vary.
+        usual.cube_size = [1.0; 2];
+    }
+    if config.randomization.happens() && !randomizes && config.randomization != usual {
+        hints.push(format!("randomization.share = {share}: nothing is randomised in {total} steps"));
+    }
+    if randomizes && models > MUCH {
+        let gib = models as f64 / f64::from(1 << 30);
+        hints.push(format!(
+            "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
+             (randomization.share=0 avoids this)",
+            env.num_envs,
+            if share.by_equal_steps(0) > 0.0 { 0 } else { share.after }
+        ));
+    }
+    hints
+}
+
+/// Returns the notes about settings that change during the training.
+fn of_ramps(config: &Config) -> Vec<String> {
     let mut hints = Vec::new();
     let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
     // The penalty for drops and the share of randomised episodes may still grow at the end.
@@ -27,40 +69,21 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
         ("ppo.away_std", ppo.away_std),
         ("ppo.desired_kl", ppo.desired_kl),
     ];
+    let others = [("training.drop_reward", training.drop_reward), ("randomization.share", config.randomization.share)];
+    for (name, Ramp { from, to, .. }) in ramps.into_iter().chain(others).filter(|(_, ramp)| ramp.end() == 0) {
+        // The first horizon is the unit of the lengths of minibatches.
+        if from != to && name != "ppo.horizon" {
+            hints.push(format!(
+                "{name}.from = {from} has no effect: the ramp has no steps, and {name} is {to} throughout"
+            ));
+        }
+    }
     let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.end() > total).collect();
     if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.end()).max() {
         let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
         hints.push(format!(
             "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
             names.join(", ")
-        ));
-    }
-    let samples = config.samples_per_minibatch();
-    if samples < SMALL_MINIBATCH {
-        hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
-    }
-    let (env, usual, weight) = (&config.env, &default.env, training.task_reward.to);
-    for (key, value, usual) in [
-        ("env.rot_reward_scale", env.rot_reward_scale, usual.rot_reward_scale),
-        ("env.dist_reward_scale", env.dist_reward_scale, usual.dist_reward_scale),
-        ("env.action_penalty_scale", env.action_penalty_scale, usual.action_penalty_scale),
-    ] {
-        if value != usual && weight < LITTLE {
-            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight}"));
-        }
-    }
-    let models = scene.saturating_mul(env.num_envs);
-    let share = config.randomization.share;
-    let randomizes = [0, total].into_iter().any(|steps| share.by_equal_steps(steps) > 0.0);
-    if config.randomization.happens() && !randomizes && share != default.randomization.share {
-        hints.push(format!("randomization.share = {share}: nothing is randomised in {total} steps"));
-    }
-    if randomizes && models > MUCH {
-        let gib = models as f64 / f64::from(1 << 30);
-        hints.push(format!(
-            "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
-             (randomization.share=0 avoids this)",
-            env.num_envs, share.after
         ));
     }
     hints
@@ -100,10 +123,19 @@ mod tests {
             "{line}"
         );
         assert!(hints_for(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
+        let [line] = &hints_for(&["env.num_envs=8192", "randomization.share.from=0.2"])[..] else { panic!("one line") };
+        assert!(line.contains("from 0 steps on"), "{line}");
         let short = hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]);
         assert!(!short.concat().contains("own model"), "it ends before");
         let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
         assert!(line.ends_with("nothing is randomised in 200000000 steps"), "{line}");
+        let ranges = hints_for(&["randomization.friction=[0.3,2]", "run.total_steps=30_000_000"]);
+        assert!(ranges.concat().contains("nothing is randomised in 30000000 steps"), "{ranges:?}");
+        assert!(
+            hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100: training.task_reward")
+        );
+        let [line] = &hints_for(&["ppo.away_std.from=0.8"])[..] else { panic!("one line") };
+        assert!(line.starts_with("ppo.away_std.from = 0.8 has no effect"), "{line}");
     }
 
     #[test]

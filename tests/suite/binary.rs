@@ -327,6 +327,10 @@ fn a_resumed_run_goes_on_in_its_folder_up_to_the_new_total() {
     let run = folder.path().join("run");
     let done = succeeded(program(folder.path(), &["train", "--resume", "run"]));
     assert!(stderr(&done).contains("is finished: 2 iterations"), "{}", stderr(&done));
+    // As if it had been killed before it could write the mark.
+    fs::remove_file(run.join("finished")).unwrap();
+    succeeded(program(folder.path(), &["train", "--resume", "run"]));
+    assert!(run.join("finished").exists(), "scripts would continue it for ever");
     let before = weights(run.join("checkpoints/latest.safetensors"));
     succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512", "--threads", "1"]));
     let rows = metrics(&run);
@@ -502,7 +506,7 @@ fn bench_tells_where_the_time_of_an_iteration_goes() {
     for part in ["physics (MuJoCo)", "observe, reward, reset", "policy acts", "learner", "nets [16]"] {
         assert!(svg.contains(part), "{part}: {svg}");
     }
-    succeeded(bench(&["--set", "training.assist=100"]));
+    succeeded(bench(&["--set", "training.assist=100", "--set", "ppo.horizon={from=16,to=32,steps=0}"]));
     let refused = bench(&["--out", "parts.pdf"]);
     assert!(stderr(&refused).contains("must end in .svg or .png"), "{}", stderr(&refused));
     let refused = bench(&["--ckpt", "nowhere"]);
