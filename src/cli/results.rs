@@ -53,7 +53,7 @@ pub struct RunsArgs {
     /// Print one JSON array, or one object if two runs are compared
     #[arg(long)]
     pub json: bool,
-    /// Refresh the table every few seconds until Ctrl-C
+    /// Refresh the table every few seconds until Ctrl-C; waits for the first run
     #[arg(long, conflicts_with = "json")]
     pub watch: bool,
 }

@@ -7,7 +7,7 @@ use anyhow::{Result, anyhow, bail};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::overlay::{DEFAULTS, lookup, overlay, settings, table_of};
+use super::overlay::{DEFAULTS, lookup, names_scene, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
 use super::smoothing::{expect_one_smoothing, smoothing_named_alone};
@@ -140,9 +140,8 @@ impl PolicyConfig {
         let (path, mut table) = source.table()?;
         table.retain(|section, _| matches!(section, "env" | "hand" | "ppo"));
         let stored = lookup(&table, "env.model").and_then(Value::as_str).unwrap_or(BUILTIN_MODEL).to_owned();
-        let asked = overrides.iter().rfind(|set| set.key == "env.model").map(|set| Path::new(&set.value));
-        // The stored path is absolute.
-        let is_same = asked.is_none_or(|asked| asked.canonicalize().is_ok_and(|file| file == Path::new(&stored)));
+        let asked = overrides.iter().rfind(|set| set.key == "env.model");
+        let is_same = asked.is_none_or(|asked| names_scene(&asked.value, &stored));
         for (section, keys) in &mut table {
             let is_used = |key: &str, value: &Value| match section.as_str() {
                 // The sizes of its hand are part of the policy.

@@ -1,5 +1,6 @@
 //! Overlays one table of settings with another. Keys and types come from the base, and what does not fit is reported.
 
+use std::path::Path;
 use std::sync::LazyLock;
 
 use toml::{Table, Value};
@@ -61,6 +62,13 @@ pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
         value = table.into();
     }
     Table::from_iter([(parts[0].to_owned(), value)])
+}
+
+/// Returns whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
+pub(super) fn names_scene(text: &str, stored: &str) -> bool {
+    let asked = table_of("env.model", text, &DEFAULTS);
+    let file = lookup(&asked, "env.model").and_then(Value::as_str).map(|asked| Path::new(asked).canonicalize());
+    file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
 }
 
 /// The maximum number of problems to report. The first ones are enough to start with.

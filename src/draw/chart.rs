@@ -240,7 +240,7 @@ impl Subplot {
             .build_cartesian_2d(x, y)?;
         let mut mesh = chart.configure_mesh();
         mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", LABEL));
-        let small = |value: &f64| if *value == 0.0 { "0".to_owned() } else { format!("{value:.1e}") };
+        let small = |value: &f64| if value.abs() < 1e-6 * extent { "0".to_owned() } else { format!("{value:.1e}") };
         if extent < SMALL {
             mesh.y_label_formatter(&small);
         }
@@ -336,9 +336,12 @@ mod tests {
 
     #[test]
     fn an_axis_of_very_small_values_has_labels_that_differ() {
-        let svg = svg(vec![panel("a", vec![line(&[[0.0, 0.0], [1.0, 3e-6]])])]);
-        let labels = ["0", "5.0e-7", "1.0e-6", "1.5e-6", "3.0e-6"];
-        assert!(labels.iter().all(|label| svg.lines().any(|line| line.trim() == *label)), "{svg}");
+        for (low, labels) in
+            [(0.0, ["0", "5.0e-7", "1.5e-6", "3.0e-6"]), (-1.3e-5, ["0", "2.0e-6", "-2.0e-6", "-1.2e-5"])]
+        {
+            let svg = svg(vec![panel("a", vec![line(&[[0.0, low], [1.0, 3e-6]])])]);
+            assert!(labels.iter().all(|label| svg.lines().any(|line| line.trim() == *label)), "{svg}");
+        }
     }
 
     #[test]

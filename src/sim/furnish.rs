@@ -2,7 +2,6 @@
 //!
 //! Nothing here changes the physics: what is added has no mass, collides with nothing, and comes after the existing objects.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Result, anyhow};
@@ -13,14 +12,10 @@ use mujoco_rs::wrappers::mj_model::MjtTexture;
 
 use super::compilation::{Compilation, VISUAL};
 
-/// The bodies whose faces are coloured if each is a plain box, with the opacity of the colours. The object and a goal that is added
-/// are coloured too.
-const CUBES: [(&str, f32); 2] = [("cube", SOLID), ("target", CLEAR)];
-
-/// The opacity of an object.
+/// The opacity of the colours of an object.
 const SOLID: f32 = 1.0;
 
-/// The opacity of a goal.
+/// The opacity of the colours of a goal.
 const CLEAR: f32 = 0.7;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
@@ -37,11 +32,13 @@ const PLATE: f64 = 0.02;
 pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&MjtTexture::mjTEXTURE_SKYBOX);
-    let parts = [(Some(&*compilation.object), SOLID), (compilation.adds_goal, CLEAR)];
-    let parts = parts.into_iter().filter_map(|(name, opacity)| Some((name?, opacity)));
-    let cubes: BTreeMap<&str, f32> = CUBES.into_iter().chain(parts).collect();
-    let boxes: Vec<_> =
-        cubes.into_iter().filter_map(|(name, opacity)| Some((name, plain_box(model, name)?, opacity))).collect();
+    let shown = |body: usize| {
+        let name = model.id_to_name(MjtObjBase::mjOBJ_BODY, body).filter(|name| !name.is_empty())?;
+        let is_goal = model.body_mocapid()[body] >= 0;
+        let opacity = if is_goal { CLEAR } else { SOLID };
+        (is_goal || name == compilation.object).then_some((name, plain_box(model, body)?, opacity))
+    };
+    let boxes: Vec<_> = (1..model.nbody() as usize).filter_map(shown).collect();
     if !is_dark && !has_no_sky && boxes.is_empty() {
         return Ok(None);
     }
@@ -81,8 +78,7 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
 }
 
 /// Returns the half sizes (m) of a body that is one box in the middle of its frame, without a material.
-fn plain_box(model: &MjModel, name: &str) -> Option<[f64; 3]> {
-    let body = model.name_to_id(MjtObjBase::mjOBJ_BODY, name)?;
+fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
     let geom = usize::try_from(model.body_geomadr()[body]).ok()?;
     let is_plain = model.body_geomnum()[body] == 1
         && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX

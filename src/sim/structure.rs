@@ -69,7 +69,7 @@ impl Scene {
             found.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
         };
         let free = others(&|body| self.free_joint(body).is_some());
-        let held = self.bodies_of_constraints();
+        let held = self.trees_of_constraints();
         let goals = others(&|body| self.model.body_mocapid()[body] >= 0 && !held.contains(&body));
         for (found, part, none, what, setting) in [
             (free, &mut parts.object, Some(NO_OBJECT), "bodies with a free joint", "hand.object"),
@@ -93,8 +93,8 @@ impl Scene {
         Ok(parts)
     }
 
-    /// Returns the bodies that equality constraints tie to each other, e.g. a mocap body that guides a hand.
-    fn bodies_of_constraints(&self) -> BTreeSet<usize> {
+    /// Returns the first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.
+    fn trees_of_constraints(&self) -> BTreeSet<usize> {
         let model = &self.model;
         let ids = model.eq_objtype().iter().zip(model.eq_obj1id().iter().zip(model.eq_obj2id()));
         let tied = ids.flat_map(|(&kind, (&a, &b))| [a, b].map(|id| (kind, id as usize)));
@@ -103,7 +103,7 @@ impl Scene {
             MjtObjBase::mjOBJ_SITE => Some(model.site_bodyid()[id] as usize),
             _ => None,
         });
-        bodies.collect()
+        bodies.map(|body| model.body_rootid()[body] as usize).collect()
     }
 
     /// Returns the bodies that one of these hinges moves and that carry no other body.

@@ -1,6 +1,6 @@
 //! Notes about settings that are valid but rarely intended, printed before a training starts.
 
-use crate::config::{Config, Ramp};
+use crate::config::Config;
 
 /// The number of samples below which a minibatch gives a noisy gradient and a step that is short for its cost.
 const SMALL_MINIBATCH: usize = 1024;
@@ -69,15 +69,6 @@ fn of_ramps(config: &Config) -> Vec<String> {
         ("ppo.away_std", ppo.away_std),
         ("ppo.desired_kl", ppo.desired_kl),
     ];
-    let others = [("training.drop_reward", training.drop_reward), ("randomization.share", config.randomization.share)];
-    for (name, Ramp { from, to, .. }) in ramps.into_iter().chain(others).filter(|(_, ramp)| ramp.end() == 0) {
-        // The first horizon is the unit of the lengths of minibatches.
-        if from != to && name != "ppo.horizon" {
-            hints.push(format!(
-                "{name}.from = {from} has no effect: the ramp has no steps, and {name} is {to} throughout"
-            ));
-        }
-    }
     let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.end() > total).collect();
     if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.end()).max() {
         let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
@@ -134,8 +125,6 @@ mod tests {
         assert!(
             hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100: training.task_reward")
         );
-        let [line] = &hints_for(&["ppo.away_std.from=0.8"])[..] else { panic!("one line") };
-        assert!(line.starts_with("ppo.away_std.from = 0.8 has no effect"), "{line}");
     }
 
     #[test]

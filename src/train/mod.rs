@@ -60,8 +60,10 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
             true => "its evaluations no longer rise; use --fork to continue",
             false => "use a larger --total-steps to continue",
         };
-        // The training may have been killed before it could write the mark.
-        saver.held.folder.mark_finished(true);
+        // It may have been killed before it could write the mark. A total that is given may be a mistake.
+        if args.total_steps.is_none() {
+            saver.held.folder.mark_finished(true);
+        }
         os::say(&format!("{place} is finished: {}; {advice}", saver.held.steps_made()));
         return Ok(ExitCode::SUCCESS);
     }

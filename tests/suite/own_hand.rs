@@ -153,7 +153,7 @@ fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
 fn a_mocap_body_that_guides_something_is_not_the_goal() {
     let guide = "<body name=\"guide\" mocap=\"true\"/></worldbody>";
     let tied = |constraint: &str| format!("<equality>{constraint}</equality></mujoco>");
-    let site = "<site name=\"grip\"/></body></worldbody>";
+    let site = "<body><site name=\"grip\"/></body></body></worldbody>";
     for (bodies, constraint) in [
         (guide.to_owned(), "<weld body1=\"guide\" body2=\"palm\"/>"),
         (guide.replace("/></worldbody>", &format!(">{site}")), "<connect site1=\"grip\" site2=\"α end\"/>"),
