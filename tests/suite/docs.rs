@@ -167,7 +167,7 @@ fn every_setting_and_option_that_the_documents_name_exists() {
 fn goals_by_time_are_those_of_the_tables() {
     let learning = read("docs/LEARNING.md");
     let second = "A second command then";
-    let of_today = [(", seed 1", "default-1"), (", seed 2", "default-2")];
+    let of_today = [(", seed 0", "default-0"), (", seed 1", "default-1"), (", seed 2", "default-2")];
     let of_earlier = [
         (", less noise, seed 1", "less-noise-1"),
         (", 2026-11-25, seed 0", "before-0"),
