@@ -13,7 +13,7 @@ const MUCH: usize = 2 << 30;
 
 /// Returns the notes about these settings, compared with the `default`, for a scene of this size in bytes.
 pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
-    let (mut hints, total) = (of_ramps(config), config.run.total_steps);
+    let (mut hints, total) = (Vec::from_iter(of_ramps(config)), config.run.total_steps);
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
         hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
@@ -53,9 +53,8 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     hints
 }
 
-/// Returns the notes about settings that change during the training.
-fn of_ramps(config: &Config) -> Vec<String> {
-    let mut hints = Vec::new();
+/// Returns a note about the ramps that are longer than the training, if there are any.
+fn of_ramps(config: &Config) -> Option<String> {
     let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
     // The penalty for drops and the share of randomised episodes may still grow at the end.
     let ramps = [
@@ -70,14 +69,12 @@ fn of_ramps(config: &Config) -> Vec<String> {
         ("ppo.desired_kl", ppo.desired_kl),
     ];
     let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.end() > total).collect();
-    if let Some(longest) = cut.iter().map(|(_, ramp)| ramp.end()).max() {
-        let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
-        hints.push(format!(
-            "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
-            names.join(", ")
-        ));
-    }
-    hints
+    let longest = cut.iter().map(|(_, ramp)| ramp.end()).max()?;
+    let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
+    Some(format!(
+        "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
+        names.join(", ")
+    ))
 }
 
 #[cfg(test)]
