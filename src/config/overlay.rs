@@ -41,10 +41,10 @@ pub(super) fn is_ramp(table: &Table) -> bool {
 }
 
 /// Returns the table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
-/// for a string key.
+/// for a string key. Numbers may lack the zero before their point, which TOML requires.
 pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
-    let parsed = format!("value = {text}").parse::<Table>();
-    let parsed = parsed.ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("value"));
+    let parse = |text: &str| format!("value = {text}").parse::<Table>().ok().filter(|t| t.len() == 1);
+    let parsed = parse(text).or_else(|| parse(&with_zeros(text))).and_then(|mut t| t.remove("value"));
     let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
     let mut value = match parsed {
         Some(value) if !wants_text || value.is_str() => value,
@@ -62,6 +62,16 @@ pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
         value = table.into();
     }
     Table::from_iter([(parts[0].to_owned(), value)])
+}
+
+/// Returns the text with a zero before each point that begins a number: `[0.5,-0.1]` for `[.5,-.1]`.
+fn with_zeros(text: &str) -> String {
+    let bytes = text.as_bytes();
+    let begins = |i: usize| {
+        let joined = i > 0 && bytes[i - 1].is_ascii_alphanumeric();
+        bytes[i] == b'.' && !joined && bytes.get(i + 1).is_some_and(u8::is_ascii_digit)
+    };
+    text.char_indices().map(|(i, c)| if begins(i) { "0.".to_owned() } else { c.to_string() }).collect()
 }
 
 /// Returns whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
@@ -210,6 +220,17 @@ mod tests {
         }
         let file = Config::from_text(Path::new("x.toml"), "[training]\ntolerance = {from=1,from=2}", &[]).unwrap_err();
         assert!(file.to_string().contains("duplicate key"), "{file}");
+    }
+
+    #[test]
+    fn numbers_may_begin_with_their_point() {
+        let sets = ["ppo.std=.27", "randomization.gains=[.7,1.6]", "training.tolerance={from=.4,to=.1,steps=9}"];
+        let sets = sets.into_iter().chain(["env.noise.joint_pos=.01", "training.drop_reward=-.5", "env.model=.5x"]);
+        let sets: Vec<_> = sets.map(|set| set.parse().unwrap()).collect();
+        let config = Config::resolve(None, &sets).unwrap();
+        assert_eq!((config.ppo.std.to, config.training.drop_reward.to), (0.27, -0.5));
+        assert_eq!((config.randomization.gains, config.training.tolerance.from), ([0.7, 1.6], 0.4));
+        assert_eq!((config.env.noise["joint_pos"], config.env.model.as_str()), (0.01, ".5x"));
     }
 
     #[test]
