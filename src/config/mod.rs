@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise_and_smoothing() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_less_noise_or_short_rollouts() {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
@@ -111,9 +111,13 @@ mod tests {
         let continuing = shipped("repose-continue");
         let drop_reward = robust.training.drop_reward;
         let smoother = TrainingConfig { act_moving_average: smoothing, drop_reward, ..trained.clone() };
-        let slower = PpoConfig { critic_first: tuning.ppo.critic_first, ..learnt.clone() };
+        let slower = PpoConfig { critic_first: continuing.ppo.critic_first, ..learnt.clone() };
+        let faster = TrainingConfig { act_moving_average: Ramp::constant(0.7), ..trained.clone() };
+        let [horizon, std, away_std] = [ppo.horizon.from, ppo.std.to, ppo.away_std.to].map(Ramp::constant);
+        let minibatches = ppo.minibatches;
+        let explores = PpoConfig { horizon, minibatches, critic_first: 20, std, away_std, ..learnt.clone() };
         for (found, training, ppo) in
-            [(&continuing, &trained, &slower), (&tuning, &trained, &slower), (&robust, &smoother, &learnt)]
+            [(&continuing, &trained, &slower), (&tuning, &faster, &explores), (&robust, &smoother, &learnt)]
         {
             assert_eq!((&found.training, &found.ppo), (training, ppo));
             let act_moving_average = training.act_moving_average.to;
