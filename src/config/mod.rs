@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_less_noise_or_short_rollouts() {
+    fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise_or_a_ramp_to_it() {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
@@ -113,7 +113,9 @@ mod tests {
         let smoother = TrainingConfig { act_moving_average: smoothing, drop_reward, ..trained.clone() };
         let slower = PpoConfig { critic_first: continuing.ppo.critic_first, ..learnt.clone() };
         let faster = TrainingConfig { act_moving_average: Ramp::constant(0.7), ..trained.clone() };
-        let [horizon, std, away_std] = [ppo.horizon.from, ppo.std.to, ppo.away_std.to].map(Ramp::constant);
+        let late = |from, to| Ramp { from, to, steps: 1_000_000, after: 4_000_000 };
+        let [horizon, std, away_std] =
+            [late(ppo.horizon.from, horizon.to), late(ppo.std.to, std.to), late(ppo.away_std.to, away_std.to)];
         let minibatches = ppo.minibatches;
         let explores = PpoConfig { horizon, minibatches, critic_first: 20, std, away_std, ..learnt.clone() };
         for (found, training, ppo) in

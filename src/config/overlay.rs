@@ -161,7 +161,7 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
-            let reason = format!("value = {text}").parse::<Table>().err();
+            let reason = format!("value = {}", with_zeros(text)).parse::<Table>().err();
             let reason = reason.map_or_else(String::new, |error| format!(": {}", shortened(error.message().trim())));
             Err(format!("a table of TOML{reason}"))
         }
@@ -214,6 +214,7 @@ mod tests {
             ("training.tolerance={from=1,from=2,to=1,steps=1}", "duplicate key"),
             ("env.noise={joint_pos=1,joint_pos=2}", "duplicate key"),
             ("training.tolerance={from=1 to=2}", "expected `,`"),
+            ("training.tolerance={from=.1 to=.2}", "expected `,`"),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(": must be a table of TOML: ") && text.contains(reason), "{bad}: {text}");
