@@ -382,8 +382,8 @@ mod tests {
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let mut observations = vec![0.1; 2 * 157];
             for (row, q) in observations.chunks_exact_mut(157).zip([[1.0, 0.0], [0.0, 1.0]]) {
-                let places = task.spaces().cube_and_goal.unwrap();
-                for place in [places.cube, places.goal] {
+                let places = task.spaces().object_and_goal.unwrap();
+                for place in [places.object, places.goal] {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
                 }
             }

@@ -10,19 +10,19 @@ pub struct Spaces {
     /// The number of values in an action.
     pub action_size: usize,
     /// The location of a cube and its goal, if there is one (for `ppo.symmetry`).
-    pub cube_and_goal: Option<CubeAndGoal>,
+    pub object_and_goal: Option<ObjectAndGoal>,
     /// The distance of an observation from its goal, in the unit of `ppo.away_range`.
     pub distance: fn(&Self, &[f32]) -> f32,
 }
 
 /// The offsets of orientations (w, x, y, z) in an observation.
 #[derive(Clone, Copy, Debug)]
-pub struct CubeAndGoal {
-    /// The offset of the orientation of the cube.
-    pub cube: usize,
+pub struct ObjectAndGoal {
+    /// The offset of the orientation of the object.
+    pub object: usize,
     /// The offset of the orientation of its goal.
     pub goal: usize,
-    /// The offset of the orientation of the cube relative to its goal.
+    /// The offset of the orientation of the object relative to its goal.
     pub relative: usize,
     /// The rotations that a policy treats as the same: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
     pub symmetry: u32,

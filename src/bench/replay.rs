@@ -29,7 +29,7 @@ pub(super) struct RecordingEnv {
     task: Arc<Task>,
     randomization: Option<Arc<Randomization>>,
     starts: Vec<Start>,
-    /// The controls of each step, and the random force on the cube, if there are such forces.
+    /// The controls of each step, and the random force on the object, if there are such forces.
     steps: Vec<(Vec<f64>, Option<[f64; 3]>)>,
     /// The physics alone.
     bare: Simulation,
@@ -87,7 +87,7 @@ impl RecordingEnv {
     fn replay(&mut self, step: usize) {
         let (ctrl, push) = &self.steps[step];
         if let Some(force) = *push {
-            self.bare.push(self.task.hand().cube.body, force);
+            self.bare.push(self.task.hand().object.body, force);
         }
         self.bare.ctrl_mut().copy_from_slice(ctrl);
         self.bare.step_whole(self.task.config().substeps());

@@ -4,7 +4,7 @@ use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
 use crate::ppo::{CLIP, InputTransform, Policy};
-use crate::spaces::{CubeAndGoal, Spaces};
+use crate::spaces::{ObjectAndGoal, Spaces};
 
 /// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
 ///
@@ -20,7 +20,7 @@ pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
         }
         None => "obs".into(),
     };
-    let seen = match perception.cube_and_goal {
+    let seen = match perception.object_and_goal {
         Some(places) => canonicalize(&mut graph, size, &seen, (places, perception.rotations())),
         None => seen,
     };
@@ -59,9 +59,9 @@ fn canonicalize(
     graph: &mut Graph,
     size: usize,
     obs: &str,
-    (CubeAndGoal { cube, goal, .. }, rotations): (CubeAndGoal, &[[f32; 4]]),
+    (ObjectAndGoal { object, goal, .. }, rotations): (ObjectAndGoal, &[[f32; 4]]),
 ) -> String {
-    assert!(cube + 4 <= goal, "the goal follows the cube");
+    assert!(object + 4 <= goal, "the goal follows the cube");
     // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
     let mut cosines = [0.0; 4 * 24];
     // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
@@ -76,9 +76,9 @@ fn canonicalize(
         graph.floats(name, &[1], &[sign]);
     }
     let parts = [
-        ("before", [0, cube]),
-        ("cube", [cube, cube + 4]),
-        ("between", [cube + 4, goal]),
+        ("before", [0, object]),
+        ("cube", [object, object + 4]),
+        ("between", [object + 4, goal]),
         ("goal", [goal, goal + 4]),
         ("after", [goal + 4, size]),
     ];
@@ -91,8 +91,8 @@ fn canonicalize(
     // The first of equals, as in `ppo::perception`.
     let nearest = graph.node("ArgMax", &[&nearness], "nearest", &[("axis", Int(1)), ("keepdims", Int(0))]);
     let product = graph.node("Gather", &["products", &nearest], "product", &[("axis", Int(0))]);
-    let [cube, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion, &product));
-    graph.node("Concat", &["before", &cube, "between", &goal, "after"], "seen", &[("axis", Int(1))])
+    let [object, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion, &product));
+    graph.node("Concat", &["before", &object, "between", &goal, "after"], "seen", &[("axis", Int(1))])
 }
 
 /// Multiplies a quaternion by the rotation, and negates it if w is negative then.

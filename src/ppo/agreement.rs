@@ -10,14 +10,14 @@ mod tests {
     use crate::config::{self, Activation, Config, Precision};
     use crate::ranks::Exchange;
     use crate::rng;
-    use crate::spaces::{CubeAndGoal, Spaces};
+    use crate::spaces::{ObjectAndGoal, Spaces};
 
     const BACKENDS: [config::Backend; 2] = [config::Backend::Fused, config::Backend::Candle];
 
     const SPACES: Spaces = Spaces {
         observation_size: 157,
         action_size: 20,
-        cube_and_goal: Some(CubeAndGoal { cube: 51, goal: 64, relative: 0, symmetry: 1 }),
+        object_and_goal: Some(ObjectAndGoal { object: 51, goal: 64, relative: 0, symmetry: 1 }),
         distance: |_, _| 0.0,
     };
 
@@ -195,7 +195,7 @@ mod tests {
 
     #[test]
     fn the_smallest_nets_and_minibatches_agree_with_candle() {
-        let spaces = Spaces { observation_size: 1, action_size: 1, cube_and_goal: None, ..SPACES };
+        let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, ..SPACES };
         let [fused, candle] = BACKENDS.map(|backend| {
             let mut config = Config::resolve(None, &[]).unwrap().ppo;
             (config.backend, config.hidden, config.symmetry) = (backend, vec![1], config::Symmetry::None);

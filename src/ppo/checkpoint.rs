@@ -288,7 +288,7 @@ mod tests {
     use crate::ppo::{Evaluation, Rollout, Stage};
     use crate::ranks::Exchange;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;

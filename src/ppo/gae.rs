@@ -33,7 +33,7 @@ mod tests {
 
     /// Returns a block of three steps.
     fn block(rewards: &[f32], values: &[f32], dones: &[bool]) -> RolloutBlock {
-        let spaces = Spaces { observation_size: 1, action_size: 1, cube_and_goal: None, distance: |_, _| 0.0 };
+        let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
         let mut block = Rollout::new(3, &[rewards.len() / 3], &spaces).blocks.remove(0);
         block.rewards.copy_from_slice(rewards);
         block.values.copy_from_slice(values);

@@ -34,7 +34,7 @@ mod tests {
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
 
-    const SPACES: Spaces = Spaces { observation_size: 1, action_size: 1, cube_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
 
     const RANGE: [f64; 2] = [5e-4, 2e-3];
 

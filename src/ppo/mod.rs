@@ -373,7 +373,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
 
     #[test]
     fn the_entropy_is_the_one_of_a_gaussian_with_this_standard_deviation() {

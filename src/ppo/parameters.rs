@@ -97,7 +97,7 @@ mod tests {
     fn the_views_cover_all_numbers_once_and_have_the_names_of_the_files() {
         let layout = Layout::new(
             &[5, 4],
-            &Spaces { observation_size: 3, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 },
+            &Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 },
         );
         let views = layout.views();
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();

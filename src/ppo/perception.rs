@@ -11,7 +11,7 @@ use super::normalizer::Normalizer;
 use super::widest::widest;
 use crate::config::Symmetry;
 use crate::quat::{self, CUBE_ROTATIONS};
-use crate::spaces::{CubeAndGoal, Spaces};
+use crate::spaces::{ObjectAndGoal, Spaces};
 
 /// Normalised observations are clipped to ± this many standard deviations, so that rare outliers do not upset the nets.
 pub const CLIP: f32 = 5.0;
@@ -23,7 +23,7 @@ const EPSILON: f64 = 1e-5;
 #[derive(Clone, Copy, Debug)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
-    pub cube_and_goal: Option<CubeAndGoal>,
+    pub object_and_goal: Option<ObjectAndGoal>,
     /// The rotations that map the object onto itself. If there are fewer, the first one fills the rest.
     rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
 }
@@ -34,16 +34,16 @@ impl Perception {
     /// # Errors
     /// Fails if the setting is the symmetry of a cube but the observations contain no cube.
     pub fn new(symmetry: Symmetry, spaces: &Spaces) -> Result<Self> {
-        let cube_and_goal = spaces.cube_and_goal.filter(|_| symmetry != Symmetry::None);
+        let object_and_goal = spaces.object_and_goal.filter(|_| symmetry != Symmetry::None);
         ensure!(
-            symmetry != Symmetry::Cube || cube_and_goal.is_some(),
+            symmetry != Symmetry::Cube || object_and_goal.is_some(),
             "ppo.symmetry = \"cube\": this task has no cube"
         );
-        let mask = cube_and_goal.map_or(1, |places| places.symmetry);
+        let mask = object_and_goal.map_or(1, |places| places.symmetry);
         let mut rotations = [CUBE_ROTATIONS[0]; CUBE_ROTATIONS.len()];
         let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
         rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
-        Ok(Self { cube_and_goal, rotations })
+        Ok(Self { object_and_goal, rotations })
     }
 
     /// Returns the rotations that map the object onto itself. The first one may be repeated at the end.
@@ -54,9 +54,9 @@ impl Perception {
     /// Maps one raw observation `[O]`, in place, to the observation that represents all equivalent ones.
     #[inline(always)]
     pub fn canonicalize(&self, observation: &mut [f32]) {
-        let Some(CubeAndGoal { cube, goal, .. }) = self.cube_and_goal else { return };
-        let best = self.nearest(quaternion(observation, cube));
-        for place in [cube, goal] {
+        let Some(ObjectAndGoal { object, goal, .. }) = self.object_and_goal else { return };
+        let best = self.nearest(quaternion(observation, object));
+        for place in [object, goal] {
             let turned = quat::mul(quaternion(observation, place), best);
             let turned = if turned[0] < 0.0 { turned.map(|x| -x) } else { turned };
             observation[place..place + 4].copy_from_slice(&turned);
@@ -65,9 +65,9 @@ impl Perception {
 
     /// Returns the rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
     #[inline(always)]
-    fn nearest(&self, cube: [f32; 4]) -> [f32; 4] {
+    fn nearest(&self, q: [f32; 4]) -> [f32; 4] {
         // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
-        let close = self.rotations.map(|s| (cube[0] * s[0] - cube[1] * s[1] - cube[2] * s[2] - cube[3] * s[3]).abs());
+        let close = self.rotations.map(|s| (q[0] * s[0] - q[1] * s[1] - q[2] * s[2] - q[3] * s[3]).abs());
         self.rotations[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
     }
 }
@@ -117,7 +117,7 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 20,
         action_size: 1,
-        cube_and_goal: Some(CubeAndGoal { cube: 5, goal: 11, relative: 0, symmetry: u32::MAX }),
+        object_and_goal: Some(ObjectAndGoal { object: 5, goal: 11, relative: 0, symmetry: u32::MAX }),
         distance: |_, _| 0.0,
     };
 
@@ -125,9 +125,9 @@ mod tests {
         Perception::new(symmetry, &SPACES).unwrap().canonicalize(row);
     }
 
-    fn observation(cube: Quat, goal: Quat) -> Vec<f32> {
+    fn observation(object: Quat, goal: Quat) -> Vec<f32> {
         let mut row: Vec<f32> = (0..20).map(|i| i as f32).collect();
-        for (place, q) in [(5, cube), (11, goal)] {
+        for (place, q) in [(5, object), (11, goal)] {
             row[place..place + 4].copy_from_slice(&quat::canonical(q).map(|x| x as f32));
         }
         row
@@ -158,12 +158,12 @@ mod tests {
     #[test]
     fn a_cube_and_the_same_cube_turned_onto_itself_look_the_same_to_a_policy() {
         for case in 0..200 {
-            let (cube, goal) = (random(2 * case), random(2 * case + 1));
-            let mut seen = observation(cube, goal);
+            let (object, goal) = (random(2 * case), random(2 * case + 1));
+            let mut seen = observation(object, goal);
             perceive(Symmetry::Cube, &mut seen);
             for rotation in CUBE_ROTATIONS {
                 let turn = |q| quat::mul(q, rotation.map(f64::from));
-                let mut other = observation(turn(cube), turn(goal));
+                let mut other = observation(turn(object), turn(goal));
                 perceive(Symmetry::Cube, &mut other);
                 let close = seen.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-5);
                 assert!(close, "{rotation:?}: {:?} and {:?}", &seen[5..9], &other[5..9]);
@@ -174,17 +174,17 @@ mod tests {
     #[test]
     fn what_is_left_to_the_goal_stays_and_nothing_but_two_orientations_changes() {
         for case in 0..200 {
-            let (cube, goal) = (random(2 * case), random(2 * case + 1));
-            let raw = observation(cube, goal);
+            let (object, goal) = (random(2 * case), random(2 * case + 1));
+            let raw = observation(object, goal);
             let mut seen = raw.clone();
             perceive(Symmetry::Cube, &mut seen);
-            let [new_cube, new_goal] = [5, 11].map(|at| quaternion(&seen, at));
+            let [new_object, new_goal] = [5, 11].map(|at| quaternion(&seen, at));
             let between = |a: [f32; 4], b: [f32; 4]| quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)));
-            let left = quat::mul(cube, quat::conj(goal));
-            assert!(quat::angle_between(between(new_cube, new_goal), left) < 1e-3);
+            let left = quat::mul(object, quat::conj(goal));
+            assert!(quat::angle_between(between(new_object, new_goal), left) < 1e-3);
             // The largest misorientation of a cube is 62.8°. Equally near are then no rotation, a quarter turn about
             // either of two axes, and a third turn about the diagonal between them.
-            assert!(new_cube[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0, "{new_cube:?}");
+            assert!(new_object[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0, "{new_object:?}");
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));
             let before = seen.clone();
@@ -221,7 +221,7 @@ mod tests {
 
     #[test]
     fn the_symmetry_of_a_cube_is_refused_where_there_is_none() {
-        let none = Spaces { cube_and_goal: None, ..SPACES };
+        let none = Spaces { object_and_goal: None, ..SPACES };
         assert!(Perception::new(Symmetry::Cube, &none).unwrap_err().to_string().contains("ppo.symmetry"));
         assert!(Perception::new(Symmetry::None, &none).is_ok());
     }

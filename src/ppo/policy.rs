@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
-        let spaces = Spaces { observation_size: 157, action_size: 20, cube_and_goal: None, distance: |_, _| 0.0 };
+        let spaces = Spaces { observation_size: 157, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
         let net =
             NetConfig { symmetry: crate::config::Symmetry::None, ..Config::resolve(None, &[]).unwrap().ppo.net() };
         let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7).unwrap()));

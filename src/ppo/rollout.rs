@@ -149,7 +149,7 @@ impl RolloutBlock {
 mod tests {
     use super::*;
 
-    const SPACES: Spaces = Spaces { observation_size: 4, action_size: 1, cube_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces { observation_size: 4, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
 
     #[test]
     fn what_follows_the_last_step_is_what_the_next_iteration_starts_from() {

@@ -67,23 +67,23 @@ impl Conditions {
         (task.config.action_delay + drawn) as usize
     }
 
-    /// Applies the random force on the cube that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
+    /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
     pub(super) fn push(&self, rng: &Rng, step: u32, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let force = self.randomization.as_ref()?.push(self.draw.as_ref()?, rng, step)?;
-        sim.push(task.hand.cube.body, force);
+        sim.push(task.hand.object.body, force);
         Some(force)
     }
 
     /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. With full
     /// assistance, the task's object gets an angular acceleration of `most` for each rad.
     pub(super) fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
-        let factor = self.assisted * most * task.hand.cube.inertia;
+        let factor = self.assisted * most * task.hand.object.inertia;
         if factor == 0.0 && !self.twisted {
             return None;
         }
         self.twisted = factor != 0.0;
         let torque = quat::rotation_vector(left).map(|angle| factor * angle);
-        sim.twist(task.hand.cube.body, torque);
+        sim.twist(task.hand.object.body, torque);
         Some(torque)
     }
 

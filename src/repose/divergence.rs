@@ -21,8 +21,8 @@ pub struct Diverged {
 impl Diverged {
     /// Returns one object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
     /// controls of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes,
-    /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the cube
-    /// in each step. In an episode with assistance, `torques` is the torque on the cube in each step.
+    /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the object
+    /// in each step. In an episode with assistance, `torques` is the torque on the object in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {
         let tail = &self.tail;
         let actions: Vec<&[f32]> = tail.actions.chunks_exact(tail.width).collect();
@@ -71,9 +71,9 @@ pub struct Tail {
     pub actions: Vec<f32>,
     /// The number of controls, and of values in an action.
     pub width: usize,
-    /// The random force on the cube in each step, N. Empty where there is none.
+    /// The random force on the object in each step, N. Empty where there is none.
     pub pushes: Vec<[f64; 3]>,
-    /// The torque on the cube in each step, N m. Empty where there is none.
+    /// The torque on the object in each step, N m. Empty where there is none.
     pub torques: Vec<[f64; 3]>,
 }
 

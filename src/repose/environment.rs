@@ -1,4 +1,4 @@
-//! The environment: a Shadow Hand turns the cube in its palm to one goal orientation after another.
+//! The environment: a Shadow Hand turns the object in its palm to one goal orientation after another.
 //!
 //! Each step has a fixed order: action, physics, errors and reward against the current goal, hold counter, ends, new
 //! goal, observation with the next goal.
@@ -51,7 +51,7 @@ pub struct StepDetails {
     pub goal: Quat,
     /// Rotation error after the step, rad.
     pub rot_dist: f64,
-    /// Distance of the cube from the goal position after the step, m.
+    /// Distance of the object from the goal position after the step, m.
     pub goal_dist: f64,
     /// The reward by term.
     pub reward: TaskReward,
@@ -59,7 +59,7 @@ pub struct StepDetails {
     pub training: TrainingReward,
     /// Whether the physics diverged.
     pub diverged: bool,
-    /// The random force on the cube in the step, N, if there are such forces in the episode.
+    /// The random force on the object in the step, N, if there are such forces in the episode.
     pub push: Option<[f64; 3]>,
 }
 
@@ -114,7 +114,7 @@ impl Repose {
 
     /// Returns the current rotation error, rad.
     pub fn rot_dist(&self) -> f64 {
-        quat::angle_between(self.cube().orientation, self.goal)
+        quat::angle_between(self.object().orientation, self.goal)
     }
 
     /// Returns the physics state.
@@ -153,34 +153,34 @@ impl Repose {
     }
 
     /// Returns the pose of the object.
-    pub fn cube(&self) -> Pose {
-        let at = self.task.hand.cube.qpos;
+    pub fn object(&self) -> Pose {
+        let at = self.task.hand.object.qpos;
         let q = self.sim.qpos();
         Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
     }
 
     /// Records what the rewards of a step depend on, after its physics.
     fn measure(&mut self, rot_dist_before: f64) {
-        let (cube, cube_velocity) = (self.cube(), self.cube_velocity());
+        let (object, object_velocity) = (self.object(), self.object_velocity());
         let (task, now, qpos, qvel) = (&self.task, &mut self.now, self.sim.qpos(), self.sim.qvel());
-        let offset = [0, 1, 2].map(|axis| cube.position[axis] - task.config.goal_position.value[axis]);
-        (now.rot_dist_before, now.rot_dist) = (rot_dist_before, quat::angle_between(cube.orientation, self.goal));
+        let offset = [0, 1, 2].map(|axis| object.position[axis] - task.config.goal_position.value[axis]);
+        (now.rot_dist_before, now.rot_dist) = (rot_dist_before, quat::angle_between(object.orientation, self.goal));
         now.goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
         now.within = now.rot_dist <= self.lesson.tolerance;
         now.dropped = now.goal_dist >= task.config.fall_dist;
-        (now.cube, now.cube_velocity) = (cube, cube_velocity);
+        (now.object, now.object_velocity) = (object, object_velocity);
         let cells = now.joint_pos.iter_mut().zip(&mut now.joint_vel);
         for ((angle, speed), joint) in cells.zip(&task.hand.joints) {
             (*angle, *speed) = (qpos[joint.qpos], qvel[joint.dof]);
         }
     }
 
-    /// Returns the velocity of the cube, in the world frame.
-    fn cube_velocity(&self) -> Velocity {
+    /// Returns the velocity of the object, in the world frame.
+    fn object_velocity(&self) -> Velocity {
         let [vx, vy, vz, spin @ ..] =
-            self.sim.qvel()[self.task.hand.cube.dof..].first_chunk::<6>().expect("a free joint");
+            self.sim.qvel()[self.task.hand.object.dof..].first_chunk::<6>().expect("a free joint");
         // MuJoCo stores the angular velocity of a free joint in the body's frame.
-        let angular = quat::rotate(self.cube().orientation, *spin);
+        let angular = quat::rotate(self.object().orientation, *spin);
         Velocity { linear: [*vx, *vy, *vz], angular }
     }
 
@@ -219,7 +219,7 @@ impl Repose {
     fn replace_goal(&mut self) {
         self.goal = self.draw_rotation();
         let position = self.task.goal_place();
-        self.sim.place(self.task.hand.target, Pose { position, orientation: self.goal });
+        self.sim.place(self.task.hand.goal, Pose { position, orientation: self.goal });
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
@@ -247,8 +247,8 @@ impl Repose {
         cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
         cells.put("joint_vel", hand.joints.iter().map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
-        let Pose { position, orientation } = self.cube();
-        let Velocity { linear, angular } = self.cube_velocity();
+        let Pose { position, orientation } = self.object();
+        let Velocity { linear, angular } = self.object_velocity();
         cells.put("cube_pos", position);
         cells.put("cube_quat", quat::canonical(orientation));
         cells.put("cube_linvel", linear);
@@ -300,10 +300,10 @@ impl Env for Repose {
         }
         for (axis, start) in config.goal_position.value.into_iter().enumerate() {
             let noise = rng::uniform(&mut self.rng, -config.reset_position_noise, config.reset_position_noise);
-            self.sim.qpos_mut()[hand.cube.qpos + axis] = start + noise;
+            self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;
         }
         let orientation = self.draw_rotation();
-        self.sim.qpos_mut()[hand.cube.qpos + 3..hand.cube.qpos + 7].copy_from_slice(&orientation);
+        self.sim.qpos_mut()[hand.object.qpos + 3..hand.object.qpos + 7].copy_from_slice(&orientation);
         self.replace_goal();
         let target = |actuator: &Actuator| self.sim.length(*actuator).clamp(actuator.range[0], actuator.range[1]);
         self.servos.reset(hand.actuators.iter().map(target), self.conditions.delay(&self.task));
@@ -323,7 +323,7 @@ impl Env for Repose {
         let rot_dist_before = self.rot_dist();
         self.actuate(action);
         let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
-        let left = quat::mul(self.goal, quat::conj(self.cube().orientation));
+        let left = quat::mul(self.goal, quat::conj(self.object().orientation));
         let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, push, torque);
         let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
@@ -412,9 +412,9 @@ impl Resumable for Repose {
         // A fork may have other delays than its parent.
         let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / actuators;
         self.sim.restore(state.numbers_but(fixed + under_way * actuators)?)?;
-        // A fork may also have no forces on the cube, but its parent's state has one.
-        self.sim.push(self.task.hand.cube.body, [0.0; 3]);
-        self.sim.twist(self.task.hand.cube.body, [0.0; 3]);
+        // A fork may also have no forces on the object, but its parent's state has one.
+        self.sim.push(self.task.hand.object.body, [0.0; 3]);
+        self.sim.twist(self.task.hand.object.body, [0.0; 3]);
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);

@@ -22,7 +22,7 @@ pub struct EpisodeStats {
     pub rot_dist_sum: f64,
     /// Sums of the reward terms.
     pub reward: TaskReward,
-    /// Whether the cube was dropped.
+    /// Whether the object was dropped.
     pub dropped: bool,
     /// Whether the physics diverged.
     pub diverged: bool,

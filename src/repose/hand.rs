@@ -36,9 +36,9 @@ pub struct Hand {
     /// The first bodies of the trees that carry the fingertips, an arm's included.
     pub roots: Vec<Body>,
     /// The object, by default a cube.
-    pub cube: FreeJoint,
+    pub object: FreeJoint,
     /// The body that shows the goal.
-    pub target: Mocap,
+    pub goal: Mocap,
     /// The number of the keyframe in which an episode starts, if it does.
     pub keyframe: Option<usize>,
     /// The generalised positions in which an episode starts, before noise.
@@ -78,15 +78,15 @@ impl Hand {
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
         let actuators = each(&parts.actuators, |actuator| scene.servo(actuator), &mut problems);
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
-        let cube = scene.free_body(&parts.object).map_err(|error| problems.push(error.to_string()));
-        let target = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
+        let object = scene.free_body(&parts.object).map_err(|error| problems.push(error.to_string()));
+        let goal = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
         let keyframe = scene.start(&parts.start).map_err(|error| problems.push(error.to_string()));
         let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
         let refused = driven.iter().flatten().filter_map(|(joint, _)| scene.hinge(joint).err());
         problems.extend(refused.map(|error| error.to_string()));
         problems.sort();
         problems.dedup();
-        let (Ok(cube), Ok(target), Ok(keyframe), []) = (cube, target, keyframe, &problems[..]) else {
+        let (Ok(object), Ok(goal), Ok(keyframe), []) = (object, goal, keyframe, &problems[..]) else {
             bail!(problems.join("; "))
         };
         let controls = scene.controls();
@@ -100,14 +100,14 @@ impl Hand {
         roots.dedup();
         let start = scene.pose_of(keyframe);
         let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
-        let hand = Self { parts, joints, actuators, driven, fingertips, roots, cube, target, keyframe, start, layout };
+        let hand = Self { parts, joints, actuators, driven, fingertips, roots, object, goal, keyframe, start, layout };
         hand.expect_shadow_drives()?;
         Ok(hand)
     }
 
     /// Returns where an episode starts the object, before noise, m.
     pub fn place(&self) -> [f64; 3] {
-        *self.start[self.cube.qpos..].first_chunk().expect("a free joint")
+        *self.start[self.object.qpos..].first_chunk().expect("a free joint")
     }
 
     /// Returns the prefix of its names if it has the names of the Shadow Hand.

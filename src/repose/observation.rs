@@ -1,7 +1,7 @@
 //! The layout of an observation: one table from which sizes, offsets and the descriptions for other modules follow.
 
 use crate::quat;
-use crate::spaces::{CubeAndGoal, Spaces};
+use crate::spaces::{ObjectAndGoal, Spaces};
 
 /// A group of consecutive values in an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,7 +25,7 @@ pub(super) const TIP_QUAT: usize = 3;
 const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
 
 // The places of groups in the table.
-pub(super) const CUBE_QUAT: usize = 3;
+pub(super) const OBJECT_QUAT: usize = 3;
 pub(super) const GOAL_QUAT: usize = 7;
 pub(super) const RELATIVE_QUAT: usize = 8;
 pub(super) const TIPS: usize = 9;
@@ -91,11 +91,11 @@ impl Layout {
 
     /// Returns the description of observations and actions for a learner, for an object with these rotations.
     pub fn spaces(&self, symmetry: &[usize]) -> Spaces {
-        let [cube, goal, relative] = [CUBE_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
+        let [object, goal, relative] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
         Spaces {
             observation_size: self.size,
             action_size: self.actions,
-            cube_and_goal: Some(CubeAndGoal { cube, goal, relative, symmetry: quat::mask(symmetry) }),
+            object_and_goal: Some(ObjectAndGoal { object, goal, relative, symmetry: quat::mask(symmetry) }),
             distance: rotation_error,
         }
     }
@@ -103,7 +103,7 @@ impl Layout {
 
 /// Returns the rotation error that an observation shows, rad.
 fn rotation_error(spaces: &Spaces, observation: &[f32]) -> f32 {
-    let places = spaces.cube_and_goal.expect("a cube and its goal");
+    let places = spaces.object_and_goal.expect("an object and its goal");
     2.0 * observation[places.relative].clamp(0.0, 1.0).acos()
 }
 

@@ -47,7 +47,7 @@ enum Law {
     Each(fn(&Hand) -> usize, fn(&RandomizationConfig) -> [f64; 2]),
 }
 
-/// The number of sizes of the cube.
+/// The number of sizes of the object.
 const SIZES: usize = 5;
 
 /// The quantities that one generator draws, one after another. Each later one has its own, so that a new quantity does not
@@ -75,7 +75,7 @@ pub const QUANTITIES: [Quantity; 10] = [
         change: |_, x| vec![Change::Friction(x[0])] },
     Quantity { name: "cube_mass", setting: "cube_mass_scale", unit: "1", neutral: 1.0,
         task: |env| vec![env.cube_mass_scale], law: Law::Uniform(|drawn| drawn.cube_mass),
-        change: |hand, x| vec![Change::Mass(hand.cube.body, x[0])] },
+        change: |hand, x| vec![Change::Mass(hand.object.body, x[0])] },
     Quantity { name: "hand_mass", setting: "hand_mass_scale", unit: "1", neutral: 1.0,
         task: |env| vec![env.hand_mass_scale], law: Law::Uniform(|drawn| drawn.hand_mass),
         change: |hand, x| each(&hand.roots, x, Change::Mass) },
@@ -85,7 +85,7 @@ pub const QUANTITIES: [Quantity; 10] = [
         task: |env| vec![f64::from(env.action_delay)], law: Law::Whole(|drawn| drawn.delay), change: none },
     Quantity { name: "cube_com", setting: "cube_com", unit: "m", neutral: 0.0,
         task: |env| env.cube_com.into(), law: Law::Within(|drawn| drawn.cube_com),
-        change: |hand, x| vec![Change::CentreOfMass(hand.cube.body, vector(x))] },
+        change: |hand, x| vec![Change::CentreOfMass(hand.object.body, vector(x))] },
     Quantity { name: "gravity", setting: "gravity", unit: "m/s^2", neutral: 0.0,
         task: |env| env.gravity.into(), law: Law::Normal(|drawn| drawn.gravity),
         change: |_, x| vec![Change::Gravity(vector(x))] },
@@ -143,7 +143,7 @@ impl Quantity {
     }
 }
 
-/// Returns the factors on the lengths of the cube that are drawn.
+/// Returns the factors on the lengths of the object that are drawn.
 pub(super) fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
     let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
     if low == high { vec![low] } else { (0..SIZES).map(place).collect() }

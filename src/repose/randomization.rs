@@ -21,7 +21,7 @@ pub struct Randomization {
     /// The scene of the episodes that are not randomised. It has the physics of the task.
     nominal: Scene,
     variants: Variants,
-    /// The factor on the lengths of the cube in each variant. The last one is the nominal scene.
+    /// The factor on the lengths of the object in each variant. The last one is the nominal scene.
     sizes: Vec<f64>,
     noise: NoiseStd,
     bias: NoiseStd,
@@ -36,7 +36,7 @@ pub struct EpisodePhysics {
     pub has_noise: bool,
     /// Whether there is an offset of the observations.
     pub has_bias: bool,
-    /// Whether there are forces on the cube.
+    /// Whether there are forces on the object.
     pub has_pushes: bool,
 }
 
@@ -130,7 +130,7 @@ impl Randomization {
         if draw.has_bias { drawn } else { Vec::new() }
     }
 
-    /// Returns the force on the cube, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.
+    /// Returns the force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.
     pub(super) fn push(&self, draw: &EpisodePhysics, rng: &Rng, step: u32) -> Option<[f64; 3]> {
         let std = self.config.push;
         let rng = &mut rng::beside_at(rng, "push", step / self.config.push_steps);

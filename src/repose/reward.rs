@@ -17,20 +17,20 @@ pub struct Step {
     pub rot_dist_before: f64,
     /// Rotation error after the step.
     pub rot_dist: f64,
-    /// Distance of the cube from the goal position.
+    /// Distance of the object from the goal position.
     pub goal_dist: f64,
     /// Whether the rotation error is within the tolerance of the lesson, which may differ from the task's in training.
     pub within: bool,
-    /// Whether the cube was dropped.
+    /// Whether the object was dropped.
     pub dropped: bool,
     /// The action, clipped to [-1, 1].
     pub action: Vec<f32>,
     /// The action of the step before, clipped. Zeros after a reset.
     pub previous_action: Vec<f32>,
-    /// The pose of the cube.
-    pub cube: Pose,
-    /// The velocity of the cube's centre.
-    pub cube_velocity: Velocity,
+    /// The pose of the object.
+    pub object: Pose,
+    /// The velocity of the object's centre.
+    pub object_velocity: Velocity,
     /// The angles of the joints, in observation order.
     pub joint_pos: Vec<f64>,
     /// The velocities of the joints, in observation order.

@@ -3,7 +3,7 @@
 use anyhow::{Result, bail};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::observation::{CUBE_QUAT, GOAL_QUAT, Group, Layout, RELATIVE_QUAT, TIP_QUAT};
+use super::observation::{GOAL_QUAT, Group, Layout, OBJECT_QUAT, RELATIVE_QUAT, TIP_QUAT};
 use crate::config::ByGroup;
 use crate::os::shortened;
 use crate::quat::{self, Quat};
@@ -61,7 +61,7 @@ pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (
 /// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
 /// numbers. It stays the same however the body turns.
 pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
-    let orientations = || std::iter::once(layout.start(CUBE_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
+    let orientations = || std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
     let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
     let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
     bias.iter().filter(|(i, _)| !in_orientation(*i)).for_each(|&(i, added)| observation[i] += added);
@@ -73,7 +73,7 @@ pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &La
 }
 
 /// Makes an observation consistent after something was added to its values. Quaternions get length 1 and their usual sign. The
-/// orientation relative to the goal follows from the orientation of the cube.
+/// orientation relative to the goal follows from the orientation of the object.
 pub(super) fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
@@ -84,11 +84,11 @@ pub(super) fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let write = |observation: &mut [f32], at: usize, q: Quat| {
         observation[at..at + 4].iter_mut().zip(q).for_each(|(cell, x)| *cell = x as f32);
     };
-    let [cube_at, goal_at, relative_at] = [CUBE_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
-    let cube = quat::canonical(read(observation, cube_at));
+    let [object_at, goal_at, relative_at] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
+    let object = quat::canonical(read(observation, object_at));
     let goal = read(observation, goal_at);
-    write(observation, cube_at, cube);
-    write(observation, relative_at, quat::canonical(quat::mul(cube, quat::conj(goal))));
+    write(observation, object_at, object);
+    write(observation, relative_at, quat::canonical(quat::mul(object, quat::conj(goal))));
     for tip in layout.tips() {
         let orientation = read(observation, tip + TIP_QUAT);
         write(observation, tip + TIP_QUAT, orientation);
@@ -135,12 +135,12 @@ mod tests {
         let mut off = || {
             let q = quat::canonical(quat::uniform([0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0))));
             let mut observation = vec![0.1; 157];
-            observation[shadow().start(CUBE_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
+            observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
             offset(&mut observation, &bias, &shadow());
             make_consistent(&mut observation, &shadow());
             assert_eq!(observation[5], 0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1);
             assert_eq!(observation[30], 0.1);
-            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(CUBE_QUAT) + i]));
+            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(OBJECT_QUAT) + i]));
             quat::canonical(quat::mul(quat::conj(q), seen))
         };
         let first = off();
@@ -154,23 +154,23 @@ mod tests {
     fn quaternions_stay_of_length_one_and_the_relative_one_is_that_of_the_seen_cube() {
         let mut observation = vec![0.1; 157];
         observation[shadow().start(GOAL_QUAT)..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
-        observation[shadow().start(CUBE_QUAT)..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
-        for (i, added) in [(shadow().start(CUBE_QUAT), -0.4), (shadow().start(TIPS) + TIP_QUAT, 3.0), (3, 0.25)] {
+        observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
+        for (i, added) in [(shadow().start(OBJECT_QUAT), -0.4), (shadow().start(TIPS) + TIP_QUAT, 3.0), (3, 0.25)] {
             observation[i] += added;
         }
         make_consistent(&mut observation, &shadow());
         let part = |at: usize| [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
-        let cube = part(shadow().start(CUBE_QUAT));
-        assert!(cube[0] > 0.0 && cube[1] < 0.0, "{cube:?}");
+        let object = part(shadow().start(OBJECT_QUAT));
+        assert!(object[0] > 0.0 && object[1] < 0.0, "{object:?}");
         for at in [
-            shadow().start(CUBE_QUAT),
+            shadow().start(OBJECT_QUAT),
             shadow().start(RELATIVE_QUAT),
             shadow().start(TIPS) + TIP_QUAT,
             shadow().start(TIPS) + TIP_SIZE + TIP_QUAT,
         ] {
             assert!((part(at).iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-6);
         }
-        let relative = quat::canonical(quat::mul(cube, quat::conj([0.0, 1.0, 0.0, 0.0])));
+        let relative = quat::canonical(quat::mul(object, quat::conj([0.0, 1.0, 0.0, 0.0])));
         assert!(part(shadow().start(RELATIVE_QUAT)).iter().zip(relative).all(|(a, b)| (a - b).abs() < 1e-6));
         assert_eq!((observation[3], observation[4]), (0.35, 0.1));
     }

@@ -58,7 +58,7 @@ impl Task {
         let nominal = if compilation.keeps_all() { as_it_is } else { Scene::load(file, &compilation)? };
         let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
-        hand.cube.inertia *= config.cube_mass_scale;
+        hand.object.inertia *= config.cube_mass_scale;
         config.goal_position.settle(hand.place());
         let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
         ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);
@@ -72,7 +72,7 @@ impl Task {
         }
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
-        let symmetry = scene.symmetry(hand.cube.body);
+        let symmetry = scene.symmetry(hand.object.body);
         Ok(Arc::new(Self {
             scene,
             compilation,
@@ -135,13 +135,13 @@ impl Task {
                 notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
             }
         }
-        let (object, alike) = (&self.hand.parts.object, self.scene.symmetry(self.hand.cube.body).len());
+        let (object, alike) = (&self.hand.parts.object, self.scene.symmetry(self.hand.object.body).len());
         if alike < CUBE_ROTATIONS.len() {
             notes.push(format!(
                 "{alike} of the 24 rotations of a cube map `{object}` onto itself (ppo.symmetry = \"object\")"
             ));
         }
-        let round = self.scene.round_axes(self.hand.cube.body);
+        let round = self.scene.round_axes(self.hand.object.body);
         if !round.is_empty() {
             notes.push(format!(
                 "turns of `{object}` about its axes {round} cannot be seen or felt, but goals include such turns, and scores count them"
@@ -225,7 +225,7 @@ impl Task {
         self.hand.layout.spaces(&self.symmetry)
     }
 
-    /// Loads this task's scene with its physics, but with another size of the cube (a factor on the task's). With `shifts`,
+    /// Loads this task's scene with its physics, but with another size of the object (a factor on the task's). With `shifts`,
     /// its centre of mass can be shifted.
     ///
     /// # Errors

@@ -39,7 +39,7 @@ impl Columns {
     pub(super) fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
         let mut drawing = task.scene().drawing(task.config().model_file().is_none(), camera);
         let (positions, quaternions) = (drawing.positions(), drawing.quaternions());
-        let goal = positions + 7 * task.hand().target.number();
+        let goal = positions + 7 * task.hand().goal.number();
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
         Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
     }

@@ -43,11 +43,11 @@ fn play(task: &Arc<Task>, episode: u64) -> (f64, u32, u32) {
     env.reset(rng::stream(0, "mobility of", episode), &mut observation);
     let (mut turned, mut steps) = (0.0, 0);
     for step in 0..STEPS {
-        let before = env.cube().orientation;
+        let before = env.object().orientation;
         action.fill_with(|| normal.sample(&mut rng));
         let end = env.step(&action, &mut observation).end;
         if step >= SETTLING {
-            turned += quat::angle_between(env.cube().orientation, before);
+            turned += quat::angle_between(env.object().orientation, before);
             steps += 1;
         }
         if end.is_some() {

@@ -39,7 +39,7 @@ impl PointMass {
 const SPACES: Spaces = Spaces {
     observation_size: 2,
     action_size: 2,
-    cube_and_goal: None,
+    object_and_goal: None,
     distance: |_, observation| observation[0].hypot(observation[1]),
 };
 

@@ -56,16 +56,16 @@ fn each_quantity_is_varied_as_if_the_scene_said_so() {
     let folder = tempfile::tempdir().unwrap();
     let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     let unchanged = after_a_second(&[]);
-    let (before, of_cube) = SCENE.split_once("<body name=\"cube\"").unwrap();
-    let (cube, after) = of_cube.split_once("</body>").unwrap();
-    let cube_of = |cube: String| format!("{before}<body name=\"cube\"{cube}</body>{after}");
+    let (before, of_object) = SCENE.split_once("<body name=\"cube\"").unwrap();
+    let (object, after) = of_object.split_once("</body>").unwrap();
+    let object_of = |object: String| format!("{before}<body name=\"cube\"{object}</body>{after}");
     let moved = format!("pos=\"{} 0 {}\"", 1.25 * 0.33, 1.25 * 0.295);
-    let larger = cube_of(scaled(&scaled(cube, "size", 1.25), "pos", 1.25).replace(&moved, "pos=\".33 0 .295\""));
-    let hand = format!("{}<body name=\"cube\"{of_cube}", scaled(&scaled(before, "mass", 1.5), "diaginertia", 1.5));
+    let larger = object_of(scaled(&scaled(object, "size", 1.25), "pos", 1.25).replace(&moved, "pos=\".33 0 .295\""));
+    let hand = format!("{}<body name=\"cube\"{of_object}", scaled(&scaled(before, "mass", 1.5), "diaginertia", 1.5));
     let inertia =
         "inertial pos=\".004 -.002 .003\" mass=\".028\" diaginertia=\".00001166667 .00001166667 .00001166667\"";
     let joint = "<freejoint name=\"cube\"/>";
-    let shifted = cube_of(cube.replace(joint, &format!("{joint}<{inertia}/>")));
+    let shifted = object_of(object.replace(joint, &format!("{joint}<{inertia}/>")));
     let option = "<option timestep=\"0.01\"";
     let falling = SCENE.replace(option, "<option gravity=\"0.5 -0.25 -8.81\" timestep=\"0.01\"");
     for (setting, scene) in [
@@ -89,24 +89,24 @@ fn each_quantity_is_varied_as_if_the_scene_said_so() {
 #[test]
 fn a_cube_of_several_parts_is_resized_as_a_whole() {
     let folder = tempfile::tempdir().unwrap();
-    let (before, of_cube) = SCENE.split_once("<body name=\"cube\"").unwrap();
-    let (cube, after) = of_cube.split_once("</body>").unwrap();
+    let (before, of_object) = SCENE.split_once("<body name=\"cube\"").unwrap();
+    let (object, after) = of_object.split_once("</body>").unwrap();
     let parts = "<frame pos=\".012 0 0\"><geom type=\"sphere\" size=\".016\" pos=\".01 .002 0\"/></frame>\
                  <body pos=\"0 .01 .02\"><geom type=\"capsule\" fromto=\"0 0 0 0 0 .01\" size=\".008\" mass=\".004\"/></body>";
     // Lumps make the motion so sensitive that rounding is seen after a second.
-    let after_a_while = |cube: &str, setting: &str| {
+    let after_a_while = |object: &str, setting: &str| {
         let path = folder.path().join("scene.xml");
-        fs::write(&path, format!("{before}<body name=\"cube\"{cube}</body>{after}")).unwrap();
+        fs::write(&path, format!("{before}<body name=\"cube\"{object}</body>{after}")).unwrap();
         after_steps(30, &[&format!("env.model={}", path.display()), setting])
     };
-    let cube = format!("{cube}{parts}");
-    let larger = ["size", "pos", "fromto"].iter().fold(cube.clone(), |text, name| scaled(&text, name, 1.2));
+    let object = format!("{object}{parts}");
+    let larger = ["size", "pos", "fromto"].iter().fold(object.clone(), |text, name| scaled(&text, name, 1.2));
     // The body's own place stays, and a part that is given by its density keeps its mass.
     let larger = larger.replace("pos=\"0.396 0 0.354\"", "pos=\".33 0 .295\"");
     let density = 1000.0 / 1.2_f64.powi(3);
     let larger = larger.replace("type=\"sphere\"", &format!("type=\"sphere\" density=\"{density}\""));
-    let unchanged = after_a_while(&cube, "env.cube_size_scale=1");
-    let set = after_a_while(&cube, "env.cube_size_scale=1.2");
+    let unchanged = after_a_while(&object, "env.cube_size_scale=1");
+    let set = after_a_while(&object, "env.cube_size_scale=1.2");
     let said = after_a_while(&larger, "env.cube_size_scale=1");
     let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     assert!(apart(&set, &said) < 1e-6, "{}", apart(&set, &said));
@@ -126,7 +126,7 @@ fn a_fork_without_forces_on_the_cube_drops_the_one_of_its_parent() {
         observation
     };
     let pushed = after_a_step(&env);
-    env.simulation_mut().push(task(&[]).hand().cube.body, [0.0; 3]);
+    env.simulation_mut().push(task(&[]).hand().object.body, [0.0; 3]);
     assert_eq!(pushed, after_a_step(&env));
 }
 

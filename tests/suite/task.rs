@@ -13,17 +13,17 @@ use crate::support::{OBSERVATION_SIZE, config, env_config, started, started_agen
 
 const STILL: [f32; 20] = [0.0; 20];
 
-fn cube_at(task: &Task) -> usize {
+fn object_at(task: &Task) -> usize {
     task.scene().free_body("cube").unwrap().qpos
 }
 
 /// Puts the cube at the goal position, turned to `orientation`, at rest.
-fn put_cube(env: &mut Repose, task: &Task, orientation: Quat) {
-    let cube = task.scene().free_body("cube").unwrap();
+fn put_object(env: &mut Repose, task: &Task, orientation: Quat) {
+    let object = task.scene().free_body("cube").unwrap();
     let simulation = env.simulation_mut();
-    simulation.qpos_mut()[cube.qpos..cube.qpos + 3].copy_from_slice(&[0.33, 0.0, 0.295]);
-    simulation.qpos_mut()[cube.qpos + 3..cube.qpos + 7].copy_from_slice(&orientation);
-    simulation.qvel_mut()[cube.dof..cube.dof + 6].fill(0.0);
+    simulation.qpos_mut()[object.qpos..object.qpos + 3].copy_from_slice(&[0.33, 0.0, 0.295]);
+    simulation.qpos_mut()[object.qpos + 3..object.qpos + 7].copy_from_slice(&orientation);
+    simulation.qvel_mut()[object.dof..object.dof + 6].fill(0.0);
     simulation.refresh();
 }
 
@@ -39,16 +39,16 @@ fn observations_land_at_their_indices() {
     let task = task(&[]);
     let (mut env, mut observation) = started(&task);
     let hand = task.hand();
-    let cube = hand.cube;
+    let object = hand.object;
     // A quarter turn about z, with w < 0: the observation shows the opposite sign.
     let orientation = [-FRAC_1_SQRT_2, 0.0, 0.0, -FRAC_1_SQRT_2];
-    put_cube(&mut env, &task, orientation);
+    put_object(&mut env, &task, orientation);
     for i in 0..24 {
         let (low, high) = (hand.joints[i].range[0], hand.joints[i].range[1]);
         env.simulation_mut().qpos_mut()[hand.joints[i].qpos] = low + (high - low) * (i as f64 + 1.0) / 30.0;
         env.simulation_mut().qvel_mut()[hand.joints[i].dof] = 0.1 * i as f64;
     }
-    env.simulation_mut().qvel_mut()[cube.dof..cube.dof + 6].copy_from_slice(&[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
+    env.simulation_mut().qvel_mut()[object.dof..object.dof + 6].copy_from_slice(&[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
     env.simulation_mut().refresh();
     env.observe(&mut observation);
 
@@ -148,7 +148,7 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
     let (mut env, mut observation) = started(&task);
     let goal = env.goal();
     for held in [1, 2, 0] {
-        put_cube(&mut env, &task, goal);
+        put_object(&mut env, &task, goal);
         let transition = env.step(&STILL, &mut observation);
         let details = *env.last_step();
         assert_eq!((details.goal, details.reward["bonus"], transition.end), (goal, 2.0, None));
@@ -173,7 +173,7 @@ fn steps_outside_the_tolerance_leave_a_cumulative_counter_alone_and_clear_a_cons
         let goal = env.goal();
         let away = quat::mul(goal, [FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0, 0.0]);
         for orientation in [goal, away, goal] {
-            put_cube(&mut env, &task, orientation);
+            put_object(&mut env, &task, orientation);
             let _ = env.step(&STILL, &mut observation);
         }
         assert_eq!(env.held(), held, "{mode}");
@@ -185,7 +185,7 @@ fn steps_outside_the_tolerance_leave_a_cumulative_counter_alone_and_clear_a_cons
 fn a_dropped_cube_terminates_and_pays_the_penalty() {
     let task = task(&["env.fall_penalty=-5"]);
     let (mut env, mut observation) = started(&task);
-    let height = cube_at(&task) + 2;
+    let height = object_at(&task) + 2;
     env.simulation_mut().qpos_mut()[height] = 0.295 - 0.241;
     env.simulation_mut().refresh();
     let transition = env.step(&STILL, &mut observation);
@@ -256,12 +256,12 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
             assert!(angle.abs() <= 0.2 && (joint.range[0]..=joint.range[1]).contains(&angle));
             assert!(qvel[joint.dof].abs() <= 0.3);
         }
-        let cube = &qpos[hand.cube.qpos..hand.cube.qpos + 7];
-        for (x, middle) in cube.iter().zip([0.33, 0.0, 0.295]) {
+        let object = &qpos[hand.object.qpos..hand.object.qpos + 7];
+        for (x, middle) in object.iter().zip([0.33, 0.0, 0.295]) {
             assert!((x - middle).abs() <= 0.01);
         }
-        assert!(qvel[hand.cube.dof..hand.cube.dof + 6].iter().all(|&v| v == 0.0));
-        let orientation: Quat = cube[3..].try_into().unwrap();
+        assert!(qvel[hand.object.dof..hand.object.dof + 6].iter().all(|&v| v == 0.0));
+        let orientation: Quat = object[3..].try_into().unwrap();
         angles.push(quat::angle_between(orientation, env.goal()));
         starts.push(qpos[hand.joints[0].qpos]);
     }

@@ -14,7 +14,7 @@ use shadow_repose::rng;
 
 use crate::support::{OBSERVATION_SIZE, config, program, started, started_agent, stderr, succeeded, task, train};
 
-const CUBE_ORIENTATION: usize = 51;
+const OBJECT_ORIENTATION: usize = 51;
 const GOAL_ORIENTATION: usize = 64;
 
 /// Returns the lesson of the task itself with these settings applied over it.
@@ -40,15 +40,15 @@ fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
 fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy() {
     // The hand moves slowly while the cube falls onto it.
     let task = task(&["env.act_moving_average=0.05"]);
-    let cube = task.scene().free_body("cube").unwrap().qpos;
+    let object = task.scene().free_body("cube").unwrap().qpos;
     let (half, root) = (0.5, std::f64::consts::FRAC_1_SQRT_2);
     for (episode, turn) in
         [[root, 0.0, root, 0.0], [half, -half, half, half], [0.0, 0.0, root, -root]].iter().enumerate()
     {
         let (mut one, mut other) = (Repose::new(&task), Repose::new(&task));
         let (mut seen, mut other_seen) = (start(&mut one, episode as u64), start(&mut other, episode as u64));
-        let orientation = *other.simulation().qpos()[cube + 3..].first_chunk().unwrap();
-        other.simulation_mut().qpos_mut()[cube + 3..cube + 7].copy_from_slice(&quat::mul(orientation, *turn));
+        let orientation = *other.simulation().qpos()[object + 3..].first_chunk().unwrap();
+        other.simulation_mut().qpos_mut()[object + 3..object + 7].copy_from_slice(&quat::mul(orientation, *turn));
         other.simulation_mut().refresh();
         // Contacts amplify rounding errors: after some more steps of a moving hand, the two cubes no longer agree.
         for step in 0..15 {
@@ -156,7 +156,7 @@ fn friction_and_the_mass_of_the_cube_are_scaled_as_if_the_scene_said_so() {
 /// Returns the observation with cube and goal turned by `rotation`, which maps the cube onto itself.
 fn turned(observation: &[f32], rotation: Quat) -> Vec<f32> {
     let mut other = observation.to_vec();
-    for place in [CUBE_ORIENTATION, GOAL_ORIENTATION] {
+    for place in [OBJECT_ORIENTATION, GOAL_ORIENTATION] {
         let q: [f32; 4] = *observation[place..].first_chunk().unwrap();
         let turned = quat::canonical(quat::mul(q.map(f64::from), rotation)).map(|x| x as f32);
         other[place..place + 4].copy_from_slice(&turned);
@@ -260,13 +260,13 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let away = ["ppo.std.from=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
     let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
     let task = task(&[]);
-    let cube = task.scene().free_body("cube").unwrap().qpos;
+    let object = task.scene().free_body("cube").unwrap().qpos;
     let mut agent = started_agent(&task, &config(&sets));
     let rows = agent.rollout.first_observations_mut().into_iter();
     let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
     for (env, row) in agent.pool.envs_mut().zip(rows).step_by(2) {
         let goal = env.goal();
-        env.simulation_mut().qpos_mut()[cube + 3..cube + 7].copy_from_slice(&goal);
+        env.simulation_mut().qpos_mut()[object + 3..object + 7].copy_from_slice(&goal);
         env.simulation_mut().refresh();
         env.observe(row);
     }
@@ -278,7 +278,7 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     for block in &rollout.blocks {
         for (i, row) in block.acted_on().chunks_exact(OBSERVATION_SIZE).enumerate() {
             let orientation = |at: usize| [0, 1, 2, 3].map(|j| f64::from(row[at + j]));
-            let error = quat::angle_between(orientation(CUBE_ORIENTATION), orientation(GOAL_ORIENTATION));
+            let error = quat::angle_between(orientation(OBJECT_ORIENTATION), orientation(GOAL_ORIENTATION));
             let expected = 1.0 + 2.0 * ((error - 0.15) / 0.35).clamp(0.0, 1.0);
             let found = f64::from(block.noise_scales[i]);
             assert!((found - expected).abs() < 0.02, "{found} instead of {expected} at {error} rad");
@@ -363,17 +363,17 @@ fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_r
 
 fn expect_help(sets: &[&str]) {
     let task = task(sets);
-    let cube = task.hand().cube;
+    let object = task.hand().object;
     // The angular velocity that a falling cube gains in the first step, as a fraction of the largest assistance.
     let gained = |env_steps: u64, episode: u64| {
         let mut env = Repose::new(&task);
         env.set_lesson(lesson(env_steps, &["training.assist={from=100,to=0,steps=1000}"]));
         let mut observation = start(&mut env, episode);
-        let orientation = env.cube().orientation;
+        let orientation = env.object().orientation;
         let left = quat::rotation_vector(quat::mul(env.goal(), quat::conj(orientation)));
         let _ = env.step(&[0.0; 20], &mut observation);
-        let spin = *env.simulation().qvel()[cube.dof + 3..].first_chunk().unwrap();
-        let spin = quat::rotate(env.cube().orientation, spin);
+        let spin = *env.simulation().qvel()[object.dof + 3..].first_chunk().unwrap();
+        let spin = quat::rotate(env.object().orientation, spin);
         let most = left.map(|angle| 100.0 * angle * 0.01);
         let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         let part = dot(spin, most) / dot(most, most);

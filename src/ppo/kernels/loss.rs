@@ -134,7 +134,7 @@ mod tests {
     /// central differences. Both actions have a standard deviation with the logarithm -0.5.
     #[test]
     fn losses_and_gradients_are_those_of_the_formulas() {
-        let spaces = Spaces { observation_size: 1, action_size: 2, cube_and_goal: None, distance: |_, _| 0.0 };
+        let spaces = Spaces { observation_size: 1, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
         let mut rollout = Rollout::new(1, &[3], &spaces);
         let block = &mut rollout.blocks[0];
         block.actions = vec![0.5, -1.0, -0.3, 0.9, 0.2, 1.5];

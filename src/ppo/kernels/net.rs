@@ -203,7 +203,8 @@ mod tests {
     use crate::config::Precision;
     use crate::spaces::Spaces;
 
-    const SPACES: Spaces = Spaces { observation_size: 157, action_size: 20, cube_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces =
+        Spaces { observation_size: 157, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
 
     #[test]
     fn packed_weights_change_no_bit() {
