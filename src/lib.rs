@@ -21,7 +21,7 @@
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
-//! | [`mod@bench`] | the speed of this machine | agent, cli, config, draw, env, load, os, ppo, ranks, repose, rng, run, schedule, sim, spaces |
+//! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
 //! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, run, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |

@@ -1,12 +1,9 @@
-//! Measuring the speed of this machine: the physics alone, the environments around it, the learner, whole iterations and their
-//! parts.
+//! Measuring the speed of this machine: the physics alone, the environments around it, the learner, and whole iterations.
 
 mod environments;
-mod iteration;
 mod measure;
 mod replay;
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -15,20 +12,16 @@ use rand_distr::{Distribution, StandardNormal};
 use serde_json::json;
 
 use crate::agent::{Agent, step_block};
-use crate::cli::{BenchArgs, Part, usage_error};
+use crate::cli::{BenchArgs, Part};
 use crate::config::{Config, expect_used, user_file};
-use crate::draw::{self, BarChart, HeatMap, NamedBar, Picture};
 use crate::env::EnvPool;
-use crate::load::PolicySource;
-use crate::os::{self, OutputFile};
+use crate::os;
 use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, shares_of_waiting, time_gradient_steps};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
 use crate::rng;
-use crate::run;
 use crate::schedule::in_rounds;
 use environments::environments;
-use iteration::{PARTS, seconds_of_parts};
 use measure::{Found, NEVER, median};
 use replay::{RecordingEnv, replay};
 
@@ -57,17 +50,7 @@ const END_TO_END_ITERATIONS: usize = 4;
 /// Fails if a setting or the scene cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
     expect_used(&args.settings.set, "bench")?;
-    if args.only != Some(Part::Iteration) && (args.ckpt.is_some() || args.out.is_some()) {
-        return Err(usage_error("bench", "--ckpt and --out apply only to --only iteration").into());
-    }
-    let origin = PolicySource::find(args.ckpt.as_deref().unwrap_or(Path::new("builtin")))?;
     let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
-    if let Some(out) = &args.out {
-        let read = args.settings.config.as_deref().into_iter().chain(origin.file());
-        run::expect_output(out, read, config.env.model_file())?;
-    }
-    let output = args.out.as_deref().map(OutputFile::create).transpose()?;
-    output.as_ref().map(draw::picture_format).transpose()?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env, &config.hand)?;
@@ -76,10 +59,6 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
     let mut lines = format!("{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n");
-    let mut tell = |(found, text): Found| {
-        found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
-        lines += &text;
-    };
     let measures: [(Part, Measure); 4] = [
         (Part::Physics, physics_and_pool),
         (Part::Learner, learner),
@@ -87,40 +66,15 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         (Part::Environments, environments),
     ];
     for (_, measure) in measures.into_iter().filter(|(part, _)| args.only.is_none_or(|only| only == *part)) {
-        tell(measure(&task, &config)?);
-    }
-    if args.only == Some(Part::Iteration) {
-        let seconds = seconds_of_parts(&config, &origin)?;
-        tell((PARTS.iter().zip(seconds).map(|((_, key), seconds)| (*key, seconds)).collect(), table(seconds)));
-        output.map_or(Ok(()), |output| picture(&config, seconds).write(output))?;
+        let (found, text) = measure(&task, &config)?;
+        found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
+        lines += &text;
     }
     os::print(&if args.json { format!("{figures}\n") } else { lines })
 }
 
 /// The measurement of a part.
 type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
-
-/// Returns the seconds and shares of the parts of an iteration as lines.
-fn table(seconds: [f64; 4]) -> String {
-    let all: f64 = seconds.iter().sum();
-    let line = |(&(name, _), seconds): (&(&str, &str), f64)| {
-        format!("{name:<26}{:>10.1} ms        {:.1} %\n", 1e3 * seconds, 100.0 * seconds / all)
-    };
-    PARTS.iter().zip(seconds).map(line).collect()
-}
-
-/// Returns a picture of the shares of the parts of an iteration.
-fn picture(config: &Config, seconds: [f64; 4]) -> BarChart {
-    let all: f64 = seconds.iter().sum();
-    let bar = |((name, _), seconds): ((&str, &str), f64)| {
-        let (value, note) = (seconds / all, format!("{:.0} ms, {:.0} %", 1e3 * seconds, 100.0 * seconds / all));
-        NamedBar { name: name.to_owned(), value, interval: [value; 2], note }
-    };
-    let title =
-        format!("one iteration of {} steps, nets {:?}: {:.2} s", config.steps_per_iteration(), config.ppo.hidden, all);
-    let map = HeatMap { columns: Vec::new(), rows: Vec::new(), cells: Vec::new() };
-    BarChart { title, bars: PARTS.into_iter().zip(seconds).map(bar).collect(), map }
-}
 
 /// Measures the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
 fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {

@@ -391,12 +391,6 @@ pub struct BenchArgs {
     /// Measure only this part
     #[arg(long, value_enum, value_name = "PART")]
     pub only: Option<Part>,
-    /// Policy that acts in `--only iteration`: a checkpoint, a run, builtin or robust [default: builtin]
-    #[arg(long, value_name = "FILE|RUN|NAME")]
-    pub ckpt: Option<PathBuf>,
-    /// Write the parts of an iteration as a picture, .svg or .png
-    #[arg(long, value_name = "FILE")]
-    pub out: Option<PathBuf>,
     /// Print only the results, as one JSON object
     #[arg(long)]
     pub json: bool,
@@ -413,6 +407,4 @@ pub enum Part {
     Training,
     /// Trainings with different numbers of environments, and which of them learns most in the same time
     Environments,
-    /// The parts of an iteration, while a trained policy acts; only on request
-    Iteration,
 }

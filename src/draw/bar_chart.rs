@@ -58,8 +58,9 @@ const BAR: RGBColor = COLOURS[0];
 
 impl Picture for BarChart {
     fn size(&self) -> Result<[u32; 2]> {
-        let map = if self.map.rows.is_empty() { 0 } else { GAP + CELL * (1 + self.map.rows.len() as i32) };
-        Ok([WIDTH as u32, (TITLE + ROW * (1 + self.bars.len() as i32) + map + GAP) as u32])
+        let bars = ROW * (1 + self.bars.len() as i32);
+        let map = CELL * (1 + self.map.rows.len() as i32);
+        Ok([WIDTH as u32, (TITLE + bars + GAP + map + GAP) as u32])
     }
 
     fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
@@ -81,8 +82,7 @@ impl Picture for BarChart {
             area.draw(&PathElement::new(bar.interval.map(|value| (x(value), middle)), BLACK))?;
         }
         let top = bottom + ROW + GAP;
-        let columns = self.map.columns.len() as i32;
-        let width = (WIDTH - NAMES - NOTES) / columns.max(1);
+        let width = (WIDTH - NAMES - NOTES) / self.map.columns.len() as i32;
         for (i, name) in self.map.columns.iter().enumerate() {
             text(name, (NAMES + width * i as i32 + width / 2, top + CELL / 2), HPos::Center, 13, BLACK)?;
         }

@@ -492,31 +492,6 @@ fn bench_prints_every_figure() {
     assert_eq!(figures["hidden"], serde_json::json!([16]));
 }
 
-#[test]
-fn bench_tells_where_the_time_of_an_iteration_goes() {
-    let folder = tempfile::tempdir().unwrap();
-    let small = ["bench", "--only", "iteration", "--set", "env.num_envs=16", "--set", "ppo.hidden=[16]"];
-    let bench = |more: &[&str]| program(folder.path(), &[&small[..], more].concat());
-    let figures = json(&succeeded(bench(&["--json", "--out", "parts.svg"])));
-    for key in ["iteration_physics_s", "iteration_policy_s", "iteration_learner_s"] {
-        assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
-    }
-    assert!(figures["iteration_environments_s"].is_f64());
-    let svg = fs::read_to_string(folder.path().join("parts.svg")).unwrap();
-    for part in ["physics (MuJoCo)", "observe, reward, reset", "policy acts", "learner", "nets [16]"] {
-        assert!(svg.contains(part), "{part}: {svg}");
-    }
-    succeeded(bench(&["--set", "training.assist=100", "--set", "ppo.horizon={from=16,to=32,steps=0}"]));
-    let refused = bench(&["--out", "parts.pdf"]);
-    assert!(stderr(&refused).contains("must end in .svg or .png"), "{}", stderr(&refused));
-    let refused = bench(&["--ckpt", "nowhere"]);
-    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("nowhere"), "{}", stderr(&refused));
-    for option in [["--ckpt", "builtin"], ["--out", "x.svg"]] {
-        let refused = program(folder.path(), &[&["bench", "--only", "learner"], &option[..]].concat());
-        assert_eq!(refused.status.code(), Some(2), "{}", stderr(&refused));
-    }
-}
-
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #[test]
 fn a_processor_without_avx_is_named_in_a_sentence() {
