@@ -13,7 +13,7 @@ use crate::draw::{self, BarChart, HeatMap, Picture};
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::load::Loaded;
 use crate::os::{self, OutputFile, Requests, number};
-use crate::repose::{Score, Task};
+use crate::repose::{Score, Task, measure};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
 const CHANGES: [(&str, &str, &[&str]); 9] = [
@@ -98,9 +98,9 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             os::say(&format!("warning: {}: {warning}", condition.name));
         }
-        let nominal = rows.first().map_or(score.goals, |nominal| nominal.score.goals);
+        let nominal = rows.first().map_or(score["goals"], |nominal| nominal.score["goals"]);
         // Without any goals there is no fraction.
-        let kept = if nominal > 0.0 { score.goals / nominal } else { f64::NAN };
+        let kept = if nominal > 0.0 { score["goals"] / nominal } else { f64::NAN };
         rows.push(Row { condition, config, score, kept });
     }
     drop(bar);
@@ -157,9 +157,9 @@ fn as_json(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> Value 
         json!({
             "name": row.condition.name,
             "set": Map::from_iter(row.condition.sets.iter().map(value)),
-            "goals_per_episode": row.score.goals,
+            measure("goals").key: row.score["goals"],
             "goals_ci95": row.score.goals_ci95,
-            "drop_rate": row.score.drop_rate,
+            measure("drop_rate").key: row.score["drop_rate"],
             "kept": row.kept,
         })
     };
@@ -174,8 +174,9 @@ fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
     text += &format!("{:<30} {:>5}  {:<15} {:>7} {:>6}\n", "", "goals", "95 % interval", "drops", "kept");
     for Row { condition, score, kept, .. } in rows {
         let [low, high] = score.goals_ci95.map(|goals| number(goals, 2));
-        let drops = format!("{:.1} %", 100.0 * score.drop_rate);
-        let (goals, kept) = (number(score.goals, 2), number(*kept, 2));
+        let drops = format!("{} %", measure("drop_rate").text(score["drop_rate"]));
+        let goals = number(score["goals"], 2);
+        let kept = number(*kept, 2);
         text += &format!("{:<30} {goals:>5}  {:<15} {drops:>7} {kept:>6}\n", condition.name, format!("{low} … {high}"));
     }
     text + &format!("\nmean kept over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
@@ -183,8 +184,8 @@ fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
 
 fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
     let bars = rows.iter().filter(|row| !row.condition.is_in_grid()).map(|row| {
-        let nominal = rows[0].score.goals;
-        let note = format!("{:.2} goals, {:.0} % drops", row.score.goals, 100.0 * row.score.drop_rate);
+        let nominal = rows[0].score["goals"];
+        let note = format!("{:.2} goals, {:.0} % drops", row.score["goals"], 100.0 * row.score["drop_rate"]);
         let interval = row.score.goals_ci95.map(|goals| goals / nominal);
         draw::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
     });

@@ -1,7 +1,7 @@
 //! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Description, FIGURES, Lesson, OF_EVALUATIONS, TaskReward, TrainingReward};
+use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, TaskReward, TrainingReward};
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -12,11 +12,16 @@ pub struct Quantity {
     pub description: String,
 }
 
-/// The groups of scores: the prefix of a name, what is added to a title, and the episodes.
-const GROUPS: [(&str, &str, &str); 3] = [
-    ("episode/", "training", "Training episodes that ended in the iteration, without the randomised ones."),
-    ("randomized/", "randomised training", "Randomised training episodes that ended in the iteration."),
-    ("eval/", "evaluation", "Episodes of the task itself with mean actions."),
+/// The groups of scores: the prefix of a name, its measures, what is added to a title, and the episodes.
+const GROUPS: [(&str, &[&str], &str, &str); 3] = [
+    (
+        "episode/",
+        &OF_TRAINING,
+        "training",
+        "Training episodes that ended in the iteration, without the randomised ones.",
+    ),
+    ("randomized/", &OF_TRAINING, "randomised training", "Randomised training episodes that ended in the iteration."),
+    ("eval/", &OF_EVALUATIONS, "evaluation", "Episodes of the task itself with mean actions."),
 ];
 
 /// What is logged besides scores and rewards: name, title, description.
@@ -67,10 +72,21 @@ pub fn quantity(name: &str) -> Option<Quantity> {
     if let Some(description) = description {
         return Some(Quantity { title: format!("{group}: {part}"), description });
     }
-    GROUPS.iter().find_map(|(group, of, episodes)| {
-        let figure = name.strip_prefix(group)?;
-        let of_evaluations = OF_EVALUATIONS.iter().filter(|_| *group == "eval/");
-        let known = FIGURES.iter().chain(of_evaluations).find(|known| known.0 == figure)?;
-        Some(Quantity { title: format!("{}, {of}", known.1), description: format!("{} {episodes}", known.2) })
+    GROUPS.iter().find_map(|(group, measures, of, episodes)| {
+        let column = name.strip_prefix(group).filter(|column| measures.contains(column))?;
+        let measure = MEASURES.iter().find(|measure| measure.column == column)?;
+        let better = match measure.better {
+            Better::Higher => "Higher is better.",
+            Better::Lower => "Lower is better.",
+        };
+        // Charts show a share as a fraction.
+        let unit = match measure.unit {
+            "" | "%" => String::new(),
+            unit => format!(" ({unit})"),
+        };
+        Some(Quantity {
+            title: format!("{}{unit}, {of}", measure.title),
+            description: format!("{} {episodes} {better}", measure.description),
+        })
     })
 }

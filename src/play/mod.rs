@@ -3,6 +3,7 @@
 
 mod actors;
 mod browser;
+mod figures;
 mod files;
 
 use std::process::ExitCode;
@@ -13,17 +14,19 @@ use anyhow::bail;
 #[cfg(not(feature = "viewer"))]
 use anyhow::ensure;
 use anyhow::{Context, Result};
-use serde_json::{Map, Value, json};
+
+pub use self::figures::json_score;
 
 use self::actors::{actor_of, baseline};
 use self::browser::Followed;
+use self::figures::table;
 use self::files::Files;
 use crate::cli::{PlayArgs, Shot, usage_error};
 use crate::config::{Config, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
-use crate::os::{self, Requests, number};
+use crate::os::{self, Requests};
 use crate::repose::{Score, Task};
 use crate::robustness::robustness;
 use crate::run;
@@ -242,94 +245,4 @@ fn film(
 fn episodes(args: &PlayArgs, otherwise: u64) -> Episodes {
     let count = args.episodes.unwrap_or(otherwise) as usize;
     Episodes::scored(args.seed, count)
-}
-
-/// Returns one object with all figures of these scored episodes, as `--json` prints it; those without a value are null.
-pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
-    let reward = Map::from_iter(score.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
-    let mut value = json!({
-        "episodes": score.episodes,
-        "env_steps": score.env_steps,
-        "goals_per_episode": score.goals,
-        "goals_ci95": score.goals_ci95,
-        "in_tolerance": score.in_tolerance,
-        "rot_dist": score.rot_dist,
-        "steps_per_goal": score.steps_per_goal,
-        "seconds_per_goal": score.seconds_per_goal,
-        "success_rate": score.success_rate,
-        "success_rate_5": score.success_rate_5,
-        "turned": score.turned,
-        "drop_rate": score.drop_rate,
-        "episode_length": score.length,
-        "return": score.episode_return,
-        "reward": reward,
-        "diverged": score.diverged,
-        "checkpoint": checkpoint,
-        "seed": seed,
-    });
-    goal_times.named().into_iter().for_each(|(name, known)| value[name] = known);
-    value
-}
-
-/// Formats a table with a row for each figure and a column for each score; two columns fit into 60 characters.
-fn table(columns: &[(&str, Score)]) -> String {
-    let mut text = format!("{:<21}", "");
-    columns.iter().for_each(|(name, _)| text += &format!(" {name:>18}"));
-    let columns: Vec<_> = columns.iter().map(|(_, score)| figures(score)).collect();
-    for (row, (label, _)) in columns[0].iter().enumerate() {
-        text += &format!("\n{label:<21}");
-        columns.iter().for_each(|column| text += &format!(" {:>18}", column[row].1));
-    }
-    text + "\n"
-}
-
-/// Returns the figures of a score with their labels in the table.
-fn figures(score: &Score) -> Vec<(String, String)> {
-    let [low, high] = score.goals_ci95.map(|goals| number(goals, 3));
-    let goals = [("episodes", score.episodes.to_string()), ("goals per episode", number(score.goals, 3))];
-    let interval = (score.episodes > 1).then(|| ("  95 % interval", format!("{low} … {high}")));
-    let others = [
-        ("success rate, %", number(100.0 * score.success_rate, 1)),
-        ("  of five goals, %", number(100.0 * score.success_rate_5, 1)),
-        ("steps in tolerance, %", number(100.0 * score.in_tolerance, 2)),
-        ("rotation error, rad", number(score.rot_dist, 3)),
-        ("turned, rad/100 steps", number(score.turned, 2)),
-        ("steps per goal", number(score.steps_per_goal, 0)),
-        ("seconds per goal", number(score.seconds_per_goal, 2)),
-        ("drop rate, %", number(100.0 * score.drop_rate, 1)),
-        ("episode length, steps", number(score.length, 1)),
-        ("return", number(score.episode_return, 2)),
-    ];
-    let terms = score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2)));
-    let before = goals.into_iter().chain(interval).chain(others).map(|(label, text)| (label.to_owned(), text));
-    before.chain(terms).chain([("diverged episodes".to_owned(), score.diverged.to_string())]).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::repose::EpisodeStats;
-
-    #[test]
-    fn the_json_of_a_score_has_the_documented_keys_and_null_for_what_is_not_known() {
-        let goal_times = GoalTimes::new(&Config::resolve(None, &[]).unwrap().env);
-        let value =
-            json_score(&Score::of(&[EpisodeStats { length: 10, ..Default::default() }], 0.01), &goal_times, None, 3);
-        let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
-        let expected = "episodes env_steps goals_per_episode goals_ci95 in_tolerance rot_dist steps_per_goal \
-                        seconds_per_goal success_rate success_rate_5 turned drop_rate \
-                        episode_length return reward diverged checkpoint seed steps_to_goal drops_first_second steps_fit";
-        assert_eq!(keys.join(" "), expected);
-        assert!(value["steps_per_goal"].is_null() && value["checkpoint"].is_null());
-        assert_eq!(value["reward"].as_object().unwrap().len(), 5);
-        assert_eq!(value["seed"], 3);
-    }
-
-    #[test]
-    fn the_table_has_a_column_for_each_score() {
-        let score = Score::of(&[EpisodeStats { length: 10, goals: 2, ..Default::default() }], 0.01);
-        let text = table(&[("policy", score), ("zero actions", score)]);
-        let goals = text.lines().find(|line| line.starts_with("goals per episode")).unwrap();
-        assert_eq!(goals.matches("2.000").count(), 2, "{text}");
-    }
 }

@@ -11,29 +11,20 @@ use crate::run::{read_metrics, value_at};
 /// The most steps at which figures are compared.
 const MOST_MARKS: usize = 12;
 
-/// A figure: its key in JSON, its column, its head, the factor in the table, and its decimals.
-type Figure = (&'static str, &'static str, &'static str, f64, usize);
-
-const FIGURES: [Figure; 4] = [
-    ("goals", "eval/goals", "goals", 1.0, 2),
-    ("drop_rate", "eval/drop_rate", "drops, %", 100.0, 0),
-    ("rot_dist", "eval/rot_dist", "error, rad", 1.0, 2),
-    ("turned", "training/turned", "turned", 1.0, 2),
-];
-
-/// The number of figures of evaluations. The others are logged in every iteration.
-const OF_EVALUATIONS: usize = 3;
+/// The measures that are compared: the group of columns, and the column in it.
+const COMPARED: [(&str, &str); 4] =
+    [("eval", "goals"), ("eval", "drop_rate"), ("eval", "rot_dist"), ("training", "turned")];
 
 /// Two runs, A and B.
 pub(super) struct Comparison {
     /// The settings in which they differ, or `None` if the settings of one are not known.
     settings: Option<Vec<Difference>>,
     /// Steps, and the figures of both there.
-    rows: Vec<(f64, [[f64; 2]; FIGURES.len()])>,
+    rows: Vec<(f64, [[f64; 2]; COMPARED.len()])>,
 }
 
 /// The points of each figure of a run, over control steps.
-type Curves = [Vec<[f64; 2]>; FIGURES.len()];
+type Curves = [Vec<[f64; 2]>; COMPARED.len()];
 
 impl Comparison {
     /// Compares two runs.
@@ -46,8 +37,9 @@ impl Comparison {
         let mut begin = f64::NEG_INFINITY;
         let row = |step| {
             let figures = std::array::from_fn(|figure| {
-                [&curves[0], &curves[1]].map(|of| match figure {
-                    0..OF_EVALUATIONS => value_at(&of[figure], step).unwrap_or(f64::NAN),
+                [&curves[0], &curves[1]].map(|of| match COMPARED[figure] {
+                    ("eval", _) => value_at(&of[figure], step).unwrap_or(f64::NAN),
+                    // The others are logged in every iteration.
                     _ => mean_between(&of[figure], begin, step),
                 })
             });
@@ -71,13 +63,10 @@ impl Comparison {
         };
         let settings = settings.into_iter().map(|row| row.iter().map(|cell| harmless(cell)).collect());
         let settings: Vec<Vec<String>> = settings.collect();
-        let heads = FIGURES.iter().flat_map(|(_, _, head, ..)| [format!("{head} A"), "B".to_owned()]);
+        let heads = COMPARED.iter().flat_map(|(_, column)| [format!("{column} A"), "B".to_owned()]);
         let heads = ["steps".to_owned()].into_iter().chain(heads).collect();
         let figures = self.rows.iter().map(|(step, figures)| {
-            let both = |((.., factor, decimals), both): (&Figure, &[f64; 2])| {
-                both.map(|value| number(factor * value, *decimals))
-            };
-            let cells = FIGURES.iter().zip(figures).flat_map(both);
+            let cells = figures.iter().flatten().map(|value| number(*value, 2));
             [format!("{step:.0}")].into_iter().chain(cells).collect()
         });
         let figures = if self.rows.is_empty() {
@@ -94,8 +83,8 @@ impl Comparison {
             let both = all.iter().map(|(key, both)| (key.clone(), json!(both)));
             both.collect::<Map<String, Value>>()
         });
-        let row = |(step, figures): &(f64, [[f64; 2]; FIGURES.len()])| {
-            let figures = FIGURES.iter().zip(figures).map(|((key, ..), both)| ((*key).to_owned(), json!(both)));
+        let row = |(step, figures): &(f64, [[f64; 2]; COMPARED.len()])| {
+            let figures = COMPARED.iter().zip(figures).map(|((_, column), both)| ((*column).to_owned(), json!(both)));
             let steps = ("env_steps".to_owned(), json!(*step as u64));
             Value::Object([steps].into_iter().chain(figures).collect())
         };
@@ -112,11 +101,12 @@ fn curves(run: &Run) -> Result<Curves> {
     if !run.has_table() {
         return Ok(Curves::default());
     }
-    let columns = FIGURES.map(|(_, column, ..)| column);
-    let table = read_metrics(&run.path, &["env_steps"], &columns).context("cannot compare")?;
+    let columns = COMPARED.map(|(group, column)| format!("{group}/{column}"));
+    let wanted = columns.each_ref().map(String::as_str);
+    let table = read_metrics(&run.path, &["env_steps"], &wanted).context("cannot compare")?;
     let steps = &table.columns["env_steps"];
     Ok(columns.map(|column| {
-        let values = table.columns.get(column).map_or(&[][..], |values| values);
+        let values = table.columns.get(&column).map_or(&[][..], |values| values);
         let points = steps.iter().zip(values).map(|(step, value)| [*step, *value]);
         points.filter(|point| point.iter().all(|x| !x.is_nan())).collect()
     }))

@@ -3,7 +3,7 @@
 use super::outcome::Outcome;
 use crate::ppo::{Rollout, RolloutBlock};
 use crate::ranks::Exchange;
-use crate::repose::{EpisodeStats, Score};
+use crate::repose::{EpisodeStats, OF_EVALUATIONS, OF_TRAINING, Score};
 use crate::run::{self, Descriptions, Histogram, histogram};
 use crate::tags::quantity;
 
@@ -37,14 +37,14 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     let mut put = |group: &str, values: &mut dyn Iterator<Item = (&'static str, f64)>| {
         row.extend(values.map(|(name, value)| (format!("{group}{name}"), value)));
     };
-    put("episode/", &mut ended.nominal.named().into_iter());
+    put("episode/", &mut ended.nominal.named(OF_TRAINING).into_iter());
     if let Some(randomized) = &ended.randomized {
-        put("randomized/", &mut randomized.named().into_iter());
+        put("randomized/", &mut randomized.named(OF_TRAINING).into_iter());
     }
     put("reward/", &mut steps.task_named());
     put("training/", &mut steps.training_named());
     put("training/", &mut iteration.lesson.named());
-    put("eval/", &mut evaluation.headline());
+    put("eval/", &mut evaluation.named(OF_EVALUATIONS).into_iter());
     put("", &mut iteration.update.named().into_iter());
     put("time/", &mut iteration.time_named().into_iter());
     put("time/", &mut traffic.iter().copied());
@@ -108,18 +108,16 @@ mod tests {
         assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");
     }
 
-    /// The row of the test below: every column with a value of its own.
-    const ROW: &str = "episode/return 110, episode/length 80, episode/goals 2, episode/in_tolerance 0.25, episode/drop_rate 1, \
-        episode/rot_dist 1.5, episode/steps_per_goal 40, reward/rotation 20, reward/distance 21, reward/action 22, \
-        reward/bonus 23, reward/fall 24, training/progress 25, training/approach 31, training/within 26, training/drop 27, \
-        training/turned 32, training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, \
-        training/randomized 0, training/act_moving_average 0.25, training/assist 0, eval/goals 2, \
-        eval/drop_rate 0.3333333333333333, eval/rot_dist 1.5, eval/return 36.666666666666664, \
-        eval/success_rate 0.6666666666666666, eval/success_rate_5 0.3333333333333333, \
-        eval/seconds_per_goal 2.0833333333333335, eval/turned 1.344, loss/policy 1, loss/value 2, policy/entropy 4, \
-        policy/kl 5, policy/first_kl 6, policy/clip_fraction 8, policy/std 10, policy/excess 3, value/explained_variance 11, \
-        optim/learning_rate 12, optim/grad_norm 9, time/collect_s 13, time/update_s 17, time/steps_per_s 2, \
-        time/exchange_s 29, time/exchange_bytes 30, sim/diverged 28";
+    /// The row of the test below between the scores of episodes and of the evaluation, and after them: every column with a value of
+    /// its own.
+    const BETWEEN: &str = "reward/rotation 20, reward/distance 21, reward/action 22, reward/bonus 23, reward/fall 24, \
+        training/progress 25, training/approach 31, training/within 26, training/drop 27, training/turned 32, \
+        training/tolerance 0.1, training/hold 50, training/task_reward 1, training/drop_reward 0, training/randomized 0, \
+        training/act_moving_average 0.25, training/assist 0";
+    const AFTER: &str = "loss/policy 1, loss/value 2, policy/entropy 4, policy/kl 5, policy/first_kl 6, \
+        policy/clip_fraction 8, policy/std 10, policy/excess 3, value/explained_variance 11, optim/learning_rate 12, \
+        optim/grad_norm 9, time/collect_s 13, time/update_s 17, time/steps_per_s 2, time/exchange_s 29, \
+        time/exchange_bytes 30, sim/diverged 28";
 
     /// All logged values are different, so that swapped values are detected.
     #[test]
@@ -153,23 +151,30 @@ mod tests {
         let evaluation = Score::of(&[whole, episode(TaskReward::default(), 200, 1), episode(reward, 50, 0)], 0.01);
         let traffic = [("exchange_s", 29.0), ("exchange_bytes", 30.0)];
         let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
-        let row = |randomizes| {
-            let row = row(&outcome, &ended(randomizes));
+        let row = |ended: &Ended| {
+            let row = row(&outcome, ended);
             row.iter().map(|(name, value)| format!("{name} {value}")).collect::<Vec<_>>().join(", ")
         };
         let names =
             |row: &str| row.split(", ").map(|cell| cell.split_once(' ').unwrap().0.to_owned()).collect::<Vec<_>>();
-        assert_eq!(row(false), ROW);
-        assert_eq!(tags(false), names(ROW));
+        let of = |group: &str, columns: &[&str], score: &Score| {
+            columns.iter().map(|column| format!("{group}/{column} {}", score[*column])).collect::<Vec<_>>().join(", ")
+        };
+        let nominal = ended(false);
+        let episode_columns = of("episode", &OF_TRAINING, &nominal.nominal);
+        let evaluated = of("eval", &OF_EVALUATIONS, &outcome.evaluation);
+        let expected = [&episode_columns, BETWEEN, &evaluated, AFTER].join(", ");
+        assert_eq!(row(&nominal), expected);
+        assert_eq!(tags(false), names(&expected));
         // Randomised episodes are apart, in columns that only such a training has.
-        let apart = "randomized/return 0, randomized/length 200, randomized/goals 8, randomized/in_tolerance 0.25, \
-            randomized/drop_rate 0, randomized/rot_dist 1.5, randomized/steps_per_goal 25, ";
-        let place = ROW.find("reward/").unwrap();
-        let expected = format!("{}{apart}{}", &ROW[..place], &ROW[place..]);
-        assert_eq!(row(true), expected);
+        let both = ended(true);
+        let apart = of("randomized", &OF_TRAINING, &both.randomized.unwrap());
+        assert!(apart.starts_with("randomized/return 0, randomized/length 200, randomized/goals 8"), "{apart}");
+        let expected = [&episode_columns, &apart, BETWEEN, &evaluated, AFTER].join(", ");
+        assert_eq!(row(&both), expected);
         assert_eq!(tags(true), names(&expected));
         let shown =
-            [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, 0.01, true).shown().goals);
+            [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, 0.01, true).shown()["goals"]);
         assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
     }
 }

@@ -25,7 +25,7 @@ use crate::load::scene_option;
 use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
-use crate::repose::{Repose, Score, StepSums, Task, divergence};
+use crate::repose::{HEADLINE, Repose, Score, StepSums, Task, divergence, measure};
 use crate::run::{Hparams, Media, Report};
 use crate::schedule::panic_message;
 #[cfg(feature = "video")]
@@ -234,7 +234,7 @@ impl Session {
 
     /// Records an evaluation, if the score is one, and returns whether it is the best so far.
     fn take_down(&mut self, evaluation: &Score) -> bool {
-        let found = Evaluation { goals: evaluation.goals, rot_dist: evaluation.rot_dist };
+        let found = Evaluation { goals: evaluation["goals"], rot_dist: evaluation["rot_dist"] };
         let improved = found.beats(self.best);
         self.best = if improved { Some(found) } else { self.best };
         // While the critic learns alone, an evaluation cannot rise.
@@ -258,14 +258,10 @@ impl Session {
         })?;
         let Some(score) = played.map(|played| Score::of(&played, ctrl_dt)) else { return Ok(None) };
         if let Some(Lead { report, .. }) = lead {
-            report.say(&format!(
-                "{} steps: evaluation of {} episodes: {:.3} goals/episode, rotation error {:.2} rad, drops {:.0} %",
-                self.agent.env_steps,
-                score.episodes,
-                score.goals,
-                score.rot_dist,
-                100.0 * score.drop_rate
-            ));
+            let found =
+                HEADLINE.map(|column| format!("{} {}", measure(column).label(), measure(column).text(score[column])));
+            let (steps, episodes) = (self.agent.env_steps, score.episodes);
+            report.say(&format!("{steps} steps: evaluation of {episodes} episodes: {}", found.join("; ")));
         }
         Ok(Some(score))
     }
@@ -274,8 +270,9 @@ impl Session {
         let Outcome { iteration, steps, evaluation, media, .. } = outcome;
         let ended = Ended::new(&outcome.ended, self.config.env.ctrl_dt, self.config.randomization.happens());
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
-        let (goals, drop_rate) = (ended.shown().goals, ended.shown().drop_rate);
-        let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation.goals };
+        let goals = ended.shown()["goals"];
+        let drop_rate = ended.shown()["drop_rate"];
+        let status = Status { env_steps, steps_per_s, goals, drop_rate, evaluation: evaluation["goals"] };
         self.diverged += steps.diverged;
         let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
@@ -312,18 +309,17 @@ fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
 
 /// Returns the figures by which a run that ends when evaluations no longer rise is compared with its start.
 fn figures(score: &Score) -> [f64; 3] {
-    [score.goals, score.rot_dist, score.drop_rate]
+    HEADLINE.map(|column| score[column])
 }
 
 /// Returns a table of the first evaluation and the best one.
 fn before_and_after(rise: &Rise, episodes: usize) -> String {
-    let row = |what: &str, of: fn(&[f64; 3]) -> String| {
-        format!("\n  {what:<20} {:>8} {:>8}", of(&rise.before), of(&rise.best))
-    };
     let mut table = format!("  {:<20} {:>8} {:>8}", format!("{episodes} episodes"), "before", "best");
-    table += &row("goals per episode", |[goals, ..]| format!("{goals:.2}"));
-    table += &row("drops", |[.., drops]| format!("{:.1} %", 100.0 * drops));
-    table + &row("rotation error", |[_, error, _]| format!("{error:.2} rad"))
+    for (column, (before, best)) in HEADLINE.into_iter().zip(rise.before.into_iter().zip(rise.best)) {
+        let measure = measure(column);
+        table += &format!("\n  {:<20} {:>8} {:>8}", measure.label(), measure.text(before), measure.text(best));
+    }
+    table
 }
 
 /// The iteration after which there is an early evaluation where the next one would come much later.

@@ -391,7 +391,7 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
         let (task, actor) = (loaded.task(&sets).unwrap(), Actor::Mean(loaded.policy.freeze()));
         let trial = Trial { task: &task, actor: &actor, episodes, stop: &AtomicBool::new(false) };
         let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
-        Score::of(&played, task.config().ctrl_dt).rot_dist
+        Score::of(&played, task.config().ctrl_dt)["rot_dist"]
     };
     assert_eq!(rot_dist(&[]), logged);
     assert_ne!(rot_dist(&["env.friction_scale=0.9"]), logged);

@@ -330,7 +330,7 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
     let said = stderr(&succeeded(run(&["--run-dir", "whole", "--total-steps", "64000"])));
     let (_, end) = said.split_once("evaluations no longer rise: ").expect(&said);
     let table: Vec<&str> = end.lines().skip(1).take(4).map(str::trim).collect();
-    for (line, first) in table.iter().zip(["2 episodes", "goals per episode", "drops", "rotation error"]) {
+    for (line, first) in table.iter().zip(["2 episodes", "goals per episode", "rotation error, rad", "drop rate, %"]) {
         assert!(line.starts_with(first), "{said}");
     }
     let iterations = |text: &str| text.split_once(" iterations").unwrap().0.rsplit(' ').next().unwrap().to_owned();
