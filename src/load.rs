@@ -271,7 +271,7 @@ pub fn for_fork(
 /// # Errors
 /// Fails if the settings of the task or the net are invalid, belong to another policy, or name a scene that no override names.
 pub fn for_playing(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<PolicyConfig> {
-    let config = PolicyConfig::from_text(path, &checkpoint.config, overrides)?;
+    let config = PolicyConfig::from_text(path, &checkpoint.config, checkpoint.progress.env_steps, overrides)?;
     expect_usable(checkpoint, &config.net, &config.env, overrides)?;
     Ok(config)
 }

@@ -26,7 +26,7 @@ impl Trace {
         let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
-            "act_moving_average": config.act_moving_average,
+            "act_moving_average": config.act_moving_average.at(0),
             "success_tolerance": config.success_tolerance,
             "max_consecutive_successes": config.max_consecutive_successes,
             "max_episode_steps": config.max_episode_steps(),

@@ -63,9 +63,8 @@ fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Re
     let about = see::About { title: scene, policy: None, seed: Some(args.seed) };
     let own = sliders.clone();
     let step = move |player: &mut Player| player.step_changed(&ACTORS[actor].2, |action| own.change(action));
-    let smoothing = task.config().act_moving_average;
-    let acting = see::Acting { step: Rc::new(step), policy: None, smoothing };
-    see::Live::open(port, &task, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
+    let acting = see::Acting { step: Rc::new(step), policy: None, task: task.clone() };
+    see::Live::open(port, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }
 
 /// Loads the task, and prints what the settings replace in the user's scene.

@@ -55,11 +55,9 @@ pub(crate) fn resolve(
     let of_task: Vec<Override> = overrides.iter().filter(|set| is_of_task(set)).cloned().collect();
     let task = loaded.task(&of_task)?;
     let whole = if training {
-        // With a trained policy, actions are smoothed as it has learnt it and nothing assists, unless the user sets otherwise.
-        let smoothing = task.config().act_moving_average.to_string();
-        let learnt = [("env.act_moving_average", smoothing), ("training.assist", "0".into())];
-        let learnt = learnt.map(|(key, value)| Override { key: key.into(), value });
-        let overrides: Vec<Override> = learnt.into_iter().chain(overrides).collect();
+        // Nothing assists a trained policy, unless the user sets otherwise.
+        let learnt = Override { key: "training.assist".into(), value: "0".into() };
+        let overrides: Vec<Override> = [learnt].into_iter().chain(overrides).collect();
         load::for_training(&loaded.checkpoint, loaded.origin.path(), &overrides)?
     } else {
         Config::resolve(None, &[])?
@@ -73,5 +71,5 @@ fn is_of_task(set: &Override) -> bool {
 
 /// Returns the settings of a task as JSON: an object of sections.
 pub(crate) fn text(task: &Task) -> String {
-    json!({ "env": task.config(), "hand": task.hand().parts }).to_string()
+    json!({ "env": task.config().at(0), "hand": task.hand().parts }).to_string()
 }

@@ -89,7 +89,7 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
     pool.reset(rollout.first_observations_mut());
     let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let std = config.ppo.std.by_equal_factors(0) as f32;
+    let std = config.ppo.std.at(0) as f32;
     // Returns the seconds that the steps took.
     let mut burst = |pool: &mut EnvPool<RecordingEnv>| {
         let actions = rollout.blocks.iter_mut().flat_map(|block| &mut block.actions);

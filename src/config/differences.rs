@@ -2,7 +2,7 @@
 
 use toml::{Table, Value};
 
-use super::overlay::{brief, is_ramp, settings};
+use super::overlay::{brief, settings};
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig};
 
 /// A setting by its dotted key, and its values in both configurations.
@@ -25,14 +25,14 @@ impl Config {
         differing([self, other].map(Self::settled))
     }
 
-    /// Returns all settings by dotted key, except settings that only divide the work. A constant ramp becomes a number.
+    /// All settings by dotted key, except settings that only divide the work.
     ///
     /// # Panics
     /// Never panics: a configuration is a tree of tables.
     pub fn dotted(&self) -> Table {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
         let of_training = settings(&own).filter(|(key, _)| !matches!(&**key, "run.threads" | "run.shards"));
-        of_training.map(|(key, value)| (key, constant(value).unwrap_or(value).clone())).collect()
+        of_training.map(|(key, value)| (key, value.clone())).collect()
     }
 
     /// Returns these settings without the length of the run and without what depends on the machine.
@@ -44,14 +44,23 @@ impl Config {
 }
 
 impl EnvConfig {
-    /// Returns the settings of the task that differ from the default ones, by dotted key.
+    /// The settings of the task that differ from the default's at its first step, by dotted key.
     ///
     /// # Panics
     /// Never panics: the defaults are valid.
     pub fn unlike_default(&self) -> Table {
+        self.unlike(&Config::resolve(None, &[]).expect("the defaults are valid").env.at(0))
+    }
+
+    /// The settings of the task that differ from those of `other`, by dotted key.
+    ///
+    /// # Panics
+    /// Never panics: the defaults are valid.
+    pub fn unlike(&self, other: &Self) -> Table {
         let default = Config::resolve(None, &[]).expect("the defaults are valid");
-        let own = Config { env: Self { num_envs: default.env.num_envs, ..self.clone() }, ..default.clone() };
-        default.compared_with(&own).into_iter().map(|(key, [_, own])| (key, own)).collect()
+        let num_envs = default.env.num_envs;
+        let [own, other] = [self, other].map(|env| Config { env: Self { num_envs, ..env.clone() }, ..default.clone() });
+        differing([other, own]).into_iter().map(|(key, [_, own])| (key, own)).collect()
     }
 }
 
@@ -61,16 +70,10 @@ fn differing(both: [Config; 2]) -> Vec<Difference> {
     both.map(|((key, own), (_, other))| (key, [own.clone(), other.clone()])).collect()
 }
 
-/// Returns the value of a constant ramp.
-fn constant(value: &Value) -> Option<&Value> {
-    let ramp = value.as_table().filter(|table| is_ramp(table))?;
-    (ramp.get("from") == ramp.get("to") && ramp["steps"] == Value::Integer(0)).then_some(&ramp["from"])
-}
-
 /// Returns a value as `--set` takes it, without spaces.
 pub fn short(value: &Value) -> String {
     let joined = |parts: Vec<String>| parts.join(",");
-    match constant(value).unwrap_or(value) {
+    match value {
         Value::Array(values) => format!("[{}]", joined(values.iter().map(inner).collect())),
         Value::Table(parts) => {
             format!("{{{}}}", joined(parts.iter().map(|(key, value)| format!("{key}={}", inner(value))).collect()))

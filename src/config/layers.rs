@@ -10,8 +10,7 @@ use toml::{Table, Value};
 use super::overlay::{DEFAULTS, lookup, names_scene, overlay, settings, table_of};
 use super::rules::violations;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
-use super::smoothing::{expect_one_smoothing, smoothing_named_alone};
-use super::{BASE, SHIPPED};
+use super::{BASE, Ramp, SHIPPED};
 use crate::os;
 use crate::sim::Parts;
 
@@ -64,7 +63,7 @@ impl Config {
     /// # Errors
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
     pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        over(Table::new(), user.map(Source::table).transpose()?, overrides)
+        layered(Table::new(), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Returns the settings of a task and of its lesson, as [`Config::resolve`] does. Other settings in the user's file are
@@ -78,7 +77,7 @@ impl Config {
             table.retain(|section, _| !matches!(section, "ppo" | "run"));
             table.get_mut("env").and_then(Value::as_table_mut).map(|env| env.remove("num_envs"));
         }
-        over(Table::new(), user, overrides)
+        layered(Table::new(), user, overrides)
     }
 
     /// Returns the settings of a training that begins with a policy of this net. As [`Config::resolve`], but the base has this net.
@@ -87,11 +86,11 @@ impl Config {
     /// Fails as [`Config::resolve`] does.
     pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
         let ppo = Value::try_from(net).expect("the structure of a net is a table");
-        over(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
+        layered(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
     }
 
     /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
-    /// their defaults. A checkpoint holds the smoothing of its moment. The result has the initial smoothing again.
+    /// their defaults.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
@@ -109,7 +108,7 @@ impl Config {
         let mut own = self.clone();
         (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
         let own = Table::try_from(own).expect("a configuration is a tree of tables");
-        let mut changed = over(own, user.map(Source::table).transpose()?, overrides)?;
+        let mut changed = layered(own, user.map(Source::table).transpose()?, overrides)?;
         if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
             changed.run.shards = self.run.shards;
         }
@@ -130,12 +129,12 @@ impl Config {
 }
 
 impl PolicyConfig {
-    /// Reads the settings for playing from the configuration of a run. All training settings are ignored, so that they can be
-    /// added and removed between versions. Values that came from one scene do not apply to another scene.
+    /// Reads the settings for playing from the configuration of a run that has made `env_steps` control steps: its ramps have the
+    /// values of that moment. All training settings are ignored. Values that came from one scene do not apply to another scene.
     ///
     /// # Errors
     /// Fails as [`Config::resolve`] does.
-    pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
+    pub fn from_text(path: &Path, text: &str, env_steps: u64, overrides: &[Override]) -> Result<Self> {
         let source = Source { path: path.into(), text: text.into() };
         let (path, mut table) = source.table()?;
         table.retain(|section, _| matches!(section, "env" | "hand" | "ppo"));
@@ -151,7 +150,13 @@ impl PolicyConfig {
                 "env" | "hand" => true,
                 _ => OF_NETS.contains(&key),
             };
-            keys.as_table_mut().into_iter().for_each(|keys| keys.retain(|key, value| is_used(key, value)));
+            let Some(keys) = keys.as_table_mut() else { continue };
+            keys.retain(|key, value| is_used(key, value));
+            for (_, value) in keys {
+                if let Some(ramp) = Ramp::read(value) {
+                    *value = ramp.at(env_steps).into();
+                }
+            }
         }
         let Config { env, hand, ppo, .. } = layered(Table::new(), Some((path, table)), overrides)?;
         Ok(Self { env, hand, net: ppo.net() })
@@ -190,14 +195,6 @@ impl Source {
     }
 }
 
-/// As [`layered`], with a file that a user has written.
-fn over(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
-    if let Some((path, table)) = &user {
-        expect_one_smoothing(path, table, &under)?;
-    }
-    layered(under, user, overrides)
-}
-
 /// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error
 /// names the file.
 fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
@@ -206,9 +203,6 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     let mut named = BTreeSet::new();
     let mut lay = |table: &Table, merged: &mut Table| {
         named.extend(settings(table).map(|(key, _)| key));
-        if let Some(constant) = smoothing_named_alone(table, merged) {
-            overlay(merged, &constant, &DEFAULTS, "", &mut problems);
-        }
         overlay(merged, table, &DEFAULTS, "", &mut problems);
     };
     [Some(under), given].iter().flatten().for_each(|table| lay(table, &mut merged));
@@ -231,7 +225,6 @@ fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -
     }
     let mut config = Config::deserialize(Value::Table(merged))?;
     let env = &mut config.env;
-    env.act_moving_average = config.training.act_moving_average.by_equal_steps(0);
     if env.model_file().is_some() && !named.contains("randomization.cube_size") {
         config.randomization.cube_size = [1.0; 2];
     }
@@ -277,14 +270,14 @@ mod tests {
     fn a_file_may_set_part_of_a_ramp() {
         let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
         let config = Config::resolve(Some(&file(text)), &[]).unwrap();
-        assert_eq!(config.training.tolerance, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
+        assert_eq!(config.training.tolerance.0, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
     }
 
     #[test]
     fn a_ramp_can_be_set_whole_in_part_or_as_a_constant() {
         let tolerance = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Config::resolve(None, &sets).unwrap().training.tolerance
+            Config::resolve(None, &sets).unwrap().training.tolerance.0
         };
         let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000, after: 0 };
         assert_eq!(tolerance(&[]), default);
@@ -351,7 +344,7 @@ mod tests {
     fn of_the_settings_in_a_policys_file_only_those_of_playing_are_read() {
         let trained = "[env]\nnum_envs = 0\nrot_eps = 0.2\n[ppo]\nhidden = [9]\ngamma = \"much\"\nnot_yet = 1\n\
                        [training]\ngoal_reward = 3\n[of_tomorrow]\nx = 1\n[run]\nseed = -1";
-        let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, sets);
+        let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, 0, sets);
         let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
         assert_eq!((found.env.rot_eps, found.env.sim_dt, found.net.hidden), (0.2, 0.005, vec![9]));
         let whole = Config::resolve(None, &[]).unwrap();

@@ -13,7 +13,6 @@ mod overlay;
 mod ramp;
 mod rules;
 mod settings;
-mod smoothing;
 
 /// The default configuration, with comments.
 pub const BASE: &str = include_str!("../../configs/repose.toml");
@@ -33,7 +32,7 @@ pub const SHIPPED: [(&str, &str); 8] = [
 pub use applicability::expect_used;
 pub use differences::{Difference, short};
 pub use layers::{Override, PolicyConfig, Source, user_file};
-pub use ramp::Ramp;
+pub use ramp::{Geometric, Ramp};
 pub use rules::FARTHEST;
 pub use settings::{
     Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, NetConfig, OfScene, PpoConfig, Precision,
@@ -95,34 +94,38 @@ mod tests {
         let default = Config::resolve(None, &[]).unwrap();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
-        let TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, .. } = training;
-        let [smoothing, assist, drop_reward, tolerance, hold] =
-            [act_moving_average, assist, drop_reward, tolerance, hold].map(ended);
-        let act_moving_average = Ramp::constant(0.6);
-        assert!(act_moving_average.to > smoothing.to);
-        let trained = TrainingConfig { act_moving_average, assist, drop_reward, tolerance, hold, ..training };
+        let smoothing = ended(default.env.act_moving_average);
+        let TrainingConfig { assist, drop_reward, tolerance, hold, .. } = training;
+        let [assist, drop_reward, hold] = [assist, drop_reward, hold].map(ended);
+        let tolerance = Geometric(ended(tolerance.0));
+        let trained = TrainingConfig { assist, drop_reward, tolerance, hold, ..training };
         let minibatches = ppo.minibatches * (ppo.horizon.to / ppo.horizon.from) as usize;
-        let [horizon, desired_kl] = [ppo.horizon, ppo.desired_kl].map(ended);
+        let horizon = ended(ppo.horizon);
+        let desired_kl = Geometric(ended(ppo.desired_kl.0));
         let [std, away_std] = [0.13, 0.2].map(Ramp::constant);
-        assert!(std.to < ppo.std.to && away_std.to < ppo.away_std.to);
-        let learnt = PpoConfig { horizon, std, away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };
+        assert!(std.to < ppo.std.0.to && away_std.to < ppo.away_std.to);
+        let learnt =
+            PpoConfig { horizon, std: Geometric(std), away_std, desired_kl, minibatches, learning_rate: 1e-4, ..ppo };
         let tuning = shipped("finetune");
         let robust = shipped("repose-robust");
         let continuing = shipped("repose-continue");
         let drop_reward = robust.training.drop_reward;
-        let smoother = TrainingConfig { act_moving_average: smoothing, drop_reward, ..trained.clone() };
+        let careless = TrainingConfig { drop_reward, ..trained.clone() };
         let slower = PpoConfig { critic_first: continuing.ppo.critic_first, ..learnt.clone() };
-        let faster = TrainingConfig { act_moving_average: Ramp::constant(0.7), ..trained.clone() };
         let late = |from, to| Ramp { from, to, steps: 1_000_000, after: 4_000_000 };
         let [horizon, std, away_std] =
-            [late(ppo.horizon.from, horizon.to), late(ppo.std.to, std.to), late(ppo.away_std.to, away_std.to)];
+            [late(ppo.horizon.from, horizon.to), late(ppo.std.0.to, std.to), late(ppo.away_std.to, away_std.to)];
         let minibatches = ppo.minibatches;
-        let explores = PpoConfig { horizon, minibatches, critic_first: 20, std, away_std, ..learnt.clone() };
-        for (found, training, ppo) in
-            [(&continuing, &trained, &slower), (&tuning, &faster, &explores), (&robust, &smoother, &learnt)]
-        {
+        let explores =
+            PpoConfig { horizon, minibatches, critic_first: 20, std: Geometric(std), away_std, ..learnt.clone() };
+        let [fast, faster] = [0.6, 0.7].map(Ramp::constant);
+        assert!(fast.to > smoothing.to);
+        for (found, act_moving_average, training, ppo) in [
+            (&continuing, fast, &trained, &slower),
+            (&tuning, faster, &trained, &explores),
+            (&robust, smoothing, &careless, &learnt),
+        ] {
             assert_eq!((&found.training, &found.ppo), (training, ppo));
-            let act_moving_average = training.act_moving_average.to;
             assert_eq!(found.env, EnvConfig { act_moving_average, ..default.env.clone() });
         }
     }
@@ -135,50 +138,19 @@ mod tests {
         text.parse().unwrap()
     }
 
-    fn errors(text: &str) -> String {
-        Config::resolve(None, &[set(text)]).unwrap_err().to_string()
-    }
-
     #[test]
-    fn a_smoothing_that_is_set_alone_holds_for_the_whole_training_and_a_ramp_begins_with_the_one_of_the_task() {
-        let both = |text: &str, sets: &[&str]| {
-            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            let config = Config::resolve(Some(&source(text)), &sets).unwrap();
-            (config.env.act_moving_average, config.training.act_moving_average)
-        };
-        let ramp = Ramp { from: 0.25, to: 0.5, steps: 40_000_000, after: 40_000_000 };
-        let alone = "[env]\nact_moving_average = 1";
-        assert_eq!(both("", &[]), (0.25, ramp));
-        assert_eq!(both("", &["env.act_moving_average=0.6"]), (0.6, Ramp::constant(0.6)));
-        assert_eq!(both(alone, &[]), (1.0, Ramp::constant(1.0)));
-        assert_eq!(both("", &["training.act_moving_average.from=0.3"]), (0.3, Ramp { from: 0.3, ..ramp }));
-        assert_eq!(both(alone, &["training.act_moving_average={from=0.2,to=0.7,steps=9}"]).0, 0.2);
-        let two = BASE.replace("act_moving_average = 0.25 ", "act_moving_average = 0.6 ");
-        let refused = Config::resolve(Some(&source(&two)), &[]).unwrap_err().to_string();
-        assert!(refused.contains("begins with 0.25: set only one of them"), "{refused}");
-        let half = "[env]\nact_moving_average = 0.6\n[training.act_moving_average]\nto = 0.7";
-        let refused = Config::resolve(Some(&source(half)), &[]).unwrap_err().to_string();
-        assert!(refused.contains("= 0.6, but training.act_moving_average begins with 0.25"), "{refused}");
-        assert!(Config::resolve_task(Some(&source(half)), &[]).is_err(), "nor in Python");
-        // What the program writes can be read, even if the ramp takes no steps.
-        let jump = Config::resolve(None, &[set("training.act_moving_average={from=0.2,to=0.7,steps=0}")]).unwrap();
-        assert_eq!(Config::resolve(Some(&source(&jump.to_text())), &[]).unwrap(), jump);
-        assert!(
-            errors("env.act_moving_average=1.5")
-                .contains("env.act_moving_average = 1.5: must be above 0 and at most 1")
-        );
-        assert!(errors("env.act_moving_average=much").contains("env.act_moving_average = \"much\": must be a number"));
-    }
-
-    #[test]
-    fn what_is_stored_in_the_middle_of_a_training_has_the_smoothing_of_its_moment_and_resumes_with_the_first_one() {
+    fn a_ramp_of_the_task_is_stored_whole_and_is_played_with_the_value_that_training_had_reached() {
         let config = Config::resolve(None, &[]).unwrap();
-        let stored = config.at(60_000_000).to_text();
         let path = Path::new("x.safetensors");
-        assert_eq!(PolicyConfig::from_text(path, &stored, &[]).unwrap().env.act_moving_average, 0.375);
-        let played = PolicyConfig::from_text(path, &stored, &[set("env.act_moving_average=0.6")]).unwrap();
-        assert_eq!(played.env.act_moving_average, 0.6);
-        assert_eq!(Config::from_text(path, &stored, &[]).unwrap(), config);
+        let text = config.to_text();
+        assert_eq!(Config::from_text(path, &text, &[]).unwrap(), config);
+        let played = |sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            PolicyConfig::from_text(path, &text, 60_000_000, &sets).unwrap().env.act_moving_average
+        };
+        assert_eq!(played(&[]), Ramp::constant(0.375));
+        assert_eq!(played(&["env.act_moving_average=0.6"]), Ramp::constant(0.6));
+        assert_eq!(config.env.at(0).act_moving_average, Ramp::constant(0.25));
     }
 
     #[test]

@@ -229,8 +229,8 @@ mod tests {
         let sets = sets.into_iter().chain(["env.noise.joint_pos=.01", "training.drop_reward=-.5", "env.model=.5x"]);
         let sets: Vec<_> = sets.map(|set| set.parse().unwrap()).collect();
         let config = Config::resolve(None, &sets).unwrap();
-        assert_eq!((config.ppo.std.to, config.training.drop_reward.to), (0.27, -0.5));
-        assert_eq!((config.randomization.gains, config.training.tolerance.from), ([0.7, 1.6], 0.4));
+        assert_eq!((config.ppo.std.0.to, config.training.drop_reward.to), (0.27, -0.5));
+        assert_eq!((config.randomization.gains, config.training.tolerance.0.from), ([0.7, 1.6], 0.4));
         assert_eq!((config.env.noise["joint_pos"], config.env.model.as_str()), (0.01, ".5x"));
     }
 

@@ -2,11 +2,17 @@
 
 use std::fmt;
 
-use serde::{Deserialize, Serialize};
+use serde::ser::SerializeStruct;
+use serde::{Deserialize, Serialize, Serializer};
+use toml::{Table, Value};
+
+use super::overlay::settings;
+use super::settings::Config;
 
 /// A value that changes to another one over a given number of control steps (counted over all environments) and then stays
-/// constant. It may begin after the first step. A plain number in the settings is a constant.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+/// constant. It may begin after the first step. A linear one changes by the same difference in each step. A constant is a plain number
+/// in the settings.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Ramp {
     /// The value at the first step, and until the ramp begins.
     pub from: f64,
@@ -15,34 +21,34 @@ pub struct Ramp {
     /// The length of the ramp in control steps. At 0, the value is `to` from its first step on.
     pub steps: u64,
     /// The control steps of the run after which the ramp begins.
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default)]
     pub after: u64,
 }
 
 impl Ramp {
-    /// Returns a ramp whose value does not change.
+    /// The ramp that this value of a setting is, unless it is a constant or something else.
+    pub(super) fn read(value: &Value) -> Option<Self> {
+        // As an array of numbers would also be read.
+        value.is_table().then(|| Self::deserialize(value.clone()).ok()).flatten()
+    }
+
+    /// A ramp whose value does not change.
     pub fn constant(value: f64) -> Self {
         Self { from: value, to: value, steps: 0, after: 0 }
     }
 
-    /// Returns the value after `env_steps` control steps. It changes by the same difference in each step.
-    pub fn by_equal_steps(&self, env_steps: u64) -> f64 {
+    /// The value after `env_steps` control steps of the run.
+    pub fn at(&self, env_steps: u64) -> f64 {
         let fraction = self.fraction(env_steps);
         self.from * (1.0 - fraction) + self.to * fraction
     }
 
-    /// Returns the value after `env_steps` control steps. It changes by the same factor in each step.
-    pub fn by_equal_factors(&self, env_steps: u64) -> f64 {
-        let fraction = self.fraction(env_steps);
-        self.from.powf(1.0 - fraction) * self.to.powf(fraction)
-    }
-
-    /// Returns the control steps of the run after which the value does not change any more.
+    /// The control steps of the run after which the value does not change any more.
     pub fn end(&self) -> u64 {
         self.after.saturating_add(self.steps)
     }
 
-    /// Returns the fraction of the ramp that is over, from 0 to 1.
+    /// The fraction of the ramp that is over, from 0 to 1.
     fn fraction(&self, env_steps: u64) -> f64 {
         match env_steps.checked_sub(self.after) {
             None => 0.0,
@@ -52,9 +58,20 @@ impl Ramp {
     }
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
-fn is_zero(steps: &u64) -> bool {
-    *steps == 0
+impl Serialize for Ramp {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if *self == Self::constant(self.to) {
+            return serializer.serialize_f64(self.to);
+        }
+        let mut parts = serializer.serialize_struct("Ramp", 4)?;
+        parts.serialize_field("from", &self.from)?;
+        parts.serialize_field("to", &self.to)?;
+        parts.serialize_field("steps", &self.steps)?;
+        if self.after > 0 {
+            parts.serialize_field("after", &self.after)?;
+        }
+        parts.end()
+    }
 }
 
 impl fmt::Display for Ramp {
@@ -66,29 +83,53 @@ impl fmt::Display for Ramp {
     }
 }
 
+impl Config {
+    /// The settings that change in the course of a run, by dotted key.
+    ///
+    /// # Panics
+    /// Never panics: a configuration is a tree of tables.
+    pub fn ramps(&self) -> Vec<(String, Ramp)> {
+        let own = Table::try_from(self).expect("a configuration is a tree of tables");
+        settings(&own).filter_map(|(key, value)| Some((key, Ramp::read(value)?))).collect()
+    }
+}
+
+/// A ramp that changes by the same factor in each step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Geometric(pub Ramp);
+
+impl Geometric {
+    /// The value after `env_steps` control steps of the run.
+    pub fn at(&self, env_steps: u64) -> f64 {
+        let Self(ramp) = self;
+        let fraction = ramp.fraction(env_steps);
+        ramp.from.powf(1.0 - fraction) * ramp.to.powf(fraction)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::path::Path;
 
-    use super::super::Config;
     use super::*;
 
     #[test]
     fn a_ramp_begins_with_one_value_ends_with_the_other_and_stays_there() {
         let ramp = Ramp { from: 0.4, to: 0.1, steps: 1000, after: 0 };
-        assert_eq!([0, 1000, 9000].map(|steps| ramp.by_equal_steps(steps)), [0.4, 0.1, 0.1]);
-        assert_eq!([0, 1000, 9000].map(|steps| ramp.by_equal_factors(steps)), [0.4, 0.1, 0.1]);
-        assert!((ramp.by_equal_steps(500) - 0.25).abs() < 1e-12);
-        assert!((ramp.by_equal_factors(500) - 0.2).abs() < 1e-12);
+        assert_eq!([0, 1000, 9000].map(|steps| ramp.at(steps)), [0.4, 0.1, 0.1]);
+        assert_eq!([0, 1000, 9000].map(|steps| Geometric(ramp).at(steps)), [0.4, 0.1, 0.1]);
+        assert!((ramp.at(500) - 0.25).abs() < 1e-12);
+        assert!((Geometric(ramp).at(500) - 0.2).abs() < 1e-12);
     }
 
     #[test]
     fn a_ramp_may_begin_later_and_keeps_its_first_value_until_then() {
         let ramp = Ramp { from: 0.0, to: 0.5, steps: 1000, after: 4000 };
-        assert_eq!([0, 3999, 4000, 5000, 9000].map(|steps| ramp.by_equal_steps(steps)), [0.0, 0.0, 0.0, 0.5, 0.5]);
-        assert!((ramp.by_equal_steps(4500) - 0.25).abs() < 1e-12);
+        assert_eq!([0, 3999, 4000, 5000, 9000].map(|steps| ramp.at(steps)), [0.0, 0.0, 0.0, 0.5, 0.5]);
+        assert!((ramp.at(4500) - 0.25).abs() < 1e-12);
         let step = Ramp { steps: 0, ..ramp };
-        assert_eq!([0, 3999, 4000].map(|steps| step.by_equal_steps(steps)), [0.0, 0.0, 0.5]);
+        assert_eq!([0, 3999, 4000].map(|steps| step.at(steps)), [0.0, 0.0, 0.5]);
         assert_eq!([ramp.end(), step.end(), Ramp { after: u64::MAX, ..ramp }.end()], [5000, 4000, u64::MAX]);
         assert_eq!(ramp.to_string(), "{ from = 0, to = 0.5, steps = 1000, after = 4000 }");
     }
@@ -96,9 +137,9 @@ mod tests {
     #[test]
     fn a_ramp_of_no_steps_is_at_its_end_from_the_first_step_on() {
         let ramp = Ramp { from: 0.4, to: 0.1, steps: 0, after: 0 };
-        assert_eq!([ramp.by_equal_steps(0), ramp.by_equal_factors(0), ramp.by_equal_steps(5)], [0.1; 3]);
-        assert_eq!([0, 7].map(|steps| Ramp::constant(0.07).by_equal_factors(steps)), [0.07; 2]);
-        assert_eq!(Ramp::constant(-0.3).by_equal_steps(3), -0.3);
+        assert_eq!([ramp.at(0), Geometric(ramp).at(0), ramp.at(5)], [0.1; 3]);
+        assert_eq!([0, 7].map(|steps| Geometric(Ramp::constant(0.07)).at(steps)), [0.07; 2]);
+        assert_eq!(Ramp::constant(-0.3).at(3), -0.3);
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use toml::{Table, Value};
 
-use super::overlay::{brief, is_ramp, lookup, number, settings};
+use super::overlay::{brief, lookup, number, settings};
 use super::settings::{Backend, Config, Precision};
 use crate::os::shortened;
 use crate::sim::Parts;
@@ -68,9 +68,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     for (key, most) in AT_MOST {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
     }
-    let smoothing = config.training.act_moving_average;
-    let key = if smoothing.from == smoothing.to { "env.act_moving_average" } else { "training.act_moving_average" };
-    rules.number(&table, key, |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1");
+    rules.number(&table, "env.act_moving_average", |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1");
     let limited = ["env.", "training.", "randomization."];
     let [least, most] = IN_F32;
     for (key, value) in settings(&table).filter(|(key, _)| key != "training.hold") {
@@ -173,12 +171,10 @@ fn learning(config: &Config, rules: &mut Rules) {
     let most = config.env.num_envs as f64 * horizon.to;
     rules.check(most <= (1 << 22).into(), "ppo.horizon", horizon, "give at most 2^22 samples (num_envs * horizon)");
     let samples = config.steps_per_iteration() as usize;
-    // Only one of the two applies. A number of minibatches of 0 is reported elsewhere.
-    let by_size = ppo.minibatch_size > 0;
-    let (key, parts) =
-        if by_size { ("ppo.minibatch_size", ppo.minibatch_size) } else { ("ppo.minibatches", ppo.minibatches) };
+    let parts = ppo.minibatches;
+    // A number of 0 is reported elsewhere.
     let divides = parts == 0 || samples.is_multiple_of(parts);
-    rules.check(divides, key, parts, &format!("divide num_envs * horizon = {samples}"));
+    rules.check(divides, "ppo.minibatches", parts, &format!("divide num_envs * horizon = {samples}"));
     let shards = config.run.shards;
     let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
@@ -188,7 +184,7 @@ fn learning(config: &Config, rules: &mut Rules) {
     rules.check(computable, "ppo.precision", precision, "be \"f32\" with ppo.backend = \"candle\"");
     let [low, high] = ppo.learning_rate_range;
     let range = format!("[{low}, {high}]");
-    let kl = ppo.desired_kl;
+    let kl = ppo.desired_kl.0;
     let fixed = [kl.from, kl.to].contains(&0.0);
     rules.check(!fixed || kl.from == kl.to, "ppo.desired_kl", kl, "be above 0 at both ends, or 0 throughout");
     let within = fixed || (low..=high).contains(&ppo.learning_rate);
@@ -211,11 +207,10 @@ impl Rules {
         }
     }
 
-    /// Checks a number, both ends of a ramp, or the numbers of all groups. A constant ramp is checked once.
+    /// Checks a number, both ends of a ramp, or the numbers of all groups.
     fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: &str) {
         let value = lookup(table, key).expect("a setting");
         let numbers = match value.as_table() {
-            Some(ramp) if is_ramp(ramp) && ramp.get("to") == ramp.get("from") => vec![(key.to_owned(), &ramp["to"])],
             // The other parts of a ramp are counts of steps.
             Some(parts) => {
                 let parts = parts.iter().filter(|(_, value)| value.is_float());

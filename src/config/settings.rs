@@ -7,7 +7,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::ramp::Ramp;
+use super::ramp::{Geometric, Ramp};
 use crate::sim::{Cone, Parts};
 
 /// The value of `env.model` for the built-in scene.
@@ -56,7 +56,7 @@ pub struct EnvConfig {
     pub goal_position: OfScene<[f64; 3]>,
     pub target_height: f64,
     pub mirror: bool,
-    pub act_moving_average: f64,
+    pub act_moving_average: Ramp,
     pub rot_reward_scale: f64,
     pub rot_eps: f64,
     pub dist_reward_scale: f64,
@@ -115,14 +115,13 @@ pub enum SuccessHold {
 /// Settings that only training uses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainingConfig {
-    pub act_moving_average: Ramp,
     pub task_reward: Ramp,
     pub progress_reward: f64,
     pub approach_reward: f64,
     pub hold_reward: f64,
     pub drop_reward: Ramp,
     pub assist: Ramp,
-    pub tolerance: Ramp,
+    pub tolerance: Geometric,
     pub hold: Ramp,
     pub goal_lifetime: u64,
 }
@@ -155,7 +154,6 @@ pub struct PpoConfig {
     pub horizon: Ramp,
     pub epochs: usize,
     pub minibatches: usize,
-    pub minibatch_size: usize,
     pub hidden: Vec<usize>,
     pub activation: Activation,
     pub symmetry: Symmetry,
@@ -163,7 +161,7 @@ pub struct PpoConfig {
     pub precision: Precision,
     pub learning_rate: f64,
     pub learning_rate_range: [f64; 2],
-    pub desired_kl: Ramp,
+    pub desired_kl: Geometric,
     pub gamma: f64,
     pub lambda: f64,
     pub clip: f64,
@@ -172,7 +170,7 @@ pub struct PpoConfig {
     pub bounds_coef: f64,
     pub max_grad_norm: f64,
     pub reward_scale: f64,
-    pub std: Ramp,
+    pub std: Geometric,
     pub away_std: Ramp,
     pub away_range: [f64; 2],
 }
@@ -268,16 +266,6 @@ impl Config {
     }
 }
 
-impl Config {
-    /// Returns the settings as they are after `env_steps` control steps of the run. Its task then has the smoothing that is trained
-    /// at that time.
-    pub fn at(&self, env_steps: u64) -> Self {
-        let mut now = self.clone();
-        now.env.act_moving_average = self.training.act_moving_average.by_equal_steps(env_steps);
-        now
-    }
-}
-
 impl PpoConfig {
     /// Returns the structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
@@ -293,14 +281,14 @@ impl PpoConfig {
     /// is the largest multiple of the first horizon that the ramp has reached.
     pub fn horizon_at(&self, env_steps: u64) -> usize {
         let first = self.first_horizon();
-        (self.horizon.by_equal_steps(env_steps) / first as f64 + 1e-9) as usize * first
+        (self.horizon.at(env_steps) / first as f64 + 1e-9) as usize * first
     }
 
     /// Returns the number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
     /// horizons of a run.
     pub fn minibatch_of(&self, samples: usize, horizon: usize) -> usize {
         let in_first = samples / (horizon / self.first_horizon());
-        if self.minibatch_size == 0 { in_first / self.minibatches } else { self.minibatch_size }
+        in_first / self.minibatches
     }
 
     /// Returns how far a value may move from its value at collection time, or infinity if `value_clip` is 0.
@@ -317,6 +305,13 @@ impl RandomizationConfig {
 }
 
 impl EnvConfig {
+    /// The task after `env_steps` control steps of a run: actions are smoothed as much as training has come to smooth them.
+    #[must_use]
+    pub fn at(&self, env_steps: u64) -> Self {
+        let act_moving_average = Ramp::constant(self.act_moving_average.at(env_steps));
+        Self { act_moving_average, ..self.clone() }
+    }
+
     /// Returns the number of physics steps in one control step.
     pub fn substeps(&self) -> usize {
         (self.ctrl_dt / self.sim_dt).round() as usize

@@ -61,7 +61,7 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("config", settings(loaded, config)),
         ("ctrl_dt", config.ctrl_dt.to_string()),
         ("default_joint_pos", offsets),
-        ("ema_alpha", config.act_moving_average.to_string()),
+        ("ema_alpha", config.act_moving_average.at(0).to_string()),
         ("fingertip_names", list(&parts.fingertips)),
         ("goal_name", parts.goal.clone()),
         ("hand", format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())),

@@ -11,7 +11,7 @@ use toml::Table;
 use super::actors::{actor_of, baseline};
 use super::files::PageFile;
 use crate::cli::PlayArgs;
-use crate::config::{Config, Source};
+use crate::config::{Config, Source, short};
 use crate::evaluate::{Actor, Player};
 use crate::load::{Loaded, MODEL, expect_named_scene, for_playing};
 use crate::os::{self, Stamp};
@@ -23,9 +23,6 @@ use crate::sim::Quality;
 
 /// The text for the origin of a built-in policy.
 const BUILT_IN: &str = "built into the program";
-
-/// The key of the smoothing of actions, which changes in the course of a training.
-const SMOOTHING: &str = "env.act_moving_average";
 
 /// Returns what a page says about an actor, the place and the description of its policy, and a seed.
 pub(super) fn about(actor: &str, policy: Option<(&str, &str)>, seed: Option<u64>) -> About {
@@ -86,12 +83,15 @@ pub(super) fn live(
     let (mut about, mut acting) = match &loaded {
         Some(loaded) => {
             let name = actor_of(loaded, args).name();
-            (about(name, Some((&loaded.origin.to_string(), &loaded.name)), Some(args.seed)), acting_of(loaded, args)?)
+            (
+                about(name, Some((&loaded.origin.to_string(), &loaded.name)), Some(args.seed)),
+                acting_of(loaded, args, &task)?,
+            )
         }
         None => {
             let about = about(baseline.name(), None, Some(args.seed));
             let step = Rc::new(move |player: &mut Player| player.step(&baseline));
-            (about, Acting { step, policy: None, smoothing: task.config().act_moving_average })
+            (about, Acting { step, policy: None, task: task.clone() })
         }
     };
     if let Some(followed) = &followed {
@@ -99,7 +99,7 @@ pub(super) fn live(
     }
     let record = loaded.map(|loaded| loaded.record);
     let hands = args.hands.unwrap_or(1) as usize;
-    let live = Live::open(port, &task, (&about, args.shot.camera), hands, &acting, None)?;
+    let live = Live::open(port, (&about, args.shot.camera), hands, &acting, None)?;
     live.show(&mut || {
         if let Some(followed) = &mut followed
             && followed.has_changed()
@@ -107,10 +107,10 @@ pub(super) fn live(
             let newer = Loaded::find(Some(&followed.path), &args.set).and_then(|newer| {
                 let same = Some(&newer.record) == record.as_ref();
                 ensure!(same, "{} is for another hand", followed.path.display());
-                let mut newer = acting_of(&newer, args)?;
+                let mut newer = acting_of(&newer, args, &task)?;
                 // The page shows the settings of the first policy.
-                if newer.smoothing != task.config().act_moving_average {
-                    newer.policy.iter_mut().for_each(|name| *name += &format!(", {SMOOTHING} {}", newer.smoothing));
+                for (key, value) in newer.task.config().unlike(task.config()) {
+                    newer.policy.iter_mut().for_each(|name| *name += &format!(", {key} {}", short(&value)));
                 }
                 Ok(newer)
             });
@@ -123,15 +123,16 @@ pub(super) fn live(
     })
 }
 
-/// Returns the policy as an actor. Its smoothing is part of it: in a training, each checkpoint has its own.
-fn acting_of(loaded: &Loaded, args: &PlayArgs) -> Result<Acting> {
+/// The policy as an actor in this task, in which the actions of each checkpoint of a run are smoothed as it has learnt it.
+fn acting_of(loaded: &Loaded, args: &PlayArgs, task: &Task) -> Result<Acting> {
     let config = for_playing(&loaded.checkpoint, loaded.origin.path(), &args.set)?;
+    let task = task.smoothed_as_in(&config.env);
     let (policy, stochastic) = (FixedPolicy::new(loaded.policy.clone()), args.stochastic);
     let step = move |player: &mut Player| {
         let frozen = policy.frozen();
         player.step(&if stochastic { Actor::Stochastic(frozen) } else { Actor::Mean(frozen) })
     };
-    Ok(Acting { step: Rc::new(step), policy: Some(loaded.name.clone()), smoothing: config.env.act_moving_average })
+    Ok(Acting { step: Rc::new(step), policy: Some(loaded.name.clone()), task })
 }
 
 /// Writes the episodes of the trace in the file `path` as the file `html`.

@@ -19,7 +19,7 @@ pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f
 /// Returns the learning rate of a fork with the settings `config`. It is the configured rate if the user changed it or fixed
 /// it, else the adapted rate within its bounds. The parent had the settings `before` and had adapted it to `rate`.
 pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f64 {
-    if config.desired_kl.to == 0.0 || config.learning_rate != before.learning_rate {
+    if config.desired_kl.0.to == 0.0 || config.learning_rate != before.learning_rate {
         return config.learning_rate;
     }
     let [lowest, highest] = config.learning_rate_range;
@@ -29,7 +29,7 @@ pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Ramp, Symmetry};
+    use crate::config::{Config, Geometric, Ramp, Symmetry};
     use crate::ppo::Ppo;
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
@@ -40,6 +40,7 @@ mod tests {
 
     fn config(learning_rate: f64, desired_kl: Ramp) -> PpoConfig {
         let config = Config::resolve(None, &[]).unwrap().ppo;
+        let desired_kl = Geometric(desired_kl);
         PpoConfig { learning_rate, desired_kl, learning_rate_range: RANGE, ..config }
     }
 

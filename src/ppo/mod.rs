@@ -137,15 +137,15 @@ impl Ppo {
     /// Fails if this machine does not support the configured precision, or if the observations lack the configured
     /// symmetry.
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
-        let policy = Policy::random(&config.net(), spaces, config.std.by_equal_factors(0), seed)?;
+        let policy = Policy::random(&config.net(), spaces, config.std.at(0), seed)?;
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Kernels::new(config, arithmetic)),
             Backend::Candle => Box::new(Reference::new(config)),
         };
         let (gradient, adam) = (vec![0.0; policy.layout.count()], Adam::new(policy.layout.count()));
-        let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.by_equal_factors(0));
-        let away_std = config.away_std.by_equal_steps(0) as f32;
+        let (learning_rate, desired_kl) = (config.learning_rate, config.desired_kl.at(0));
+        let away_std = config.away_std.at(0) as f32;
         let slices = exchange.slices(&norm_chunks(&policy.layout.nets()));
         Ok(Self {
             config: config.clone(),
@@ -189,9 +189,9 @@ impl Ppo {
         if horizon != rollout.horizon() {
             rollout.resize(horizon, &self.policy.spaces);
         }
-        self.desired_kl = self.config.desired_kl.by_equal_factors(env_steps);
-        self.away_std = self.config.away_std.by_equal_steps(env_steps) as f32;
-        self.policy.log_std = self.config.std.by_equal_factors(env_steps).ln() as f32;
+        self.desired_kl = self.config.desired_kl.at(env_steps);
+        self.away_std = self.config.away_std.at(env_steps) as f32;
+        self.policy.log_std = self.config.std.at(env_steps).ln() as f32;
     }
 
     /// Begins a fork of another run after this iteration.

@@ -189,7 +189,7 @@ impl Repose {
         let now = &mut self.now;
         std::mem::swap(&mut now.previous_action, &mut now.action);
         now.action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        self.servos.apply(&now.action, &self.task.hand.actuators, self.lesson.act_moving_average);
+        self.servos.apply(&now.action, &self.task.hand.actuators, &self.lesson);
         self.send();
     }
 

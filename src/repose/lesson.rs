@@ -32,7 +32,7 @@ impl Lesson {
     /// Returns the lesson that is the task itself, as played and scored.
     pub fn task(env: &EnvConfig) -> Self {
         Self {
-            act_moving_average: env.act_moving_average,
+            act_moving_average: env.act_moving_average.at(0),
             assist: 0.0,
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
@@ -48,15 +48,14 @@ impl Lesson {
     pub fn at(env_steps: u64, config: &Config) -> Self {
         let training = &config.training;
         Self {
-            act_moving_average: training.act_moving_average.by_equal_steps(env_steps),
-            assist: training.assist.by_equal_steps(env_steps),
-            // By equal factors: halving the error is equally hard at any size.
-            tolerance: training.tolerance.by_equal_factors(env_steps),
-            hold: training.hold.by_equal_steps(env_steps).round() as u32,
+            act_moving_average: config.env.act_moving_average.at(env_steps),
+            assist: training.assist.at(env_steps),
+            tolerance: training.tolerance.at(env_steps),
+            hold: training.hold.at(env_steps).round() as u32,
             redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
             goals_end: true,
-            randomized: config.randomization.share.by_equal_steps(env_steps),
-            task_reward: training.task_reward.by_equal_steps(env_steps),
+            randomized: config.randomization.share.at(env_steps),
+            task_reward: training.task_reward.at(env_steps),
             weights: training_weights(training, env_steps),
         }
     }

@@ -187,7 +187,7 @@ pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> Training
 pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
     Terms::new(TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
-        Weight::Ramp(_, ramp) => ramp(training).by_equal_steps(env_steps),
+        Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
     }))
 }
 

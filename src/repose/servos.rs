@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use super::Lesson;
 use crate::sim::Actuator;
 
 /// The targets of the servos of one hand: for each actuator in action order, in the unit of its control range.
@@ -29,9 +30,9 @@ impl Servos {
         self.due.copy_from_slice(&self.targets);
     }
 
-    /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect. `alpha` is the weight of an action
-    /// in the smoothed targets.
-    pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], alpha: f64) {
+    /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect.
+    pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], lesson: &Lesson) {
+        let alpha = lesson.act_moving_average;
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
             let asked = low + (f64::from(*action) + 1.0) / 2.0 * (high - low);

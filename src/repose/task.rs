@@ -98,8 +98,10 @@ impl Task {
         Ok(Arc::new(Self { scene, hand, ..self.clone() }))
     }
 
-    /// Returns the same task with this smoothing of the actions.
-    pub fn smoothed(&self, act_moving_average: f64) -> Arc<Self> {
+    /// The same task, in which actions are smoothed as in `other`.
+    #[must_use]
+    pub fn smoothed_as_in(&self, other: &EnvConfig) -> Arc<Self> {
+        let act_moving_average = other.act_moving_average;
         Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
     }
 

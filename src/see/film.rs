@@ -152,7 +152,7 @@ impl EpisodeFilms {
             self.frames.draw_due(&moment, |frame| frames.push(frame))
         };
         let one = Episodes { count: 1, ..episodes };
-        let task = self.task.smoothed(task.config().act_moving_average);
+        let task = self.task.smoothed_as_in(task.config());
         let played = Trial { task: &task, actor, episodes: one, stop }.play(&mut observe)?;
         played.map(|_| Ok(Animation { size: ANIMATION.size, gif: gif_of(frames, ANIMATION)? })).transpose()
     }

@@ -34,13 +34,12 @@ pub struct Acting {
     pub step: Rc<Stepping>,
     /// The page's name for the policy, if it differs from the name for the whole page.
     pub policy: Option<String>,
-    /// The smoothing of its actions: `env.act_moving_average` of its task.
-    pub smoothing: f64,
+    /// The task that it acts in.
+    pub task: Arc<Task>,
 }
 
 /// Hands on a page of this machine.
 pub struct Live {
-    task: Arc<Task>,
     columns: Columns,
     server: Server,
     sliders: Option<Sliders>,
@@ -69,12 +68,12 @@ impl Live {
     /// Fails if the port cannot be opened.
     pub fn open(
         port: u16,
-        task: &Arc<Task>,
         (about, camera): (&About, Option<Camera>),
         hands: usize,
         acting: &Acting,
         sliders: Option<Sliders>,
     ) -> Result<Self> {
+        let task = &acting.task;
         let mut columns = Columns::new(task, camera);
         let every = (BETWEEN_ROWS / task.config().ctrl_dt).round().max(1.0) as u64;
         let mut more = json!({ "live": true, "hands": hands, "every": every });
@@ -97,13 +96,15 @@ impl Live {
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
         ));
-        Ok(Self { task: task.clone(), columns, server, sliders, key, every, episodes, hands })
+        Ok(Self { columns, server, sliders, key, every, episodes, hands })
     }
 
     /// Shows the hands for as long as the program runs. `next` says who acts in each further episode.
     pub fn show(mut self, next: &mut dyn FnMut() -> Acting) -> ! {
-        let (start, mut clock, mut steps, mut begun) =
-            (Instant::now(), Clock::new(self.task.config().ctrl_dt), 0_u64, self.hands.len());
+        let start = Instant::now();
+        let mut clock = Clock::new(self.hands[0].acting.task.config().ctrl_dt);
+        let mut steps = 0_u64;
+        let mut begun = self.hands.len();
         loop {
             if self.server.wait_for_reader() {
                 clock.pause();
@@ -133,8 +134,7 @@ impl Live {
 
     fn begin(&mut self, hand: usize, episode: usize, acting: Acting) {
         let own = &mut self.hands[hand];
-        let task = self.task.smoothed(acting.smoothing);
-        own.player = Player::new(&task, Episodes { first: episode, ..self.episodes });
+        own.player = Player::new(&acting.task, Episodes { first: episode, ..self.episodes });
         (own.acting, own.episode, own.has_ended) = (acting, episode, false);
         own.reward = TaskReward::default();
         let mut about = own.about(self.episodes.seed);
@@ -197,15 +197,20 @@ mod tests {
     use crate::config::Config;
 
     #[test]
-    fn each_episode_has_the_smoothing_of_the_policy_that_acts() {
-        let config = Config::resolve(None, &[]).unwrap();
-        let task = Task::new(&config.env, &config.hand).unwrap();
-        let acting = |smoothing| Acting { step: Rc::new(|_| None), policy: None, smoothing };
+    fn each_episode_is_played_in_the_task_of_the_policy_that_acts() {
+        let task = |sets: &[&str]| {
+            let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
+            let config = Config::resolve(None, &sets).unwrap();
+            Task::new(&config.env, &config.hand).unwrap()
+        };
+        let acting = |task: &Arc<Task>| Acting { step: Rc::new(|_| None), policy: None, task: task.clone() };
         let about = About { title: "A hand".into(), policy: None, seed: None };
-        let mut live = Live::open(0, &task, (&about, None), 1, &acting(0.25), None).unwrap();
-        let smoothing = |live: &Live| live.hands[0].player.env().config().act_moving_average;
-        assert_eq!(smoothing(&live), 0.25);
-        live.begin(0, 1, acting(0.8));
-        assert_eq!((smoothing(&live), live.hands[0].episode), (0.8, 1));
+        let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
+        let mut live = Live::open(0, (&about, None), 1, &acting(&first), None).unwrap();
+        let seconds = |live: &Live| live.hands[0].player.env().config().max_episode_seconds;
+        assert_eq!(seconds(&live), 10.0);
+        live.begin(0, 1, acting(&second));
+        assert_eq!(seconds(&live), 3.0);
+        assert_eq!(live.hands[0].episode, 1);
     }
 }

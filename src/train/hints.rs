@@ -32,7 +32,7 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
     }
     let models = scene.saturating_mul(env.num_envs);
     let share = config.randomization.share;
-    let randomizes = [0, total].into_iter().any(|steps| share.by_equal_steps(steps) > 0.0);
+    let randomizes = [0, total].into_iter().any(|steps| share.at(steps) > 0.0);
     let mut usual = default.randomization.clone();
     if config.env.model_file().is_some() {
         // By default, the size of an own object does not vary.
@@ -47,30 +47,22 @@ pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<Stri
             "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
              (randomization.share=0 avoids this)",
             env.num_envs,
-            if share.by_equal_steps(0) > 0.0 { 0 } else { share.after }
+            if share.at(0) > 0.0 { 0 } else { share.after }
         ));
     }
     hints
 }
 
-/// Returns a note about the ramps that are longer than the training, if there are any.
+/// Ramps that may still grow at the end of a run: the penalty for drops and the share of randomised episodes.
+const MAY_GROW: [&str; 2] = ["training.drop_reward", "randomization.share"];
+
+/// A note about the ramps that are longer than the training run, if there are any.
 fn of_ramps(config: &Config) -> Option<String> {
-    let (training, ppo, total) = (&config.training, &config.ppo, config.run.total_steps);
-    // The penalty for drops and the share of randomised episodes may still grow at the end.
-    let ramps = [
-        ("training.act_moving_average", training.act_moving_average),
-        ("training.assist", training.assist),
-        ("training.task_reward", training.task_reward),
-        ("training.tolerance", training.tolerance),
-        ("training.hold", training.hold),
-        ("ppo.horizon", ppo.horizon),
-        ("ppo.std", ppo.std),
-        ("ppo.away_std", ppo.away_std),
-        ("ppo.desired_kl", ppo.desired_kl),
-    ];
-    let cut: Vec<_> = ramps.into_iter().filter(|(_, ramp)| ramp.from != ramp.to && ramp.end() > total).collect();
+    let total = config.run.total_steps;
+    let mut cut = config.ramps();
+    cut.retain(|(key, ramp)| ramp.from != ramp.to && ramp.end() > total && !MAY_GROW.contains(&&**key));
     let longest = cut.iter().map(|(_, ramp)| ramp.end()).max()?;
-    let names: Vec<&str> = cut.iter().map(|(name, _)| *name).collect();
+    let names: Vec<String> = cut.into_iter().map(|(key, _)| key).collect();
     Some(format!(
         "run.total_steps = {total} is shorter than the ramps of {}, which last up to {longest} steps",
         names.join(", ")
@@ -93,7 +85,7 @@ mod tests {
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
-        let ramps = "training.act_moving_average, training.tolerance, training.hold, ppo.horizon";
+        let ramps = "env.act_moving_average, training.tolerance, training.hold, ppo.horizon";
         assert!(line.contains(&format!("{ramps}, which last up to 80000000 steps")), "{line}");
         assert!(!line.contains("assist"), "its ramp ends in time: {line}");
         assert!(hints_for(&["run.total_steps=9000000"])[0].contains("training.assist"));

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use rand_distr::{Distribution, Normal};
 use rayon::prelude::*;
 
+use crate::config::EnvConfig;
 use crate::env::Env;
 use crate::quat;
 use crate::repose::{Repose, Task};
@@ -18,13 +19,12 @@ const SETTLING: usize = 60;
 /// The standard deviation of the actions. An untrained policy has the same by default.
 const STD: f32 = 0.6;
 
-/// The mobility of the built-in hand with this smoothing of the actions, rad in 100 steps.
+/// The mobility of the built-in hand in the default task, rad in 100 steps.
 const OF_BUILTIN: f64 = 3.6;
-const SMOOTHING: f64 = 0.25;
 
-/// Measures the mobility of a task's hand, and returns a sentence about it.
-pub(super) fn mobility(task: &Arc<Task>) -> String {
-    let task = &task.smoothed(SMOOTHING);
+/// A sentence about the mobility of a task's hand, whose actions are smoothed as in the `default` task.
+pub(super) fn mobility(task: &Arc<Task>, default: &EnvConfig) -> String {
+    let task = &task.smoothed_as_in(default);
     let played = (0..EPISODES).into_par_iter().map(|episode| play(task, episode));
     let (turned, steps, drops) = played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
     let (rate, object) = (100.0 * turned / f64::from(steps.max(1)), &task.hand().parts.object);

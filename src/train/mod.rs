@@ -74,9 +74,10 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     os::say(&format!("run folder: {place}"));
     session.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.quiet {
-        let hints = hints(&session.config, &Config::resolve(None, &[])?, session.task.scene().size());
+        let default = Config::resolve(None, &[])?;
+        let hints = hints(&session.config, &default, session.task.scene().size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
-        let mobility = own_scene.then(|| mobility(&session.task));
+        let mobility = own_scene.then(|| mobility(&session.task, &default.env));
         session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
     }
     let mut report = new_report(&session, &saver, args.quiet);
@@ -200,9 +201,9 @@ impl Session {
         Some(media)
     }
 
-    /// Returns the task with its present smoothing.
+    /// The task as far as training has come.
     fn task_now(&self) -> Arc<Task> {
-        self.task.smoothed(self.config.at(self.agent.env_steps).env.act_moving_average)
+        self.task.smoothed_as_in(&self.config.env.at(self.agent.env_steps))
     }
 
     fn evaluation_episodes(&self) -> Episodes {
@@ -280,7 +281,7 @@ impl Session {
             self.warned = true;
             report.warn(&warning);
         }
-        let desired_kl = self.config.ppo.desired_kl.by_equal_factors(env_steps);
+        let desired_kl = self.config.ppo.desired_kl.at(env_steps);
         let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
         self.far = if is_far { self.far.saturating_add(1) } else { 0 };
         if self.far == FAR_FOR {

@@ -139,7 +139,7 @@ impl Session {
 
     /// Returns the complete state at the end of the last iteration.
     pub(super) fn checkpoint(&self) -> Checkpoint {
-        let mut checkpoint = self.agent.checkpoint(&self.config.at(self.agent.env_steps).to_text(), self.best);
+        let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
         checkpoint.progress.rise = self.rise;
         checkpoint.scene = Some(self.scene.clone());
         checkpoint.hand = Some(self.hand.to_text());

@@ -538,7 +538,7 @@ fn live_reads(live: &Live) -> bool {
 fn a_training_is_followed_by_its_newest_policy_and_is_not_changed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let ramp = ["--set", "training.act_moving_average={from=0.2,to=0.8,steps=200}"];
+    let ramp = ["--set", "env.act_moving_average={from=0.2,to=0.8,steps=200}"];
     succeeded(program(folder, &train(&[&ramp[..], &["--total-steps", "128", "--run-dir", "run"]].concat())));
     let before = names(&folder.join("run"));
     let live = Live::start(folder, &["play", "--ckpt", "run", "--web", "0", "--follow", "--plain"]);

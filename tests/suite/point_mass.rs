@@ -3,7 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::{Backend, PpoConfig, Precision, Ramp};
+use shadow_repose::config::{Backend, Geometric, PpoConfig, Precision, Ramp};
 use shadow_repose::env::{End, Env, Transition};
 use shadow_repose::ppo::Ppo;
 use shadow_repose::ranks::Exchange;
@@ -150,14 +150,14 @@ fn ppo_learns_in_bf16_where_the_processor_has_it() {
 #[test]
 fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
     let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
-    let settings = PpoConfig { std, ..settings() };
+    let settings = PpoConfig { std: Geometric(std), ..settings() };
     let mut ppo = Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).unwrap();
     assert!((ppo.policy().std() - 0.5).abs() < 1e-6);
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
         ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
         assert!((ppo.policy().std() - expected).abs() < 1e-6, "{env_steps}");
     }
-    let at_once = PpoConfig { std: Ramp { steps: 0, ..std }, ..settings };
+    let at_once = PpoConfig { std: Geometric(Ramp { steps: 0, ..std }), ..settings };
     let ppo = Ppo::new(&at_once, SPACES, 0, Exchange::alone(1)).unwrap();
     assert!((ppo.policy().std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
 }
@@ -186,7 +186,7 @@ fn while_the_critic_learns_alone_the_policy_stands_still() {
 #[test]
 fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone() {
     let moved = |critic_first: u64| {
-        let settings = PpoConfig { critic_first, desired_kl: Ramp::constant(0.0), ..settings() };
+        let settings = PpoConfig { critic_first, desired_kl: Geometric(Ramp::constant(0.0)), ..settings() };
         let mut agent = agent(&settings, 3);
         (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
         let actor = |agent: &Agent<PointMass>| {

@@ -250,23 +250,3 @@ fn the_number_of_shards_is_the_largest_power_of_two_that_fits_or_the_one_that_is
         assert!(refused.contains("run.shards") && refused.contains("a power of two that divides"), "{refused}");
     }
 }
-
-#[test]
-fn a_minibatch_may_be_given_by_its_size_so_that_more_hands_make_more_gradient_steps() {
-    let small = ["ppo.hidden=[16]", "ppo.horizon=8", "env.max_episode_seconds=0.1"];
-    let after = |more: &[&str]| {
-        let config = config(&[&small, more].concat());
-        let task = Task::new(&config.env, &config.hand).unwrap();
-        let mut agent = started_agent(&task, &config);
-        agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
-        let mut end = agent.checkpoint("", None);
-        (end.take_counters("adam.steps").unwrap()[0], learnt(&mut agent, 1))
-    };
-    let by_number = after(&["env.num_envs=16", "ppo.minibatches=2"]);
-    let by_size = after(&["env.num_envs=16", "ppo.minibatches=4", "ppo.minibatch_size=64"]);
-    assert!(by_size == by_number, "128 samples are two times 64");
-    let doubled = after(&["env.num_envs=32", "ppo.minibatch_size=64"]);
-    assert_eq!((by_size.0, doubled.0), (8, 16), "four epochs");
-    let refused = Config::resolve(None, &["ppo.minibatch_size=1000".parse().unwrap()]).unwrap_err().to_string();
-    assert!(refused.contains("ppo.minibatch_size = 1000: must divide num_envs * horizon = 16384"), "{refused}");
-}

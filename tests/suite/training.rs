@@ -4,8 +4,9 @@ use std::fs;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::Symmetry;
+use shadow_repose::config::{Override, Ramp, Symmetry};
 use shadow_repose::env::{End, Env, EnvPool};
+use shadow_repose::load::Loaded;
 use shadow_repose::ppo::{Checkpoint, Perception};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::ranks::Exchange;
@@ -410,12 +411,12 @@ fn a_settings_file_of_the_program_can_be_named_in_any_folder_and_an_own_one_of_i
 }
 
 #[test]
-fn the_smoothing_follows_its_ramp_in_training_and_is_stored_with_each_checkpoint() {
+fn the_smoothing_follows_its_ramp_in_training_and_a_policy_plays_with_the_value_of_its_checkpoint() {
     let task = task(&[]);
     // How far the first target goes towards the end of the range that is asked for.
     let moved = |env_steps: u64| {
         let mut env = Repose::new(&task);
-        env.set_lesson(lesson(env_steps, &["training.act_moving_average={from=0.25,to=0.75,steps=100}"]));
+        env.set_lesson(lesson(env_steps, &["env.act_moving_average={from=0.25,to=0.75,steps=100}"]));
         let mut observation = start(&mut env, 0);
         let before = env.simulation().ctrl().to_vec();
         let _ = env.step(&[1.0; 20], &mut observation);
@@ -424,11 +425,18 @@ fn the_smoothing_follows_its_ramp_in_training_and_is_stored_with_each_checkpoint
     assert!((moved(100) / moved(0) - 3.0).abs() < 1e-6 && (moved(50) / moved(0) - 2.0).abs() < 1e-6);
 
     let folder = tempfile::tempdir().unwrap();
-    let ramp = ["--set", "training.act_moving_average={from=0.2,to=0.8,steps=200}", "--total-steps", "256"];
+    let ramp = ["--set", "env.act_moving_average={from=0.2,to=0.8,steps=200}", "--total-steps", "256"];
     succeeded(program(folder.path(), &train(&[&ramp[..], &["--run-dir", "run"]].concat())));
-    let latest = fs::read(folder.path().join("run/checkpoints/latest.safetensors")).unwrap();
-    let stored = Checkpoint::parse(&latest).unwrap().config;
-    let of = |text: &str| text.parse::<toml::Table>().unwrap()["env"]["act_moving_average"].as_float().unwrap();
-    assert_eq!(of(&stored), 0.8);
-    assert_eq!(of(&fs::read_to_string(folder.path().join("run/config.toml")).unwrap()), 0.2);
+    let latest = folder.path().join("run/checkpoints/latest.safetensors");
+    let played = |sets: &[Override]| Loaded::find(Some(&latest), sets).unwrap().task(sets).unwrap();
+    assert_eq!(played(&[]).config().act_moving_average, Ramp::constant(0.8));
+    assert_eq!(
+        played(&["env.act_moving_average=0.4".parse().unwrap()]).config().act_moving_average,
+        Ramp::constant(0.4)
+    );
+    let stored = Checkpoint::parse(&fs::read(&latest).unwrap()).unwrap().config;
+    assert!(
+        stored.contains("act_moving_average = { from = 0.2, to = 0.8, steps = 200 }"),
+        "the ramp goes on: {stored}"
+    );
 }
