@@ -15,6 +15,8 @@ import importlib
 import os
 import sys
 
+from ._registration import register
+
 TYPE_CHECKING = False  # as in `typing`, which takes longer to import than all of this
 if TYPE_CHECKING:
     from typing import Any
@@ -54,17 +56,6 @@ def _load() -> Any:
 _expect_avx()
 if not TYPE_CHECKING:
     _native = _load()
-
-def register() -> None:
-    """Registers `ShadowRepose-v0` for `gymnasium.make` and `gymnasium.make_vec`.
-
-    This happens by itself if Gymnasium is imported before this package, or if `shadow_repose.envs` is imported.
-    """
-    from gymnasium.envs import registration
-
-    if "ShadowRepose-v0" not in registration.registry:
-        registration.register("ShadowRepose-v0", entry_point="shadow_repose.envs:Env", vector_entry_point="shadow_repose.envs:VectorEnv")
-
 
 if "gymnasium" in sys.modules:
     register()

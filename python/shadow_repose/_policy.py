@@ -15,8 +15,6 @@ from ._settings import absolute, flat, number, pairs
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from .envs import VectorEnv
-
 
 BUILT_IN = ("builtin", "robust")
 """The policies that come with the package."""
@@ -26,7 +24,7 @@ class Policy:
     """A trained policy: it maps raw observations to actions. Create one by `Policy.load`.
 
     A policy belongs to the settings of its task, above all `env.act_moving_average`. In environments with other settings it scores
-    worse. Create them by `policy.make_env()` or `VectorEnv(policy=policy)`.
+    worse. Create them by `VectorEnv(policy=policy)`.
     """
 
     def __init__(self, native: _native.Policy) -> None:
@@ -94,12 +92,6 @@ class Policy:
     def std(self) -> np.ndarray:
         """The standard deviation `[A]` of its actions in training, float32."""
         return np.full(self._native.sizes()[1], self._native.std, np.float32)
-
-    def make_env(self, num_envs: int = 64, **options: Any) -> VectorEnv:
-        """Returns `VectorEnv(num_envs, policy=self, **options)`: environments of the task that it was trained for."""
-        from .envs import VectorEnv
-
-        return VectorEnv(num_envs, policy=self, **options)
 
     def __reduce__(self) -> Any:
         return _reload, (os.fspath(self._native.place), self._set, self._checksum)

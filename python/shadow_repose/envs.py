@@ -12,8 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from . import _native, register
+from . import _native
 from ._policy import Policy
+from ._registration import register
 from ._settings import absolute, flat, number, pairs
 
 if TYPE_CHECKING:

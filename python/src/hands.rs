@@ -17,10 +17,13 @@ use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, Randomization, Repose, StepDetails, Task, TaskReward, TrainingReward};
 
 use crate::episodes::columns;
+use crate::errors::{guarded, refused};
 use crate::policy::Policy;
 use crate::settings::{Set, overrides, resolve, text};
 use crate::workers::Workers;
-use crate::{guarded, refused};
+
+/// The most environments, as in a training run.
+const MOST_HANDS: usize = 65536;
 
 /// N environments of one task, with O values in an observation and A in an action.
 #[pyclass(frozen, module = "shadow_repose._native")]
@@ -197,8 +200,17 @@ impl Hands {
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
             let overrides = overrides(set, training)?;
-            let policy = policy.as_ref().map(|policy| policy.get());
-            let (config, task) = resolve(count, config.as_deref(), policy, &overrides, training)?;
+            ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
+            let (config, task) = match &policy {
+                None => resolve(config.as_deref(), &overrides)?,
+                Some(policy) => {
+                    ensure!(
+                        config.is_none(),
+                        "give config or policy, not both: a policy brings the settings of its task"
+                    );
+                    policy.get().resolve(&overrides, training)?
+                }
+            };
             let randomization = if training { Randomization::new(&task, &config.randomization)? } else { None };
             let hand = |_| {
                 let goes_on = !stop.load(std::sync::atomic::Ordering::Relaxed);

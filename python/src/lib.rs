@@ -5,17 +5,12 @@
 //! a `RuntimeError`. No call waits for a lock that another thread of the user may hold: the second call fails.
 
 mod episodes;
+mod errors;
 mod hands;
 mod policy;
 mod settings;
 mod workers;
 
-use std::any::Any;
-use std::io::ErrorKind;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-
-use anyhow::Error;
-use pyo3::exceptions::{PyFileNotFoundError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 
 /// The module.
@@ -32,31 +27,6 @@ mod _native {
         flush_before_the_end();
         Ok(())
     }
-}
-
-/// Returns an error about the user's input.
-fn refused(error: Error) -> PyErr {
-    let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
-    let kind = kinds.map(std::io::Error::kind).next();
-    // The library's messages name options of its command line.
-    let text =
-        format!("{error:#}").replace("--mirror plays", "set={\"env.mirror\": True} plays").replace("--set ", "set ");
-    match kind {
-        Some(ErrorKind::NotFound) => PyFileNotFoundError::new_err(text),
-        Some(ErrorKind::PermissionDenied) => PyPermissionError::new_err(text),
-        _ => PyValueError::new_err(text),
-    }
-}
-
-/// Does the work. A panic becomes an error that `except Exception` catches.
-fn guarded<T>(work: impl FnOnce() -> T) -> PyResult<T> {
-    // Unwind safe: what a panic left inconsistent is not used again.
-    catch_unwind(AssertUnwindSafe(work)).map_err(|panic| panicked(&*panic))
-}
-
-fn panicked(panic: &(dyn Any + Send)) -> PyErr {
-    let message = shadow_repose::schedule::panic_message(panic);
-    PyRuntimeError::new_err(format!("internal error: {message}"))
 }
 
 /// A fatal error of MuJoCo ends the process, so what Python has buffered is written first.

@@ -1,29 +1,30 @@
 //! Trained policies, and their scores.
 
 use std::path::PathBuf;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 
+use anyhow::Result;
 use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use shadow_repose::config::Override;
+use shadow_repose::config::{Config, Override};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
-use shadow_repose::load::Loaded;
+use shadow_repose::load::{self, Loaded};
 use shadow_repose::os::OutputFile;
 use shadow_repose::play::json_score;
 use shadow_repose::ppo::{FixedPolicy, GROUP};
-use shadow_repose::repose::Score;
+use shadow_repose::repose::{Score, Task};
 use shadow_repose::run;
 use shadow_repose::spaces::Spaces;
 use shadow_repose::trace::Trace;
 
+use crate::errors::{guarded, refused};
 use crate::settings::{Set, overrides, resolve, text};
 use crate::workers::Workers;
-use crate::{guarded, refused};
 
 /// The threads that compute large batches of actions.
 static WORKERS: Mutex<Option<Workers>> = Mutex::new(None);
@@ -39,13 +40,28 @@ pub(crate) struct Policy {
 }
 
 impl Policy {
-    pub(crate) fn loaded(&self) -> &Loaded {
-        &self.loaded
+    /// The settings with which it was loaded, and then these.
+    fn with(&self, overrides: &[Override]) -> Vec<Override> {
+        [&self.set, overrides].concat()
     }
 
-    /// Returns the settings with which it was loaded, and then these.
-    pub(crate) fn with(&self, overrides: &[Override]) -> Vec<Override> {
-        [&self.set, overrides].concat()
+    /// The settings and the task of environments for this policy. With `training`, nothing assists it, unless the user sets otherwise.
+    ///
+    /// # Errors
+    /// Fails if the settings are invalid, or if the scene cannot be used.
+    pub(crate) fn resolve(&self, overrides: &[Override], training: bool) -> Result<(Config, Arc<Task>)> {
+        let overrides = self.with(overrides);
+        let is_of_task = |set: &&Override| matches!(set.key.split('.').next(), Some("env" | "hand"));
+        let of_task: Vec<Override> = overrides.iter().filter(is_of_task).cloned().collect();
+        let task = self.loaded.task(&of_task)?;
+        let whole = if training {
+            let learnt = Override { key: "training.assist".into(), value: "0".into() };
+            let overrides: Vec<Override> = [learnt].into_iter().chain(overrides).collect();
+            load::for_training(&self.loaded.checkpoint, self.loaded.origin.path(), &overrides)?
+        } else {
+            Config::resolve(None, &[])?
+        };
+        Ok((Config { env: task.config().clone(), ..whole }, task))
     }
 
     /// Computes rows of `width` values for the observations.
@@ -198,10 +214,10 @@ pub(crate) fn evaluate(
             Scored::Function(_) => None,
         };
         let task = match loaded {
-            Some(policy) => policy.loaded().task(&policy.with(&set))?,
-            None => resolve(1, None, None, &set, false)?.1,
+            Some(policy) => policy.loaded.task(&policy.with(&set))?,
+            None => resolve(None, &set)?.1,
         };
-        let loaded = loaded.map(Policy::loaded);
+        let loaded = loaded.map(|policy| &policy.loaded);
         let outside = |observations: &[f32], actions: &mut [f32]| {
             if let Scored::Function(act) = &scored
                 && let Err(error) = ask(act, task.spaces(), (observations, actions), stop)

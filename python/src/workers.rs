@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use rayon::ThreadPool;
 use shadow_repose::os;
 
-use crate::panicked;
+use crate::errors::{panicked, refused};
 
 /// How long Ctrl-C waits at most.
 const PATIENCE: Duration = Duration::from_millis(50);
@@ -39,7 +39,7 @@ impl Workers {
             None if forked => {
                 os::thread_pool(self.threads).map_err(|error| PyRuntimeError::new_err(error.to_string()))?
             }
-            None => os::thread_pool(self.threads).map_err(crate::refused)?,
+            None => os::thread_pool(self.threads).map_err(refused)?,
         };
         Ok(&self.pool.insert((process::id(), pool)).1)
     }

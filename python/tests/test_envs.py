@@ -302,7 +302,7 @@ def test_the_lesson_follows_the_steps_that_the_user_sets():
 
 def test_the_task_is_that_of_the_policy():
     policy = Policy.load("builtin")
-    envs = policy.make_env(4, seed=1)
+    envs = VectorEnv(4, policy=policy, seed=1)
     assert envs.settings == policy.settings != VectorEnv(1).settings
     assert envs.settings["env.act_moving_average"] == 0.7
     changed = VectorEnv(4, policy="builtin", set={"env.friction_scale": 0.5})

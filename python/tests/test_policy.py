@@ -61,7 +61,7 @@ def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
     with pytest.raises(TypeError, match="Policy.load"):
         Policy("builtin")
     slippery = Policy.load("builtin", set={"env.friction_scale": 0.5})
-    both = slippery.make_env(2, set={"env.gains_scale": 0.9}).settings
+    both = VectorEnv(2, policy=slippery, set={"env.gains_scale": 0.9}).settings
     assert (both["env.friction_scale"], both["env.gains_scale"]) == (0.5, 0.9)
     assert pickle.loads(pickle.dumps(slippery)).settings == slippery.settings != Policy.load("builtin").settings
     short = {"episodes": 2, "set": {"env.max_episode_seconds": 0.1}}
