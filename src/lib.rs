@@ -32,7 +32,7 @@
 //! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |
 //! | [`mod@env`] | many environments, in blocks that step without a barrier or all at once; no hand in it | ranks, rng, schedule, sim, spaces |
-//! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`kernels`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
+//! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`fused`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
 //! | [`config`] | all settings, their defaults and rules | os, sim |
 //! | [`sim`] | the only interface to MuJoCo | os, quat, schedule |
 //! | [`run`] | the folder of a run and its logs | os, sim |
@@ -64,7 +64,7 @@
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
 //! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
-//! `ppo::kernels` describes how a minibatch is computed. `ppo::candle` computes the same with candle's tensors.
+//! `ppo::fused` describes how a minibatch is computed. `ppo::candle` computes the same with candle's tensors.
 //!
 //! A training may be spread over several processes. [`ranks`] describes what they exchange.
 //!

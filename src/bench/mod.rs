@@ -16,7 +16,7 @@ use crate::cli::{BenchArgs, Part};
 use crate::config::{Config, expect_used, user_file};
 use crate::env::EnvPool;
 use crate::os;
-use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, shares_of_waiting, time_gradient_steps};
+use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
 use crate::rng;
@@ -134,25 +134,20 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let size = config.samples_per_minibatch();
     let flops = flops_per_sample(ppo.policy());
     time_gradient_steps(ppo, rollout, 2)?;
-    let samples = size as f64 / median(time_gradient_steps(ppo, rollout, REPEATS)?);
-    let (gflops, matmul) = (1e-9 * flops * samples, median(matmul_gflops(ppo, size, REPEATS)));
-    let waits = shares_of_waiting(ppo, rollout, REPEATS)?;
-    let all: f64 = waits.iter().map(|(_, share)| share).sum();
-    let parts: Vec<String> = waits.iter().map(|(part, share)| format!("{part} {:.1}", 100.0 * share)).collect();
-    let lines = format!(
+    let times = time_gradient_steps(ppo, rollout, REPEATS)?;
+    let samples = size as f64 / median(times.seconds);
+    let gflops = 1e-9 * flops * samples;
+    let matmul = median(matmul_gflops(ppo, size, REPEATS));
+    let mut lines = format!(
         "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
-         its matrix products alone                      {matmul:.1} GFLOP/s\n\
-         its threads wait          {:>10.1} % of the time: {}\n",
-        100.0 * all,
-        parts.join(", ")
+         its matrix products alone                      {matmul:.1} GFLOP/s\n"
     );
-    let figures = [
-        ("learner_samples_per_s", samples),
-        ("learner_gflops", gflops),
-        ("matmul_gflops", matmul),
-        ("learner_waits", all),
-    ];
-    Ok((figures.into(), lines))
+    let mut figures = vec![("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)];
+    if let Some(waiting) = times.waiting {
+        lines += &format!("its threads wait          {:>10.1} % of the time\n", 100.0 * waiting);
+        figures.push(("learner_waits", waiting));
+    }
+    Ok((figures, lines))
 }
 
 /// Measures the env steps per second of whole iterations of a training with these settings, without the first one if there are

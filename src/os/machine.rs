@@ -35,6 +35,19 @@ pub(super) fn process_status(name: &str) -> String {
     status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
 }
 
+/// The time that all threads of this process together have spent on processors, s, to 10 ms. It is `None` if the system does not
+/// report it.
+pub fn processor_seconds() -> Option<f64> {
+    /// The kernel's unit of time for programs, on every processor that this program runs on.
+    const TICKS_PER_S: f64 = 100.0;
+    let text = fs::read_to_string("/proc/self/stat").ok()?;
+    // The name of the program, in parentheses, may hold anything. The times for the program and for the kernel are the 12th and the
+    // 13th field after it.
+    let (_, fields) = text.rsplit_once(") ")?;
+    let times = fields.split(' ').skip(11).take(2).map(|field| field.parse::<f64>().ok());
+    Some(times.sum::<Option<f64>>()? / TICKS_PER_S)
+}
+
 /// Returns the number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
 fn count(list: &str) -> usize {
     let number = |text: &str| text.trim().parse::<usize>().ok();
@@ -50,7 +63,19 @@ pub fn program_checksum() -> u32 {
 
 #[cfg(test)]
 mod tests {
+    use std::time::{Duration, Instant};
+
     use super::*;
+
+    #[test]
+    fn a_thread_that_computes_uses_a_processor() {
+        let before = processor_seconds().unwrap();
+        let begun = Instant::now();
+        while begun.elapsed() < Duration::from_millis(300) {}
+        let used = processor_seconds().unwrap() - before;
+        // Other programs may run at the same time.
+        assert!(used > 0.1, "{used}");
+    }
 
     #[test]
     fn processors_are_counted_in_the_lists_of_the_kernel() {

@@ -18,7 +18,7 @@ mod threads;
 pub use file::{Cannot, Stamp, expect_named, read_bytes, read_bytes_if, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};
-pub use machine::{Machine, program_checksum};
+pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
     OUR_PARTIAL, OutputFile, expect_folder, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder,

@@ -4,8 +4,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::clock::{Clock, Part};
-use super::widest::widest;
+use super::kernels::widest;
 
 /// The decay rate of the mean gradient.
 const BETA1: f64 = 0.9;
@@ -47,7 +46,6 @@ impl Adam {
         gradient: &[f32],
         own: Range<usize>,
         (rate, scale): (f64, f64),
-        clock: &Clock,
     ) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
@@ -58,15 +56,13 @@ impl Adam {
         let parameters = parameters[own.clone()].par_chunks_mut(CHUNK).zip(gradient[own].par_chunks(CHUNK));
         let moments = mean.par_chunks_mut(CHUNK).zip(square.par_chunks_mut(CHUNK));
         parameters.zip(moments).for_each(|((x, grad), (mean, square))| {
-            clock.work(Part::Adam, || {
-                widest!({
-                    for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square) {
-                        let grad = grad * scale;
-                        *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
-                        *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
-                        *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
-                    }
-                });
+            widest!({
+                for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square) {
+                    let grad = grad * scale;
+                    *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
+                    *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
+                    *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
+                }
             });
         });
     }
@@ -129,7 +125,7 @@ mod tests {
             let gradient = [2.0 * x[0], x[1], 0.2 * x[2]];
             let norm = norm_of(&gradient, &[0..2, 2..3]);
             assert!((norm - expected_norm).abs() < 1e-5, "norm {norm}");
-            adam.step(&mut x, &gradient, 0..3, (0.1, (1.0 / (norm + 1e-6)).min(1.0)), &Clock::default());
+            adam.step(&mut x, &gradient, 0..3, (0.1, (1.0 / (norm + 1e-6)).min(1.0)));
             for (found, expected) in x.iter().zip(expected) {
                 assert!((found - expected).abs() < 1e-6, "{found} instead of {expected}");
             }

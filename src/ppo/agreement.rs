@@ -5,7 +5,8 @@ mod tests {
     use std::sync::atomic::AtomicBool;
 
     use super::super::backend::Losses;
-    use super::super::kernels::{Arithmetic, Kernels};
+    use super::super::fused::Fused;
+    use super::super::kernels::Arithmetic;
     use super::super::{Policy, Ppo, Rollout};
     use crate::config::{self, Activation, Config, Precision};
     use crate::ranks::Exchange;
@@ -54,13 +55,13 @@ mod tests {
 
     /// Takes one gradient step with a learning rate of 1e-3, without clipping.
     fn step(ppo: &mut Ppo) {
-        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), (1e-3, 1.0), &ppo.clock);
+        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), (1e-3, 1.0));
     }
 
     /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         let minibatch = ppo.exchange.minibatch(samples);
-        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch, &ppo.clock).unwrap();
+        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch).unwrap();
         let add_up = |parameters, out: &mut [f32]| ppo.backend.add_up(parameters, out);
         ppo.slices.reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
         ppo.losses(&sums, minibatch.count)
@@ -173,7 +174,7 @@ mod tests {
             let Ok(arithmetic) = Arithmetic::new(precision) else { continue };
             let run = |threads: &[usize]| {
                 let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Tanh);
-                ppo.backend = Box::new(Kernels::new(&ppo.config, arithmetic));
+                ppo.backend = Box::new(Fused::new(&ppo.config, arithmetic));
                 ppo.backend.begin(&ppo.policy, &rollout);
                 let samples: Vec<u32> = (0..rollout.samples() as u32).collect();
                 let mut losses = Vec::new();

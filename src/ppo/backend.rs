@@ -5,8 +5,8 @@ use std::ops::{Add, Range};
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 
-use super::clock::Clock;
-use super::{Policy, Rollout};
+use super::policy::Policy;
+use super::rollout::Rollout;
 use crate::config::PpoConfig;
 use crate::ranks::Minibatch;
 
@@ -64,7 +64,7 @@ pub(super) trait GradientBackend: Send + Sync {
     ///
     /// # Errors
     /// Fails if the underlying library fails.
-    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, clock: &Clock) -> Result<Vec<Losses>>;
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>>;
 
     /// Writes the sum of the gradients of all groups for these parameters of one net. They are added as a tree.
     fn add_up(&self, parameters: Range<usize>, out: &mut [f32]);

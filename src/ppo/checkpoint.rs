@@ -285,7 +285,8 @@ impl Ppo {
 mod tests {
     use super::*;
     use crate::config::{Backend, Config, PpoConfig, Symmetry};
-    use crate::ppo::{Evaluation, Rollout, Stage};
+    use crate::ppo::update::Stage;
+    use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Exchange;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };

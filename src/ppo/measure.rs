@@ -5,18 +5,30 @@ use std::time::Instant;
 use anyhow::Result;
 use rayon::prelude::*;
 
+use super::Ppo;
 use super::kernels::{Matrix, Multiplier, ROWS};
-use super::{Part, Policy, Ppo, Rollout, Stage};
+use super::policy::Policy;
+use super::rollout::Rollout;
+use super::update::Stage;
+use crate::os;
 
 /// Seconds after which no further gradient step is timed, once three have been.
 const LIMIT: f64 = 5.0;
 
+/// How long gradient steps took.
+pub struct StepTimes {
+    /// The time of each, s.
+    pub seconds: Vec<f64>,
+    /// The share of the time of all threads in which they neither compute nor look for work, if the system reports it.
+    pub waiting: Option<f64>,
+}
+
 /// Times up to `repeats` gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a
-/// collected rollout. Returns the seconds of each.
+/// collected rollout.
 ///
 /// # Errors
 /// Fails if a loss or gradient is not finite.
-pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<f64>> {
+pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<StepTimes> {
     ppo.prepare(rollout);
     ppo.backend.begin(&ppo.policy, rollout);
     // Samples from the whole rollout, as in a shuffled minibatch.
@@ -24,34 +36,21 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     let step = samples / ppo.config.minibatch_of(samples, rollout.horizon());
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
-    while seconds.len() < repeats && (seconds.len() < 3 || seconds.iter().sum::<f64>() < LIMIT) {
+    let mut all = 0.0;
+    let before = os::processor_seconds();
+    while seconds.len() < repeats && (seconds.len() < 3 || all < LIMIT) {
         let taken = rayon::scope(|_| {
             let start = Instant::now();
             let minibatch = ppo.exchange.minibatch(&minibatch);
             ppo.minibatch_step(rollout, &minibatch, Stage::Later).map(|_| start.elapsed())
         });
-        seconds.push(taken?.as_secs_f64());
+        let taken = taken?.as_secs_f64();
+        all += taken;
+        seconds.push(taken);
     }
-    Ok(seconds)
-}
-
-/// Takes `repeats` more gradient steps as [`time_gradient_steps`] does. Returns the share of the time that threads wait in each
-/// part of a step, and while one thread works between the parts.
-///
-/// # Errors
-/// Fails as [`time_gradient_steps`] does.
-pub fn shares_of_waiting(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<Vec<(&'static str, f64)>> {
-    ppo.clock.start();
-    let all: f64 = time_gradient_steps(ppo, rollout, repeats)?.iter().sum();
-    let threads = rayon::current_num_threads() as f64;
-    let mut between = all;
-    let share = |(&(_, name), [elapsed, worked]): (&(Part, &'static str), [f64; 2])| {
-        between -= elapsed;
-        (name, (elapsed - worked / threads) / all)
-    };
-    let mut shares: Vec<_> = Part::ALL.iter().zip(ppo.clock.seconds()).map(share).collect();
-    shares.push(("between", between / all * (1.0 - 1.0 / threads)));
-    Ok(shares)
+    let worked = os::processor_seconds().zip(before).map(|(after, before)| after - before);
+    let of_threads = all * rayon::current_num_threads() as f64;
+    Ok(StepTimes { seconds, waiting: worked.map(|worked| (1.0 - worked / of_threads).max(0.0)) })
 }
 
 /// Returns the matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::widest::widest;
+use super::kernels::widest;
 use crate::ranks::Exchange;
 
 /// Rows that one task sums. The number is fixed, so that the result does not depend on the number of threads.

@@ -7,8 +7,8 @@
 
 use anyhow::{Result, ensure};
 
+use super::kernels::widest;
 use super::normalizer::Normalizer;
-use super::widest::widest;
 use crate::config::Symmetry;
 use crate::quat::{self, CUBE_ROTATIONS};
 use crate::spaces::{ObjectAndGoal, Spaces};

@@ -7,7 +7,6 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::Normalizer;
-use super::clock::Clock;
 use super::kernels::{Arithmetic, Net, Workspace};
 use super::parameters::{Layer, Layout};
 use super::perception::{InputTransform, Perception};
@@ -104,10 +103,10 @@ impl Policy {
     }
 
     /// Returns actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
-    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool, clock: &Clock) -> [Net<'_>; 2] {
+    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
         let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
         let mut nets = [&self.layout.actor, &self.layout.critic].map(net);
-        Net::prepare(&mut nets, arithmetic, learning, clock);
+        Net::prepare(&mut nets, arithmetic, learning);
         nets
     }
 
@@ -118,7 +117,7 @@ impl Policy {
 
     /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let [actor, critic] = self.nets(arithmetic, false, &Clock::default());
+        let [actor, critic] = self.nets(arithmetic, false);
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }

@@ -12,7 +12,6 @@ use candle_nn::Linear;
 
 use super::Policy;
 use super::backend::{GradientBackend, Losses};
-use super::clock::Clock;
 use super::parameters::Layer;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::{Activation, PpoConfig};
@@ -57,8 +56,9 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
         returns: column(|block| &block.returns)?,
     })
 }
+
 impl GradientBackend for Reference {
-    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch, _: &Clock) -> Result<Vec<Losses>> {
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>> {
         let mut sums = Vec::new();
         self.gradients.clear();
         for group in &of.groups {

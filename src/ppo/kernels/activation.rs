@@ -3,7 +3,7 @@
 //! candle computes these functions one element at a time, in several passes, which costs more than the matrix products
 //! between them.
 
-use super::super::widest::widest;
+use super::widest::widest;
 use crate::config::Activation;
 
 /// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|). The argument x is clamped to [-87, 88].

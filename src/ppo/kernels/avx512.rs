@@ -59,6 +59,10 @@ impl Unit for Dots {
 
 /// Computes eight rows of a block, from row `first` of the tiles `lhs` on. Their values are `LINE` apart from line to line
 /// and `PAIR` from pair to pair.
+///
+/// # Safety
+/// The processor must have AVX-512F and AVX-512 BF16. `out` must have eight rows of 32 values, `columns` apart, `rhs` twice as many tiles
+/// as `lhs`, and a tile the eight lines from `first` on.
 #[target_feature(enable = "avx512f,avx512bf16")]
 unsafe fn rows<const LINE: usize, const PAIR: usize>(
     out: &mut [f32],
@@ -101,7 +105,7 @@ unsafe fn rows<const LINE: usize, const PAIR: usize>(
     }
 }
 
-/// Returns the same bits as pairs of bf16.
+/// The same bits as pairs of bf16.
 #[target_feature(enable = "avx512f")]
 fn bf16(bits: __m512i) -> __m512bh {
     // SAFETY: both are 512 bits of which every value is valid.

@@ -2,8 +2,8 @@
 
 use std::fmt::Debug;
 
-use super::super::widest::widest;
 use super::product::Matrix;
+use super::widest::widest;
 
 /// Lines in a tile. The lines of an operand are the rows of the left matrix or the columns of the right one.
 pub(super) const LINES: usize = 16;

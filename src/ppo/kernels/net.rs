@@ -4,7 +4,6 @@ use std::borrow::Cow;
 
 use rayon::prelude::*;
 
-use super::super::clock::{Clock, Part};
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
 use super::bf16::{Packed, Tiles};
@@ -91,7 +90,7 @@ impl<'a> Net<'a> {
     /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. With `learning`, they are for
     /// forward and backward passes. Otherwise they are for many forward passes of few rows, where making them would take longer
     /// than the product. The results are the same, bit for bit.
-    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learning: bool, clock: &Clock) {
+    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learning: bool) {
         let mut parts = Vec::new();
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
             if !learning {
@@ -104,10 +103,7 @@ impl<'a> Net<'a> {
                 }
             }
         }
-        if !parts.is_empty() {
-            let pack = |tiles: Tiles| clock.work(Part::Packing, || tiles.pack());
-            clock.part(Part::Packing, || parts.into_par_iter().for_each(pack));
-        }
+        parts.into_par_iter().for_each(Tiles::pack);
     }
 
     /// Returns copies of its weights for [`Self::with_copies`].
@@ -215,7 +211,7 @@ mod tests {
             let [plain, packed] = [false, true].map(|packed| {
                 let mut nets = [Net::new(&layout.actor, &parameters, Activation::Elu)];
                 if packed {
-                    Net::prepare(&mut nets, arithmetic, true, &Clock::default());
+                    Net::prepare(&mut nets, arithmetic, true);
                 }
                 let [net] = nets;
                 let mut work = Workspace::new(&layout.actor, rows, true, arithmetic);
@@ -242,7 +238,7 @@ mod tests {
             for rows in [1, 2, 5, 13, 32, 64] {
                 let expected = net().forward(rows, &mut work).to_vec();
                 let mut nets = [net()];
-                Net::prepare(&mut nets, Arithmetic::F32, false, &Clock::default());
+                Net::prepare(&mut nets, Arithmetic::F32, false);
                 assert_eq!(nets[0].forward(rows, &mut work), expected, "{rows} rows");
             }
         }

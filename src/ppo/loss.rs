@@ -4,10 +4,10 @@
 
 use std::iter::repeat_n;
 
-use super::super::backend::Losses;
-use super::super::policy::Policy;
-use super::super::rollout::{Rollout, RolloutBlock};
-use super::super::widest::widest;
+use super::backend::Losses;
+use super::kernels::widest;
+use super::policy::Policy;
+use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 
 /// The losses of a minibatch. An action has A values.

@@ -10,4 +10,4 @@ macro_rules! widest {
     };
 }
 
-pub(super) use widest;
+pub(in crate::ppo) use widest;

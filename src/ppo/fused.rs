@@ -1,0 +1,119 @@
+//! The gradient of a minibatch in one pass over its samples, without an autograd graph.
+//!
+//! The network inputs of all samples are computed once per rollout. The samples of a minibatch come in groups, and each
+//! (group, net) is one job for one thread. The job gathers a block of rows at a time, which stays in the cache of that core.
+//! It runs the forward pass, the loss and the backward pass on it, and accumulates the gradient of its group. Then the
+//! gradients of the groups are added as a binary tree, chunk by chunk, each with its squares for the norm. All threads wait
+//! for each other after each of these parts. The grouping depends only on the settings, so the result
+//! is the same for any number of threads. After the first minibatch, the only float arrays that are allocated are the
+//! packing buffers of gemm and small temporaries of the sums. bf16 also packs the weights anew for each minibatch.
+
+use std::ops::Range;
+use std::sync::Mutex;
+
+use anyhow::Result;
+use rayon::prelude::*;
+
+use super::backend::{GradientBackend, Losses};
+use super::kernels::{Arithmetic, ROWS, Workspace};
+use super::loss::{Loss, Sums};
+use super::policy::Policy;
+use super::rollout::{Rollout, RolloutBlock};
+use crate::config::PpoConfig;
+use crate::ranks::{Minibatch, tree_sum};
+
+/// The gradient backend with our own kernels.
+pub(super) struct Fused {
+    config: PpoConfig,
+    arithmetic: Arithmetic,
+    /// Workspaces, one per thread of the pool.
+    workspaces: Vec<Mutex<Workspace>>,
+    /// Results of each group of the last minibatch, for actor and critic.
+    parts: Vec<[Partial; 2]>,
+    /// `[B, O]`: network inputs for the samples of the rollout
+    seen: Vec<f32>,
+}
+
+/// The result of a job.
+#[derive(Default)]
+struct Partial {
+    gradient: Vec<f32>,
+    sums: Sums,
+}
+
+/// The net that a job works on.
+#[derive(Clone, Copy)]
+enum Role {
+    Actor,
+    Critic,
+}
+
+impl Fused {
+    /// Creates the backend with these settings.
+    pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
+        Self { config: config.clone(), arithmetic, workspaces: Vec::new(), parts: Vec::new(), seen: Vec::new() }
+    }
+
+    /// Makes room for this number of groups of up to `samples` samples. Returns the number of rows that pass through a
+    /// net together, chosen for blocks of equal size as far as possible.
+    fn reserve(&mut self, policy: &Policy, groups: usize, samples: usize) -> usize {
+        let rows = samples.div_ceil(samples.div_ceil(ROWS));
+        self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
+        while self.workspaces.len() < rayon::current_num_threads() {
+            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, true, self.arithmetic)));
+        }
+        self.parts.resize_with(groups, Default::default);
+        rows
+    }
+}
+
+impl GradientBackend for Fused {
+    fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
+        let (transform, size) = (policy.input_transform(), policy.spaces.observation_size);
+        self.seen.resize(rollout.samples() * size, 0.0);
+        let mut rest = &mut self.seen[..];
+        let mut seen = |block: &RolloutBlock| rest.split_off_mut(..block.samples() * size).expect("room for all");
+        let parts: Vec<_> = rollout.blocks.iter().map(|block| (seen(block), block)).collect();
+        parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
+    }
+
+    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>> {
+        let groups = &of.groups;
+        let rows = self.reserve(policy, groups.len(), groups.iter().map(|group| group.len()).max().unwrap_or(0));
+        let (nets, ranges) = (policy.nets(self.arithmetic, true), policy.layout.nets());
+        let loss = Loss::new(policy, rollout, of.count, &self.config);
+        let parts = groups.iter().zip(&mut self.parts);
+        let jobs: Vec<_> = parts
+            .flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)])
+            .collect();
+        let pass = |(group, role, part): (&&[u32], Role, &mut Partial)| {
+            let net = &nets[role as usize];
+            part.gradient.resize(ranges[role as usize].len(), 0.0);
+            part.sums = loss.of_none();
+            let thread = rayon::current_thread_index().expect("runs on a rayon thread");
+            let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
+            for (i, block) in group.chunks(rows).enumerate() {
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(policy.spaces.observation_size)) {
+                    row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
+                }
+                net.forward(block.len(), work);
+                let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
+                match role {
+                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
+                    Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
+                }
+                net.backward(block.len(), work, &mut part.gradient, i > 0);
+            }
+        };
+        jobs.into_par_iter().with_max_len(1).for_each(pass);
+        Ok(self.parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
+    }
+
+    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {
+        // The critic's parameters follow the actor's.
+        let actor = self.parts[0][0].gradient.len();
+        let (net, first) = if parameters.start < actor { (Role::Actor, 0) } else { (Role::Critic, actor) };
+        let own = parameters.start - first..parameters.end - first;
+        tree_sum(out, &self.parts.iter().map(|nets| &nets[net as usize].gradient[own.clone()]).collect::<Vec<_>>());
+    }
+}
