@@ -1,5 +1,7 @@
 //! Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 //!
+//! This library is internal to the program `shadow-repose` and to its Python package. Its items promise nothing to other crates.
+//!
 //! # Vocabulary
 //! A *substep* is one physics step. A *step* (or control step) is one action of an environment. An *iteration* is one
 //! rollout of all environments and the update that learns from it. An *episode* ends *terminated* (the cube was dropped or

@@ -84,7 +84,7 @@ static AT_WORK: AtomicU32 = AtomicU32::new(0);
 
 /// Kills the running processes, if any: they would keep writing to their folder after this program has ended. `kill` is built into
 /// the shell, so that no file of this name is looked for.
-#[allow(dead_code)]
+#[allow(dead_code, reason = "build.rs includes this file and never stops it")]
 pub(crate) fn stop() {
     let id = AT_WORK.load(Ordering::Relaxed);
     if id != 0 {
