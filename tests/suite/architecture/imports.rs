@@ -1,4 +1,4 @@
-//! Finds out from the code which file of src/ uses which others. Code that exists for tests only is left out.
+//! Finds out from the code which file of a crate uses which others. Code that exists for tests only is left out.
 //!
 //! Follows `use`, re-exports and written paths to the file that defines a name. Naming a module alone does not count as using it.
 
@@ -12,9 +12,12 @@ use syn::visit::{self, Visit};
 /// The path of a module from the root of the crate, empty for the root.
 type Module = Vec<String>;
 
-/// Returns the files that each file uses, as paths within src/.
-pub(super) fn imports(src: &Path) -> BTreeMap<PathBuf, BTreeSet<PathBuf>> {
-    let mut house = House::default();
+/// The files that each file uses.
+pub(super) type Imports = BTreeMap<PathBuf, BTreeSet<PathBuf>>;
+
+/// The imports of a crate with this name, as paths within its folder `src`.
+pub(super) fn imports(src: &Path, name: &'static str) -> Imports {
+    let mut house = House { name, modules: BTreeMap::new() };
     let mut paths: Vec<(PathBuf, Module, Vec<String>)> = Vec::new();
     for path in super::sources(src) {
         let file = path.strip_prefix(src).unwrap().to_owned();
@@ -22,7 +25,7 @@ pub(super) fn imports(src: &Path) -> BTreeMap<PathBuf, BTreeSet<PathBuf>> {
         let parsed = syn::parse_file(&fs::read_to_string(&path).unwrap()).unwrap();
         house.add(&file, &module, &parsed.items, &mut paths);
     }
-    let mut found: BTreeMap<PathBuf, BTreeSet<PathBuf>> = BTreeMap::new();
+    let mut found = Imports::new();
     for (file, module, path) in paths {
         let used = found.entry(file.clone()).or_default();
         used.extend(house.file_of(&module, &path, 0).filter(|other| *other != file));
@@ -30,7 +33,28 @@ pub(super) fn imports(src: &Path) -> BTreeMap<PathBuf, BTreeSet<PathBuf>> {
     found
 }
 
-/// Returns the module of a file: a::b for `a/b.rs` and `a/b/mod.rs`.
+/// The imports between the files of a Python package. They are written `from .file import name` or `from . import file`.
+pub(super) fn of_python(package: &Path) -> Imports {
+    let mut found = Imports::new();
+    for path in super::sources(package).iter().filter(|path| path.extension().is_some_and(|ending| ending == "py")) {
+        let file = path.strip_prefix(package).unwrap();
+        let text = fs::read_to_string(path).unwrap();
+        let used = found.entry(file.to_owned()).or_default();
+        for line in text.lines().filter_map(|line| line.trim().strip_prefix("from .")) {
+            let (place, names) = line.split_once(" import ").unwrap();
+            let places = if place.is_empty() { names.split(", ").collect() } else { vec![place] };
+            for place in places.into_iter().filter(|place| !package.join(format!("{place}.pyi")).exists()) {
+                let other = PathBuf::from(format!("{place}.py"));
+                let is_file = package.join(&other).exists();
+                used.insert(if is_file { other } else { "__init__.py".into() });
+            }
+        }
+        used.retain(|other| other != file);
+    }
+    found
+}
+
+/// The module of a file: a::b for `a/b.rs` and `a/b/mod.rs`.
 fn module_of(file: &Path) -> Module {
     let mut names: Module = file.with_extension("").iter().map(|part| part.to_str().unwrap().to_owned()).collect();
     let last = names.pop().unwrap();
@@ -53,9 +77,11 @@ struct Names {
     globs: Vec<Vec<String>>,
 }
 
-/// All modules of the program.
-#[derive(Default)]
-struct House(BTreeMap<Module, Names>);
+/// All modules of a crate.
+struct House {
+    name: &'static str,
+    modules: BTreeMap<Module, Names>,
+}
 
 impl House {
     /// Adds the items of a module, and to `paths` every path that is written in it.
@@ -96,23 +122,23 @@ impl House {
         }
         paths.extend(written.0.into_iter().map(|path| (file.to_owned(), module.to_vec(), path)));
         // Of a module with several cfgs, the first counts.
-        self.0.entry(module.to_vec()).or_insert(names);
+        self.modules.entry(module.to_vec()).or_insert(names);
     }
 
-    /// Returns the file that defines what `path` means in `module`.
+    /// The file that defines what `path` means in `module`.
     fn file_of(&self, module: &[String], path: &[String], depth: usize) -> Option<PathBuf> {
         assert!(depth < 16, "{module:?}: {path:?} cannot be resolved");
         let (first, rest) = path.split_first()?;
         match first.as_str() {
-            "crate" | "shadow_repose" => return self.below(&[], rest, depth),
+            name if name == "crate" || name == self.name => return self.below(&[], rest, depth),
             "self" => return self.below(module, rest, depth),
             "super" => return self.file_of_or_below(&module[..module.len() - 1], rest, depth),
             _ => {}
         }
-        let names = self.0.get(module)?;
+        let names = self.modules.get(module)?;
         let is_known = names.defined.contains(first)
             || names.imported.contains_key(first)
-            || self.0.contains_key(&[module, std::slice::from_ref(first)].concat())
+            || self.modules.contains_key(&[module, std::slice::from_ref(first)].concat())
             || !names.globs.is_empty();
         if is_known { self.below(module, path, depth) } else { None }
     }
@@ -125,15 +151,15 @@ impl House {
         }
     }
 
-    /// Returns the file that defines `path` within `module`.
+    /// The file that defines `path` within `module`.
     fn below(&self, module: &[String], path: &[String], depth: usize) -> Option<PathBuf> {
         let (first, rest) = path.split_first()?;
         let child = [module, std::slice::from_ref(first)].concat();
-        let names = self.0.get(module)?;
+        let names = self.modules.get(module)?;
         if names.defined.contains(first) {
             return Some(names.file.clone());
         }
-        if self.0.contains_key(&child) {
+        if self.modules.contains_key(&child) {
             return self.below(&child, rest, depth);
         }
         // Not an item with the name of its crate, such as anyhow.
@@ -197,7 +223,7 @@ fn imported(tree: &syn::UseTree, before: &mut Vec<String>, tell: &mut dyn FnMut(
     }
 }
 
-/// Returns the name that an item defines in its module.
+/// The name that an item defines in its module.
 fn name_of(item: &syn::Item) -> Option<String> {
     let ident = match item {
         syn::Item::Const(item) => &item.ident,
@@ -214,7 +240,7 @@ fn name_of(item: &syn::Item) -> Option<String> {
     Some(ident.to_string())
 }
 
-fn is_of_tests(item: &syn::Item) -> bool {
+pub(super) fn is_of_tests(item: &syn::Item) -> bool {
     let attributes = match item {
         syn::Item::Fn(item) => &item.attrs,
         syn::Item::Mod(item) => &item.attrs,
