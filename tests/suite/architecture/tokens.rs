@@ -46,7 +46,6 @@ const LONGER_FUNCTIONS: &[&str] = &[
     "repose/task.rs: new",
     "robustness.rs: robustness",
     "run/table.rs: read_metrics",
-    "runs/comparison.rs: lines",
     "sim/fingerprint.rs: fingerprint",
     "sim/furnish.rs: furnished",
     "sim/structure.rs: find_parts",
