@@ -1,8 +1,9 @@
-//! The settings in which two configurations differ.
+//! Configurations as trees of settings: where two differ, and which settings are ramps.
 
 use toml::{Table, Value};
 
 use super::overlay::{brief, settings};
+use super::ramp::Ramp;
 use super::settings::{BUILTIN_MODEL, Config, EnvConfig};
 
 /// A setting by its dotted key, and its values in both configurations.
@@ -33,6 +34,15 @@ impl Config {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
         let of_training = settings(&own).filter(|(key, _)| !matches!(&**key, "run.threads" | "run.shards"));
         of_training.map(|(key, value)| (key, value.clone())).collect()
+    }
+
+    /// The settings that change in the course of a run, by dotted key.
+    ///
+    /// # Panics
+    /// Never panics: a configuration is a tree of tables.
+    pub fn ramps(&self) -> Vec<(String, Ramp)> {
+        let own = Table::try_from(self).expect("a configuration is a tree of tables");
+        settings(&own).filter_map(|(key, value)| Some((key, Ramp::read(value)?))).collect()
     }
 
     /// Returns these settings without the length of the run and without what depends on the machine.

@@ -4,10 +4,7 @@ use std::fmt;
 
 use serde::ser::SerializeStruct;
 use serde::{Deserialize, Serialize, Serializer};
-use toml::{Table, Value};
-
-use super::overlay::settings;
-use super::settings::Config;
+use toml::Value;
 
 /// A value that changes to another one over a given number of control steps (counted over all environments) and then stays
 /// constant. It may begin after the first step. A linear one changes by the same difference in each step. A constant is a plain number
@@ -83,17 +80,6 @@ impl fmt::Display for Ramp {
     }
 }
 
-impl Config {
-    /// The settings that change in the course of a run, by dotted key.
-    ///
-    /// # Panics
-    /// Never panics: a configuration is a tree of tables.
-    pub fn ramps(&self) -> Vec<(String, Ramp)> {
-        let own = Table::try_from(self).expect("a configuration is a tree of tables");
-        settings(&own).filter_map(|(key, value)| Some((key, Ramp::read(value)?))).collect()
-    }
-}
-
 /// A ramp that changes by the same factor in each step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -112,6 +98,7 @@ impl Geometric {
 mod tests {
     use std::path::Path;
 
+    use super::super::Config;
     use super::*;
 
     #[test]

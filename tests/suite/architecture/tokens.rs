@@ -23,7 +23,6 @@ const LONGER_FUNCTIONS: &[&str] = &[
     "config/layers.rs: layered",
     "config/overlay.rs: typed",
     "config/rules.rs: violations",
-    "config/rules.rs: learning",
     "draw/bar_chart.rs: draw",
     "draw/film/caption.rs: draw",
     "draw/film/mp4.rs: encode",
