@@ -5,7 +5,7 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, bail};
 
@@ -176,18 +176,8 @@ impl Loaded {
 /// # Errors
 /// Fails if the record in its file is damaged.
 pub fn record(checkpoint: &Checkpoint, net: &NetConfig) -> Result<Record> {
-    let record = match &checkpoint.hand {
-        Some(text) => Record::parse(text)?,
-        None => OF_BUILTIN.clone(),
-    };
-    Ok(record.with(net.symmetry))
+    Ok(Record::parse(&checkpoint.hand)?.with(net.symmetry))
 }
-
-/// The hand and the cube of the built-in scene, for files that say nothing of theirs.
-static OF_BUILTIN: LazyLock<Record> = LazyLock::new(|| {
-    let builtin = Config::resolve(None, &[]).and_then(|config| Task::new(&config.env, &config.hand));
-    builtin.expect("the built-in scene is sound").record()
-});
 
 /// Reads a checkpoint or a policy.
 ///

@@ -26,7 +26,7 @@ const GROUPS: [(&str, &[&str], &str, &str); 3] = [
 
 /// What is logged besides scores and rewards: name, title, description.
 #[rustfmt::skip]
-const OTHERS: [(&str, &str, &str); 22] = [
+const OTHERS: [(&str, &str, &str); 21] = [
     ("training/turned", "turned towards the goal (rad/100 steps)",
         "Rotation towards the goal in 100 steps, rad; no weight changes it."),
     ("loss/policy", "policy loss", "The clipped surrogate, negated, mean over the minibatches."),
@@ -48,7 +48,6 @@ const OTHERS: [(&str, &str, &str); 22] = [
     ("sim/diverged", "diverged steps", "Steps of the iteration on which the physics diverged."),
     ("histogram/actions", "actions", "Actions of the iteration as drawn, before they are clipped to [-1, 1]."),
     ("histogram/advantages", "advantages", "Advantages of the iteration, with mean 0 and standard deviation 1."),
-    ("eval/film", "film", "The first evaluation episode with mean actions, at the speed of the simulation."),
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];
 

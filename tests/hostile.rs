@@ -16,7 +16,7 @@ use shadow_repose::ppo::Checkpoint;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::Task;
 use shadow_repose::rng::{self, Rng};
-use shadow_repose::run::{Media, Report};
+use shadow_repose::run::Report;
 
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -37,8 +37,11 @@ fn a_checkpoint() -> Checkpoint {
     let config = Config::resolve(None, &sets).unwrap();
     let task = Task::new(&config.env, &config.hand).unwrap();
     let agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
-    let mut checkpoint = agent.checkpoint(&config.to_text(), None);
-    checkpoint.scene = Some(task.scene().fingerprint());
+    let mut checkpoint = Checkpoint::default();
+    agent.save(&mut checkpoint);
+    checkpoint.config = config.to_text();
+    checkpoint.scene = task.scene().fingerprint();
+    checkpoint.hand = task.record().to_text();
     checkpoint
 }
 
@@ -152,7 +155,7 @@ fn growth(rows: u64) -> i64 {
         report.iteration(
             row,
             &values,
-            &Media::default(),
+            &[],
             &Status { env_steps: row, steps_per_s: 1e4, goals: 0.5, drop_rate: f64::NAN, evaluation: f64::NAN },
         );
         if row % 500 == 0 {

@@ -11,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 
 use crate::config::{Config, PpoConfig};
 use crate::env::{End, Env, EnvBlock, EnvPool, EnvState, Resumable};
-use crate::ppo::{Array, Checkpoint, Evaluation, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace};
+use crate::ppo::{Array, Checkpoint, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
 use crate::schedule::in_rounds;
@@ -169,26 +169,28 @@ impl<E: Env> Agent<E> {
 }
 
 impl<E: Resumable> Agent<E> {
-    /// Returns the complete state at the end of an iteration, with the configuration of the run (TOML) and its best evaluation. All
-    /// ranks call it together.
-    pub fn checkpoint(&self, config: &str, best: Option<Evaluation>) -> Checkpoint {
-        let (iteration, env_steps, fork) = (self.iteration, self.env_steps, self.fork.clone());
-        let progress = Progress { iteration, env_steps, best, fork, rise: None };
-        let mut checkpoint = self.ppo.checkpoint(config, progress);
+    /// Adds the complete state at the end of an iteration. All ranks call it together.
+    pub fn save(&self, checkpoint: &mut Checkpoint) {
+        let progress = &mut checkpoint.progress;
+        progress.iteration = self.iteration;
+        progress.env_steps = self.env_steps;
+        progress.fork.clone_from(&self.fork);
+        self.ppo.save(checkpoint);
         let EnvState { numbers, counters } = EnvState::joined(self.exchange.all_gather(self.pool.save()));
         let rows = self.exchange.of_all(self.pool.count());
         checkpoint.insert(NUMBERS, Array::F64(vec![rows, numbers.len() / rows], numbers));
         checkpoint.insert(COUNTERS, Array::U64(vec![rows, counters.len() / rows], counters));
-        checkpoint
     }
 
-    /// Restores what [`Agent::checkpoint`] has saved, bit for bit, and takes it out of the checkpoint.
+    /// Restores what [`Agent::save`] has added, bit for bit, and takes it out of the checkpoint.
     ///
     /// # Errors
     /// Fails if no such agent can have saved this state.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
         let Progress { iteration, env_steps, fork, .. } = &checkpoint.progress;
-        (self.iteration, self.env_steps, self.fork) = (*iteration, *env_steps, fork.clone());
+        self.iteration = *iteration;
+        self.env_steps = *env_steps;
+        self.fork.clone_from(fork);
         self.ppo.begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
         let numbers = checkpoint.take_doubles(NUMBERS)?;

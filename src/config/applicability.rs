@@ -29,9 +29,7 @@ pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
 /// Returns the commands that use a setting.
 fn users(key: &str) -> &'static [&'static str] {
     match key {
-        "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.film_every" | "run.patience" => {
-            &["train"]
-        }
+        "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.patience" => &["train"],
         key if key.starts_with("hand.") => &["train", "bench", "play", "view", "export"],
         key if key.starts_with("env.") && key != "env.num_envs" => &["train", "bench", "play", "view", "export"],
         _ => &["train", "bench"],

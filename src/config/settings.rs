@@ -226,7 +226,6 @@ pub struct RunConfig {
     pub eval_every: u64,
     pub eval_episodes: usize,
     pub patience: u32,
-    pub film_every: u64,
     pub seed: u64,
     pub shards: usize,
     pub threads: usize,

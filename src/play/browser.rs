@@ -176,7 +176,7 @@ pub(super) fn from_trace(path: &Path, html: &Path, args: &PlayArgs) -> Result<()
 fn settings(path: &Path, header: &Value) -> Result<Source> {
     let mut env = Table::new();
     let settings = header["settings"].as_object();
-    for (key, value) in settings.context("it has no settings: an older version wrote it; play the episodes again")? {
+    for (key, value) in settings.context("it has no settings: not a trace of this program")? {
         let value = toml::Value::try_from(value).with_context(|| format!("its setting {}", os::shortened(key)))?;
         env.insert(key.strip_prefix("env.").unwrap_or(key).to_owned(), value);
     }

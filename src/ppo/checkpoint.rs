@@ -14,10 +14,10 @@ use crate::os::shortened;
 use crate::spaces::Spaces;
 
 /// The text `format` of a file.
-const FORMAT: &str = "shadow-repose checkpoint 4";
+const FORMAT: &str = "shadow-repose checkpoint 5";
 
-/// The formats of versions that this program does not read.
-const OLDER: [(&str, &str); 2] = [("shadow-repose checkpoint 2", "0.1.0"), ("shadow-repose checkpoint 3", "0.2.0")];
+/// The format of files that `scripts/convert` converts.
+const CONVERTIBLE: &str = "shadow-repose checkpoint 4";
 
 /// The text that identifies the physics of the scene.
 const SCENE: &str = "scene";
@@ -38,7 +38,7 @@ const LOG_STD: &str = "log_std";
 const LEARNING_RATE: &str = "learning_rate";
 
 /// A checkpoint, or a policy alone, independent of a learner.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Checkpoint {
     /// The configuration of the run, as TOML.
     pub config: String,
@@ -46,10 +46,10 @@ pub struct Checkpoint {
     pub progress: Progress,
     /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes.
     pub provenance: Option<String>,
-    /// The fingerprint of the physics of its scene, or `None` for the built-in scene.
-    pub scene: Option<String>,
-    /// The hand and the object that it was trained with, or `None` for the built-in scene.
-    pub hand: Option<String>,
+    /// The fingerprint of the physics of its scene.
+    pub scene: String,
+    /// The hand and the object that it was trained with, as JSON.
+    pub hand: String,
     content: Content,
 }
 
@@ -62,9 +62,7 @@ impl Checkpoint {
         let mut content = Content::parse(bytes)?;
         let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
         let format = text("format")?;
-        if let Some((_, version)) = OLDER.iter().find(|(older, _)| *older == format) {
-            bail!("made by version {version}, whose files this version does not read");
-        }
+        ensure!(format != CONVERTIBLE, "its format is `{format}`; `scripts/convert OLD NEW` writes it as `{FORMAT}`");
         ensure!(format == FORMAT, "its format is `{}`; this program reads `{FORMAT}`", shortened(&format));
         let config = text("config")?;
         let long = config.len();
@@ -72,7 +70,9 @@ impl Checkpoint {
         let progress = serde_json::from_str(&text("progress")?);
         let progress =
             progress.map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
-        let [provenance, scene, hand] = [PROVENANCE, SCENE, HAND].map(|key| content.texts.remove(key));
+        let scene = text(SCENE)?;
+        let hand = text(HAND)?;
+        let provenance = content.texts.remove(PROVENANCE);
         if let Some(key) = content.texts.keys().next() {
             bail!("its metadata has an unknown `{}`", shortened(key));
         }
@@ -84,11 +84,17 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a value is not finite.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
-        let (mut content, progress) = (self.content.clone(), serde_json::to_string(&self.progress)?);
-        let always = [("format", FORMAT), ("config", &self.config), ("progress", &progress)];
-        let others = [(PROVENANCE, &self.provenance), (SCENE, &self.scene), (HAND, &self.hand)];
-        let others = others.into_iter().filter_map(|(key, text)| Some((key, text.as_deref()?)));
-        content.texts.extend(always.into_iter().chain(others).map(|(key, text)| (key.into(), text.into())));
+        let mut content = self.content.clone();
+        let progress = serde_json::to_string(&self.progress)?;
+        let always = [
+            ("format", FORMAT),
+            ("config", &self.config),
+            ("progress", &progress),
+            (SCENE, &self.scene),
+            (HAND, &self.hand),
+        ];
+        let provenance = self.provenance.iter().map(|text| (PROVENANCE, text.as_str()));
+        content.texts.extend(always.into_iter().chain(provenance).map(|(key, text)| (key.into(), text.into())));
         content.to_bytes()
     }
 
@@ -101,11 +107,6 @@ impl Checkpoint {
         alone.content.arrays.retain(|name, _| needed(name));
         alone.progress.fork = None;
         alone
-    }
-
-    /// Returns whether its scene may be the scene with this fingerprint.
-    pub fn is_of_scene(&self, fingerprint: &str) -> bool {
-        self.scene.as_ref().is_none_or(|scene| scene == fingerprint)
     }
 
     /// Adds an array.
@@ -223,11 +224,8 @@ impl Policy {
 }
 
 impl Ppo {
-    /// Returns the policy and everything that is needed to resume learning, with the configuration (TOML) and the
-    /// progress of the run. All ranks call it together.
-    pub fn checkpoint(&self, config: &str, progress: Progress) -> Checkpoint {
-        let (config, content) = (config.to_owned(), Content::default());
-        let mut checkpoint = Checkpoint { config, progress, provenance: None, scene: None, hand: None, content };
+    /// Adds the policy and everything that is needed to resume learning. All ranks call it together.
+    pub fn save(&self, checkpoint: &mut Checkpoint) {
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
         let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
@@ -246,7 +244,6 @@ impl Ppo {
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
         checkpoint.insert("normalizer.count", vector(&[normalizer.count]));
-        checkpoint
     }
 
     /// Starts with the policy of a checkpoint, or with a policy alone.
@@ -312,7 +309,9 @@ mod tests {
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
-        ppo.checkpoint("[env]", progress())
+        let mut checkpoint = Checkpoint { config: "[env]".into(), progress: progress(), ..Checkpoint::default() };
+        ppo.save(&mut checkpoint);
+        checkpoint
     }
 
     fn refusal(mut checkpoint: Checkpoint, into: &mut Ppo) -> String {

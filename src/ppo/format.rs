@@ -73,8 +73,7 @@ impl Content {
     /// Fails if the bytes were not written by [`Content::to_bytes`], or with [`Damaged`] if they were changed since.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let (mut texts, views) = read(bytes)?;
-        let stored =
-            texts.remove(CHECKSUM).context("no checksum: not a file of this program, or an older version wrote it")?;
+        let stored = texts.remove(CHECKSUM).context("no checksum: not a file of this program")?;
         let found = checksum(&texts, &views);
         ensure!(
             stored == found,

@@ -11,8 +11,9 @@ use tensorboard_proto::event::{Event, Event_oneof_what as What, SessionLog, Sess
 use tensorboard_proto::summary::{Summary, Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_rs::record_writer::RecordWriter;
 
+use super::histogram::Histogram;
 use super::records::length_up_to;
-use super::summary::{Descriptions, Media, image, markdown, value};
+use super::summary::{Descriptions, markdown, value};
 use crate::os::{Cannot, expect_named, make_own, sync_folder};
 
 /// The prefix and the suffix of the names of event files.
@@ -67,12 +68,16 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn iteration(&mut self, step: u64, values: &[(impl AsRef<str>, f64)], figures: &Media) -> Result<()> {
+    pub(super) fn iteration(
+        &mut self,
+        step: u64,
+        values: &[(impl AsRef<str>, f64)],
+        histograms: &[(&'static str, Histogram)],
+    ) -> Result<()> {
         let numbers = values.iter().filter(|(_, number)| !number.is_nan());
         let numbers = numbers.map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
-        let histograms = figures.histograms.iter().map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
-        let film = figures.film.iter().map(|(tag, film)| (*tag, Content::image(image(film))));
-        self.summary(numbers.chain(histograms).chain(film), step)
+        let histograms = histograms.iter().map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
+        self.summary(numbers.chain(histograms), step)
     }
 
     fn summary<'a>(&mut self, values: impl Iterator<Item = (&'a str, Content)>, step: u64) -> Result<()> {
@@ -146,7 +151,7 @@ pub(super) fn now() -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Animation, histogram};
+    use super::super::histogram;
     use super::*;
 
     fn read(path: &Path) -> Vec<Event> {
@@ -161,7 +166,7 @@ mod tests {
     }
 
     fn create(folder: &Path, first_step: u64) -> EventFile {
-        let tags = ["reward/fall", "histogram/std", "eval/film", SETTINGS];
+        let tags = ["reward/fall", "histogram/std", SETTINGS];
         let tags = tags.map(|name| (name.to_owned(), format!("of {name}")));
         EventFile::create(folder, first_step, &tags.into(), "[run]\nseed = 3\n").unwrap()
     }
@@ -170,11 +175,7 @@ mod tests {
     fn steps_after_the_checkpoint_and_half_written_events_are_cut_off() {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 0);
-        let figures = Media {
-            film: Some(("eval/film", Animation { size: [320, 240], gif: vec![7; 3 << 20] })),
-            ..Default::default()
-        };
-        (1..=4).for_each(|step| events.iteration(10 * step, &[("a", step as f64)], &figures).unwrap());
+        (1..=4).for_each(|step| events.iteration(10 * step, &[("a", step as f64)], &[]).unwrap());
         let path = events.path.clone();
         let half = [fs::read(&path).unwrap(), vec![9; 30]].concat();
         fs::write(&path, half).unwrap();
@@ -193,10 +194,9 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 7);
         let histograms = vec![("histogram/std", histogram([0.5_f32, 1.5].iter()))];
-        let film = Some(("eval/film", Animation { size: [3, 2], gif: vec![1, 2] }));
         let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
-        events.iteration(9, &values, &Media { histograms, film }).unwrap();
-        events.iteration(11, &values, &Media::default()).unwrap();
+        events.iteration(9, &values, &histograms).unwrap();
+        events.iteration(11, &values, &[]).unwrap();
         let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
         let found = read(&path);
         assert_eq!(found.len(), 5);
@@ -210,11 +210,10 @@ mod tests {
         assert_eq!((found[2].get_step(), settings.get_tag(), &plugin(settings)[..]), (7, "settings", "text"));
         assert_eq!(settings.get_tensor().get_string_val()[0], b"```\n[run]\nseed = 3\n\n```\n");
         let values = found[3].get_summary().get_value();
-        assert_eq!((found[3].get_step(), values.len()), (9, 3));
+        assert_eq!((found[3].get_step(), values.len()), (9, 2));
         assert_eq!((values[0].get_tag(), values[0].get_simple_value()), ("reward/fall", 0.25));
         assert_eq!((values[1].get_histo().get_num(), values[1].get_histo().get_max()), (2.0, 1.5));
-        assert_eq!(values[2].get_image().get_encoded_image_string(), [1, 2]);
-        assert_eq!([0, 1, 2].map(|i| plugin(&values[i])), ["scalars", "histograms", "images"]);
+        assert_eq!([0, 1].map(|i| plugin(&values[i])), ["scalars", "histograms"]);
         let metadata = values[1].get_metadata();
         assert_eq!(metadata.get_summary_description(), "of histogram/std");
         assert_eq!(metadata.get_unknown_fields().get(4).unwrap().varint, [2], "the data class");

@@ -21,5 +21,5 @@ pub use histogram::{Histogram, histogram};
 pub use hparams::Hparams;
 pub use kept::{expect_other_policy, expect_output};
 pub use report::Report;
-pub use summary::{Animation, Descriptions, Media};
+pub use summary::Descriptions;
 pub use table::{MetricsTable, read_metrics, table_of, value_at};

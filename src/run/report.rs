@@ -11,9 +11,10 @@ use anyhow::Result;
 
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
+use super::histogram::Histogram;
 use super::hparams::{self, HPARAMS, Hparams};
 use super::metrics::Metrics;
-use super::summary::{Descriptions, Media};
+use super::summary::Descriptions;
 use crate::os::{Status, StatusLine};
 
 /// The columns before the tags.
@@ -147,14 +148,20 @@ impl Report {
     }
 
     /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
-    pub fn iteration(&mut self, iteration: u64, values: &[(impl AsRef<str>, f64)], figures: &Media, status: &Status) {
+    pub fn iteration(
+        &mut self,
+        iteration: u64,
+        values: &[(impl AsRef<str>, f64)],
+        histograms: &[(&'static str, Histogram)],
+        status: &Status,
+    ) {
         (self.iterations.end, self.env_steps) = (iteration, status.env_steps);
         let names = values.iter().map(|(name, _)| name.as_ref());
         assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
         let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };
         let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
-        self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, figures));
+        self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, histograms));
         self.metrics.write(&self.progress, |metrics| metrics.row(&row));
         if !status.evaluation.is_nan() {
             let best = self.hparams.goals.map_or(status.evaluation, |goals| goals.max(status.evaluation));
@@ -162,8 +169,7 @@ impl Report {
             let drop_rate = values.iter().find(|(name, _)| name.as_ref() == "eval/drop_rate");
             let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
             let metrics = hparams::metrics(best, drop_rate, status.steps_per_s);
-            self.session
-                .write(&self.progress, |events| events.iteration(status.env_steps, &metrics, &Media::default()));
+            self.session.write(&self.progress, |events| events.iteration(status.env_steps, &metrics, &[]));
         }
         self.progress.show(status);
     }
@@ -228,10 +234,10 @@ mod tests {
         let mut report = open(place.path(), &tags, 0, 0);
         for iteration in 1..=3 {
             let values = [("loss/policy", 0.5 * iteration as f64), ("eval/goals", f64::NAN)];
-            report.iteration(iteration, &values, &Media::default(), &status(10 * iteration));
+            report.iteration(iteration, &values, &[], &status(10 * iteration));
         }
         let mut resumed = open(place.path(), &tags, 2, 20);
-        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &Media::default(), &status(30));
+        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &[], &status(30));
         let text = std::fs::read_to_string(place.path().join("metrics.csv")).unwrap();
         assert_eq!(text, "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n");
     }
@@ -241,17 +247,17 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("gone");
         let mut report = open(&folder, &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &Media::default(), &status(10));
+        report.iteration(1, &[("a", 1.0)], &[], &status(10));
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
         report.sync();
-        report.iteration(2, &[("a", 2.0)], &Media::default(), &status(20));
+        report.iteration(2, &[("a", 2.0)], &[], &status(20));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
         // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
-        report.iteration(3, &[("a", 3.0)], &Media::default(), &status(30));
+        report.iteration(3, &[("a", 3.0)], &[], &status(30));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
-        report.iteration(4, &[("a", 4.0)], &Media::default(), &status(40));
+        report.iteration(4, &[("a", 4.0)], &[], &status(40));
         assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 3);
     }
@@ -261,7 +267,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         std::os::unix::fs::symlink("/dev/full", place.path().join(METRICS)).unwrap();
         let mut report = open(place.path(), &["a"], 0, 0);
-        report.iteration(1, &[("a", 1.0)], &Media::default(), &status(10));
+        report.iteration(1, &[("a", 1.0)], &[], &status(10));
         report.sync();
         assert_eq!((report.metrics.lost, report.events.lost), (1, 0));
     }

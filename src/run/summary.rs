@@ -1,37 +1,17 @@
-//! The values of an event for TensorBoard: numbers, histograms, an animated picture, text.
+//! The values of an event for TensorBoard: numbers, histograms, text.
 //!
-//! Numbers, histograms and pictures have the older form, which is smaller and which all readers convert. The first value of a
+//! Numbers and histograms have the older form, which is smaller and which all readers convert. The first value of a
 //! tag in a file also holds its plugin, data class and description. Without a data class, TensorBoard shows no description.
 
 use std::collections::HashMap;
 
 use protobuf::Message;
-use tensorboard_proto::summary::{Summary_Image, Summary_Value, Summary_Value_oneof_value as Content};
+use tensorboard_proto::summary::{Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_proto::tensor::TensorProto;
 use tensorboard_proto::types::DataType;
 
-use super::Histogram;
-
 /// The descriptions of the logged quantities, by their tags.
 pub type Descriptions = HashMap<String, String>;
-
-/// What some iterations have in the event file besides numbers, each with its tag.
-#[derive(Debug, Default)]
-pub struct Media {
-    /// Histograms.
-    pub histograms: Vec<(&'static str, Histogram)>,
-    /// An animated picture.
-    pub film: Option<(&'static str, Animation)>,
-}
-
-/// An animated picture.
-#[derive(Debug)]
-pub struct Animation {
-    /// Width and height in pixels.
-    pub size: [u32; 2],
-    /// The bytes of a GIF file.
-    pub gif: Vec<u8>,
-}
 
 /// The number of the field `data_class` of the metadata, which tensorboard-proto does not know.
 const DATA_CLASS: u32 = 4;
@@ -42,7 +22,6 @@ pub(super) fn value(tag: &str, content: Content, description: Option<String>) ->
     let (plugin, data_class) = match content {
         Content::simple_value(_) => ("scalars", 1),
         Content::histo(_) => ("histograms", 2),
-        Content::image(_) => ("images", 3),
         _ => ("text", 2),
     };
     let Some(description) = description else {
@@ -69,10 +48,4 @@ pub(super) fn markdown(text: &str) -> TensorProto {
     tensor.mut_tensor_shape();
     tensor.mut_string_val().push(text.as_bytes().to_vec());
     tensor
-}
-
-/// Returns a picture in colour.
-pub(super) fn image(film: &Animation) -> Summary_Image {
-    let [width, height] = film.size.map(|pixels| pixels as i32);
-    Summary_Image { width, height, colorspace: 3, encoded_image_string: film.gif.clone(), ..Summary_Image::default() }
 }

@@ -17,7 +17,7 @@ mod window;
 pub use columns::About;
 pub use display::task_for_display;
 #[cfg(feature = "video")]
-pub use film::{EpisodeFilms, Film, screenshot};
+pub use film::{Film, screenshot};
 pub use live::{Acting, Live};
 pub use replay::{MOST_EPISODES, Replay};
 pub use sliders::Sliders;

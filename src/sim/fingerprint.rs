@@ -18,8 +18,8 @@ macro_rules! unusual {
 }
 
 /// Returns a checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
-/// nothing are left out, and so are sensors, keyframes and plugins. Quantities that version 0.3 left out count only where they are
-/// unusual, so that the checksum of other scenes stays the same.
+/// nothing are left out, and so are sensors, keyframes and plugins. The quantities of the second list count only where they are
+/// unusual, so that the checksum of other scenes stays the same when the list grows.
 pub(super) fn fingerprint(model: &MjModel) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |parts: &[&dyn Debug]| parts.iter().for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()));

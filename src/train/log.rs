@@ -62,11 +62,10 @@ pub(super) fn tags(randomizes: bool) -> Vec<String> {
 // What is logged besides numbers and settings.
 const ACTIONS: &str = "histogram/actions";
 const ADVANTAGES: &str = "histogram/advantages";
-pub(super) const FILM: &str = "eval/film";
 
 /// Returns the values with these names and all other things that are logged, with their descriptions.
 pub(super) fn described(names: &[String]) -> Descriptions {
-    let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, FILM, run::SETTINGS]);
+    let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
     all.map(|name| (name.to_owned(), quantity(name).map(|known| known.description).unwrap_or_default())).collect()
 }
 

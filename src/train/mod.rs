@@ -1,7 +1,5 @@
 //! The training loop: collect, learn, evaluate, report, save.
 
-#[cfg(feature = "video")]
-mod films;
 mod hints;
 mod lockstep;
 mod log;
@@ -26,10 +24,8 @@ use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
 use crate::repose::{HEADLINE, Repose, Score, StepSums, Task, divergence, measure};
-use crate::run::{Hparams, Media, Report};
+use crate::run::{Histogram, Hparams, Report};
 use crate::schedule::panic_message;
-#[cfg(feature = "video")]
-use films::film;
 use hints::hints;
 use lockstep::{STOPPED, follow};
 use log::{Ended, described, histograms, row, tags};
@@ -161,7 +157,7 @@ impl Session {
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
             let Some(evaluation) = self.evaluate(due, now, lead.as_mut())? else { return Ok(None) };
-            let Some(media) = self.media(now, lead.as_mut()) else { return Ok(None) };
+            let histograms = self.histograms(lead.is_some());
             let improved = self.take_down(&evaluation);
             let (pool, exchange) = (&mut self.agent.pool, &self.agent.exchange);
             let ended = exchange.all_gather(pool.take_finished()).concat();
@@ -174,31 +170,15 @@ impl Session {
             let steps = exchange.sum(&sums, total, |sum, more| *sum += more);
             let decision =
                 self.decide(requests, lead.is_some_and(|lead| lead.saver.held.folder.take_stop()), improved)?;
-            Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, media, decision }))
+            Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, histograms, decision }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
     }
 
-    /// Returns the histograms and the film that are due after this iteration, or `None` if a stop was requested meanwhile. Only
-    /// the first rank has some.
-    #[cfg_attr(not(feature = "video"), expect(unused_variables, reason = "only a film answers requests and may warn"))]
-    fn media(&mut self, requests: &Requests, lead: Option<&mut Lead>) -> Option<Media> {
-        let mut media = Media::default();
-        let Some(lead) = lead else { return Some(media) };
-        if self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY) {
-            media.histograms = histograms(&self.agent.rollout);
-        }
-        #[cfg(feature = "video")]
-        if self.films.is_some() && self.agent.iteration.is_multiple_of(self.config.run.film_every) {
-            let episodes = self.evaluation_episodes();
-            let task = self.task_now();
-            let film = film(&mut self.films, (&task, self.agent.ppo.policy(), episodes), requests, lead);
-            if requests.stop().load(std::sync::atomic::Ordering::Relaxed) {
-                return None;
-            }
-            media.film = film.map(|film| (log::FILM, film));
-        }
-        Some(media)
+    /// The histograms that are due after this iteration. Only the first rank has some.
+    fn histograms(&self, is_first: bool) -> Vec<(&'static str, Histogram)> {
+        let due = is_first && self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY);
+        if due { histograms(&self.agent.rollout) } else { Vec::new() }
     }
 
     /// The task as far as training has come.
@@ -268,7 +248,7 @@ impl Session {
     }
 
     fn report(&mut self, report: &mut Report, outcome: &Outcome) {
-        let Outcome { iteration, steps, evaluation, media, .. } = outcome;
+        let Outcome { iteration, steps, evaluation, histograms, .. } = outcome;
         let ended = Ended::new(&outcome.ended, self.config.env.ctrl_dt, self.config.randomization.happens());
         let (env_steps, steps_per_s) = (self.agent.env_steps, iteration.steps_per_s());
         let goals = ended.shown()["goals"];
@@ -290,7 +270,7 @@ impl Session {
                  large; lower ppo.learning_rate_range or ppo.learning_rate"
             ));
         }
-        report.iteration(self.agent.iteration, &row(outcome, &ended), media, &status);
+        report.iteration(self.agent.iteration, &row(outcome, &ended), histograms, &status);
     }
 }
 

@@ -3,7 +3,7 @@
 use super::lockstep::Decision;
 use crate::agent::Iteration;
 use crate::repose::{EpisodeStats, Lesson, Score, StepSums};
-use crate::run::Media;
+use crate::run::Histogram;
 
 /// The results of one iteration, of all ranks unless stated otherwise.
 #[derive(Debug, Default)]
@@ -18,8 +18,8 @@ pub(super) struct Outcome {
     pub evaluation: Score,
     /// The cost of the exchange while collecting and learning, by name.
     pub traffic: [(&'static str, f64); 2],
-    /// Histograms and film of the environments of this rank.
-    pub media: Media,
+    /// Histograms of the rollout on this rank, by tag, if they are due.
+    pub histograms: Vec<(&'static str, Histogram)>,
     /// What follows the iteration.
     pub decision: Decision,
 }

@@ -5,8 +5,6 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 
-#[cfg(feature = "video")]
-use super::films::films;
 use super::saver::Saver;
 use super::start::{Plan, Takes};
 use crate::agent::Agent;
@@ -18,8 +16,6 @@ use crate::ppo::{Checkpoint, Evaluation, Rise};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
 use crate::run::{self, RunFolder};
-#[cfg(feature = "video")]
-use crate::see::EpisodeFilms;
 
 /// Everything that a training owns, except its saver.
 pub(super) struct Session {
@@ -33,9 +29,6 @@ pub(super) struct Session {
     pub best: Option<Evaluation>,
     /// How far evaluations have risen, if the run ends when they no longer do.
     pub rise: Option<Rise>,
-    /// What films evaluation episodes, as long as that works.
-    #[cfg(feature = "video")]
-    pub films: Option<EpisodeFilms>,
     /// The number of steps of this session in which the physics diverged.
     pub diverged: u64,
     /// Whether the warning about them was printed.
@@ -87,12 +80,6 @@ impl Session {
         let set_up = || {
             // As it is saved.
             config.run.shards = config.shards();
-            #[cfg(feature = "video")]
-            let films = exchange.is_first().then(|| films(&task, &config)).flatten();
-            #[cfg(not(feature = "video"))]
-            if config.run.film_every > 0 {
-                os::say(&format!("warning: run.film_every: no films in this session: {}", crate::see::NO_FILMS));
-            }
             let agent = Agent::for_task(&task, &config, exchange)?;
             let mut session = Self {
                 scene: task.scene().fingerprint(),
@@ -102,8 +89,6 @@ impl Session {
                 agent,
                 best,
                 rise: None,
-                #[cfg(feature = "video")]
-                films,
                 diverged: 0,
                 warned: false,
                 far: 0,
@@ -131,7 +116,7 @@ impl Session {
             return checkpoint.finish();
         }
         self.rise = checkpoint.progress.rise;
-        if !checkpoint.is_of_scene(&self.scene) && agent.exchange.is_first() {
+        if checkpoint.scene != self.scene && agent.exchange.is_first() {
             os::say("warning: the scene differs from the checkpoint's scene: the resumed run is a different training");
         }
         checkpoint.finish()
@@ -139,10 +124,13 @@ impl Session {
 
     /// Returns the complete state at the end of the last iteration.
     pub(super) fn checkpoint(&self) -> Checkpoint {
-        let mut checkpoint = self.agent.checkpoint(&self.config.to_text(), self.best);
+        let mut checkpoint = Checkpoint::default();
+        self.agent.save(&mut checkpoint);
+        checkpoint.progress.best = self.best;
         checkpoint.progress.rise = self.rise;
-        checkpoint.scene = Some(self.scene.clone());
-        checkpoint.hand = Some(self.hand.to_text());
+        checkpoint.config = self.config.to_text();
+        checkpoint.scene = self.scene.clone();
+        checkpoint.hand = self.hand.to_text();
         checkpoint
     }
 

@@ -287,7 +287,11 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
-    let same = checkpoint.is_of_scene(&Task::new(&before, &config.hand)?.scene().fingerprint());
-    ensure!(same, "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep", config.env.model);
+    let here = Task::new(&before, &config.hand)?.scene().fingerprint();
+    ensure!(
+        checkpoint.scene == here,
+        "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",
+        config.env.model
+    );
     Ok(())
 }

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use shadow_repose::ppo::{Checkpoint, Evaluation, sealed};
+use shadow_repose::ppo::{Checkpoint, Evaluation};
 
 use crate::support::{metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
 
@@ -242,70 +242,39 @@ fn the_same_training_writes_the_same_bytes() {
     }
 }
 
-#[test]
-fn a_file_of_an_older_version_is_refused_by_one_sentence_that_names_the_version() {
-    let folder = trained(&[]);
-    let path = folder.path().join("run/checkpoints/latest.safetensors");
-    let bytes = fs::read(&path).unwrap();
-    for (format, version) in [("checkpoint 2", "0.1.0"), ("checkpoint 3", "0.2.0")] {
-        let place = bytes.windows(12).position(|part| part == b"checkpoint 4").unwrap();
-        let mut older = bytes.clone();
-        older[place..place + 12].copy_from_slice(format.as_bytes());
-        fs::write(&path, sealed(&older).unwrap()).unwrap();
-        for args in [["train", "--resume", "run"], ["play", "--json", "--ckpt=run/checkpoints/latest.safetensors"]] {
-            let refused = program(folder.path(), &args);
-            assert_eq!(refused.status.code(), Some(1));
-            let said = stderr(&refused);
-            assert!(
-                said.contains(&format!("made by version {version}, whose files this version does not read")),
-                "{said}"
-            );
-        }
-    }
-}
-
-/// Puts back into a checkpoint what version 0.2.0 additionally wrote.
-const AS_0_2_0: &str = "
-import json, struct, sys
+/// Writes a file of today as commit 4303414 would have written it.
+const AS_BEFORE: &str = "
+import sys
 sys.path.insert(0, sys.argv[1])
 from provenance import read, write
 texts, arrays, data = read(sys.argv[2])
-texts.pop('scene', None)
-texts['format'] = 'shadow-repose checkpoint 3'
-texts['config'] = texts['config'].replace('symmetry = \"cube\"\\n', '')
-for name, kind, shape, more in [('scene', 'U64', [1], bytes(8))] + [
-    (f'adam.{moment}.log_std', 'F32', [20], bytes(80)) for moment in ('mean', 'square')
-]:
-    arrays[name] = {'dtype': kind, 'shape': shape, 'data_offsets': [len(data), len(data) + len(more)]}
-    data += more
+texts['format'] = 'shadow-repose checkpoint 4'
+texts['config'] = texts['config'].replace('[run]\n', '[run]\nfilm_every = 0\n')
 write(sys.argv[3], texts, arrays, data)
 ";
 
 #[test]
-fn a_checkpoint_of_0_2_0_is_converted_by_a_script_and_goes_on() {
-    let folder = trained(&["--set", "ppo.symmetry=none"]);
+fn an_earlier_file_is_refused_with_the_name_of_a_script_that_converts_it_without_a_loss() {
+    let folder = trained(&[]);
+    let run = folder.path().join("run");
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
-    let latest = folder.path().join("run/checkpoints/latest.safetensors");
-    let [older, newer] = ["older", "newer"].map(|name| folder.path().join(name));
-    let python = |first: &std::ffi::OsStr, more: &[&Path]| {
-        let done = std::process::Command::new("python3").arg(first).args(more).output().unwrap();
+    let [backwards, earlier, converted] = ["backwards.py", "earlier", "converted"].map(|name| folder.path().join(name));
+    fs::write(&backwards, AS_BEFORE).unwrap();
+    let python = |script: &Path, args: &[&Path]| {
+        let done = std::process::Command::new("python3").arg(script).args(args).output().unwrap();
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     };
-    let script = folder.path().join("older.py");
-    fs::write(&script, AS_0_2_0).unwrap();
-    python(script.as_os_str(), &[&scripts, &latest, &older]);
-    python(scripts.join("convert").as_os_str(), &[&older, &newer]);
-    let [one, other] = [&latest, &newer].map(|path| Checkpoint::parse(&fs::read(path).unwrap()).unwrap());
-    assert!(other.config.contains("symmetry = \"none\"") && other.scene.is_none(), "{}", other.config);
-    for name in ["log_std", "envs.numbers", "adam.mean.actor.0.weight"] {
-        assert_eq!(one.shape(name), other.shape(name), "{name}");
+    for name in ["policy.safetensors", "checkpoints/latest.safetensors"] {
+        let today = run.join(name);
+        python(&backwards, &[&scripts, &today, &earlier]);
+        let refused = program(folder.path(), &["play", "--json", "--ckpt", "earlier"]);
+        assert_eq!(refused.status.code(), Some(1));
+        assert!(stderr(&refused).contains("`scripts/convert OLD NEW` writes it as"), "{}", stderr(&refused));
+        python(&scripts.join("convert"), &[&earlier, &converted]);
+        let [expected, found] =
+            [&today, &converted].map(|path| Checkpoint::parse(&fs::read(path).unwrap()).unwrap().to_bytes().unwrap());
+        assert!(found == expected, "{name}");
     }
-    fs::copy(&newer, &latest).unwrap();
-    fs::remove_file(folder.path().join("run/config.toml")).unwrap();
-    succeeded(program(
-        folder.path(),
-        &["train", "--resume", "run/checkpoints/latest.safetensors", "--total-steps", "512"],
-    ));
 }
 
 #[test]

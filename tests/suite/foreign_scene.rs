@@ -68,7 +68,7 @@ fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_st
         Scene::load(Some(&path), &plain).unwrap().fingerprint()
     };
     let builtin = Scene::load(None, &plain).unwrap().fingerprint();
-    // Checkpoints of earlier versions hold this one.
+    // Checkpoints hold this one.
     assert_eq!(builtin, "bdf8dcb5");
     assert_eq!(print(&[]), builtin);
     for servo in ["armature=\".01\"", "damping=\".1\""] {

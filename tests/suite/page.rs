@@ -239,7 +239,7 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
         (changed(&[(3, &other)]), &[], "line 3: `qpos` is not a list of 31 numbers"),
         (changed(&[(3, &large)]), &[], "line 3: `qpos`"),
         (changed(&[(3, &steps)]), &[], "line 3: `step` is not a count up to 32767"),
-        (changed(&[(1, &older)]), &[], "an older version wrote it"),
+        (changed(&[(1, &older)]), &[], "it has no settings"),
         (text.clone(), &["--set", "env.ctrl_dt=0.02"], "a trace has its own settings"),
         (fs::read_to_string(folder.join("own.jsonl")).unwrap(), &[], "add --set env.model=joints.xml"),
         (text.clone(), &["--set", "env.model=joints.xml"], "it was recorded with another hand, which has other joints"),

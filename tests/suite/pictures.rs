@@ -16,9 +16,7 @@ use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-use crate::support::{
-    colours_of_the_cube, command, events, must_be_possible, program, started, stderr, succeeded, task, train,
-};
+use crate::support::{colours_of_the_cube, command, must_be_possible, program, started, stderr, succeeded, task};
 
 /// Returns whether pictures can be drawn here. Without EGL it prints a note, or fails if CI has installed EGL.
 fn can_draw() -> bool {
@@ -287,44 +285,6 @@ fn without_egl_the_packages_are_named() {
         assert!(!said.contains("panicked"), "{said}");
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
-}
-
-/// Trains for three iterations with a film after every second, and returns the films in its event file and what it said.
-fn training_with_films(folder: &Path, libraries: Option<&str>) -> (Vec<(i64, Vec<u8>)>, String) {
-    let args = train(&["--run-dir", "run", "--total-steps", "384", "--set", "run.film_every=2"]);
-    let mut command = command(folder, &args);
-    libraries.map(|libraries| command.env("__EGL_VENDOR_LIBRARY_DIRS", libraries));
-    let output = succeeded(command.output().unwrap());
-    let events = events(&folder.join("run"));
-    let values = events.iter().flat_map(|e| e.get_summary().get_value().iter().map(|value| (e.get_step(), value)));
-    let films = values.filter(|(_, value)| value.get_tag() == "eval/film");
-    let films = films.map(|(step, value)| (step, value.get_image().get_encoded_image_string().to_vec())).collect();
-    (films, stderr(&output))
-}
-
-#[test]
-fn a_training_films_an_evaluation_episode_and_learns_the_same_without_films() {
-    if !can_draw() {
-        return;
-    }
-    let (seen, unseen) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let (films, said) = training_with_films(seen.path(), None);
-    assert!(!said.contains("warning"), "{said}");
-    assert_eq!(films.iter().map(|(step, _)| *step).collect::<Vec<_>>(), [256]);
-    let mut options = gif::DecodeOptions::new();
-    options.set_color_output(gif::ColorOutput::RGBA);
-    let mut film = options.read_info(&films[0].1[..]).unwrap();
-    assert_eq!((film.width(), film.height()), (320, 240));
-    let mut frames = 0;
-    while film.read_next_frame().unwrap().is_some() {
-        frames += 1;
-    }
-    assert_eq!(frames, 2, "0.2 s at 10 frames per second");
-    // Without EGL there is one warning and no film, and the training is the same.
-    let (films, said) = training_with_films(unseen.path(), Some("/nonexistent"));
-    assert_eq!((films.len(), said.matches("warning: run.film_every").count()), (0, 1), "{said}");
-    let policy = |folder: &Path| fs::read(folder.join("run/policy.safetensors")).unwrap();
-    assert!(policy(seen.path()) == policy(unseen.path()));
 }
 
 #[test]

@@ -158,7 +158,9 @@ fn continued(from: Option<&[u8]>, iterations: usize, ranks: usize, config: &Conf
         for _ in 0..iterations {
             agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         }
-        agent.checkpoint("", None)
+        let mut end = Checkpoint::default();
+        agent.save(&mut end);
+        end
     };
     on_ranks(ranks, 8, work).swap_remove(0).to_bytes().unwrap()
 }

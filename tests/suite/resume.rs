@@ -137,8 +137,8 @@ fn a_newest_checkpoint_that_cannot_be_used_as_asked_is_not_passed_over() {
     // A checkpoint of another version.
     let newest = folder.join(checkpoint(12));
     let whole = fs::read(&newest).unwrap();
-    let text = String::from_utf8_lossy(&whole).replacen("shadow-repose checkpoint 4", "shadow-repose checkpoint 9", 1);
-    let at = whole.windows(12).position(|window| window == b"checkpoint 4").unwrap();
+    let text = String::from_utf8_lossy(&whole).replacen("shadow-repose checkpoint 5", "shadow-repose checkpoint 9", 1);
+    let at = whole.windows(12).position(|window| window == b"checkpoint 5").unwrap();
     let mut newer = whole.clone();
     newer[at + 11] = b'9';
     assert!(text.contains("checkpoint 9"));

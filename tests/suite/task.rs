@@ -4,6 +4,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::env::{End, Env};
+use shadow_repose::ppo::Checkpoint;
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::repose::{Repose, Step, Task, task_reward};
 use shadow_repose::rng;
@@ -292,7 +293,9 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
             "only those episodes end"
         );
     }
-    agent.checkpoint("", None).to_bytes().expect("all weights are finite");
+    let mut end = Checkpoint::default();
+    agent.save(&mut end);
+    end.to_bytes().expect("all weights are finite");
 }
 
 #[test]

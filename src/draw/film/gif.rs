@@ -1,13 +1,14 @@
 //! GIF: one palette for the whole film. Each frame holds only what differs from the previous one.
 
 use std::borrow::Cow;
-use std::io::{BufWriter, Write};
+use std::io::BufWriter;
 
 use anyhow::{Result, anyhow};
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
 use super::format::{FilmFormat, Frames};
+use crate::os::OutputFile;
 
 /// The number of colours in the palette. The index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
@@ -21,7 +22,7 @@ const PIXELS_FOR_PALETTE: usize = 400_000;
 ///
 /// # Errors
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
-pub(super) fn encode<W: Write>(file: W, format: FilmFormat, frames: Frames) -> Result<W> {
+pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Result<OutputFile> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
     let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
     let mut palette = Palette::new(&waiting);

@@ -1,4 +1,4 @@
-//! Films and pictures: H.264 in MP4, GIF and PNG files, or a GIF in memory.
+//! Films and pictures: H.264 in MP4, GIF and PNG files.
 //!
 //! One thread draws a film and another encodes it, which keeps both cores of a small machine busy.
 
@@ -8,7 +8,7 @@ mod gif;
 mod mp4;
 
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -83,15 +83,7 @@ impl FilmWriter {
     }
 }
 
-/// Returns a film of these frames in memory, as a GIF.
-///
-/// # Errors
-/// Fails if the pictures are too large for a GIF.
-pub fn gif_of(frames: Vec<Frame>, format: FilmFormat) -> Result<Vec<u8>> {
-    gif::encode(Vec::new(), format, &mut captioned(frames, format))
-}
-
-fn captioned(frames: impl IntoIterator<Item = Frame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
+fn captioned(frames: Receiver<Frame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
     frames.into_iter().map(move |(mut rgb, lines)| {
         caption::draw(&mut rgb, format.size, &lines);
         rgb
