@@ -25,7 +25,7 @@
 //! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
-//! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, run, sim |
+//! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule, spaces |

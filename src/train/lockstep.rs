@@ -1,19 +1,28 @@
-//! A training on several ranks: they agree on what follows an iteration, and the others follow the first one.
+//! A training on several ranks: they agree on what follows an iteration.
 
-use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::session::Session;
-use super::start::Plan;
-use crate::os::{self, Requests};
-use crate::ranks::Exchange;
-use crate::sim;
+use crate::os::Requests;
 
-/// The reason for the end of a training that was asked to stop, other than by a file.
-pub(super) const STOPPED: &str = "stopped";
+/// Why a run ends before all its steps are made.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stop {
+    /// Whether the user has asked for it by a file.
+    pub by_file: bool,
+    /// The signal that has asked for it, or 0.
+    pub signal: i32,
+}
+
+impl Stop {
+    /// The stop that these requests ask for.
+    pub(super) fn by_signal(requests: &Requests) -> Self {
+        Self { by_file: false, signal: requests.signal() }
+    }
+}
 
 /// What follows an iteration.
 #[derive(Debug, Default)]
@@ -22,8 +31,8 @@ pub(super) struct Decision {
     pub save: bool,
     /// Whether the state is handed to the saver. If nobody else waits, it always is: the next iteration may be cut short.
     pub hand_over: bool,
-    /// The exit code and the reason if the training is to stop here.
-    pub stop: Option<(ExitCode, &'static str)>,
+    /// Whether the run stops here.
+    pub stop: Option<Stop>,
 }
 
 /// What all ranks must know to decide.
@@ -34,36 +43,6 @@ struct Vote {
     improved: bool,
     signal: i32,
     weights: u32,
-}
-
-/// Computes, and leaves reporting and saving to the first rank.
-pub(super) fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
-    sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
-    let mut plan = Plan::receive(exchange)?;
-    let loaded = plan.load_task()?;
-    os::start_threads(plan.config.run.threads)?;
-    let exchange = exchange.clone().over(plan.config.shards())?;
-    let mut session = Session::new(plan, loaded, exchange)?;
-    session.agent.exchange.expect_alike(&session.scene)?;
-    requests.wait_for_end();
-    // The state that the saver begins with.
-    session.checkpoint();
-    if session.finished() {
-        return Ok(ExitCode::SUCCESS);
-    }
-    session.begin(requests, None)?;
-    session.checkpoint();
-    while !session.finished() {
-        let done = session.iterate(requests, None)?.context("a stop comes between iterations")?;
-        if done.decision.hand_over {
-            session.checkpoint();
-        }
-        session.dumps();
-        if let Some((code, _)) = done.decision.stop.filter(|_| !session.finished()) {
-            return Ok(code);
-        }
-    }
-    Ok(ExitCode::SUCCESS)
 }
 
 impl Session {
@@ -87,8 +66,7 @@ impl Session {
         }
         let any = |of: fn(&Vote) -> bool| votes.iter().any(of);
         let signal = votes.iter().map(|vote| vote.signal).max().unwrap_or(0);
-        let reason = if by_file { "stopped by the file `stop`" } else { STOPPED };
-        let stop = any(|vote| vote.stop).then(|| (os::exit_code(signal), reason));
+        let stop = any(|vote| vote.stop).then_some(Stop { by_file, signal });
         let save = any(|vote| vote.save) || self.agent.iteration.is_multiple_of(self.config.run.checkpoint_every);
         let last = self.finished() || stop.is_some();
         let hand_over = exchange.is_alone() || last || save || any(|vote| vote.improved);

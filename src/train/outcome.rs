@@ -20,6 +20,8 @@ pub(super) struct Outcome {
     pub traffic: [(&'static str, f64); 2],
     /// Histograms of the rollout on this rank, by tag, if they are due.
     pub histograms: Vec<(&'static str, Histogram)>,
+    /// The steps that led to each divergence, as files with these names and texts.
+    pub dumps: Vec<(String, String)>,
     /// What follows the iteration.
     pub decision: Decision,
 }

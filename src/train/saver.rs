@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::load;
-use crate::os::{self, Locked, Requests};
+use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -186,23 +186,6 @@ impl Saver {
                 Err(error) => os::say(&format!("error: {:#}", held.elsewhere(error))),
             }
         });
-    }
-}
-
-/// What only the first of all ranks has.
-pub(super) struct Lead<'a> {
-    /// What it reports to.
-    pub report: &'a mut Report,
-    /// What saves its training.
-    pub saver: &'a mut Saver,
-}
-
-impl Lead<'_> {
-    /// Saves the state at the end of the last complete iteration, if that is requested. Work that takes long calls this meanwhile.
-    pub(super) fn save_if_asked(&mut self, requests: &Requests) {
-        if self.saver.held.wrote && requests.take_save() {
-            self.saver.save_or_warn(self.report);
-        }
     }
 }
 

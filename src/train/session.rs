@@ -16,6 +16,7 @@ use crate::ppo::{Checkpoint, Evaluation, Rise};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
 use crate::run::{self, RunFolder};
+use crate::sim;
 
 /// Everything that a training owns, except its saver.
 pub(super) struct Session {
@@ -29,12 +30,6 @@ pub(super) struct Session {
     pub best: Option<Evaluation>,
     /// How far evaluations have risen, if the run ends when they no longer do.
     pub rise: Option<Rise>,
-    /// The number of steps of this session in which the physics diverged.
-    pub diverged: u64,
-    /// Whether the warning about them was printed.
-    pub warned: bool,
-    /// The iterations in a row after which the policy had moved far more than it should.
-    pub far: u32,
     /// Whether the steps that led to them are written.
     pub dumps: bool,
     /// The fingerprint of the scene.
@@ -71,6 +66,23 @@ impl Session {
         Ok((session, saver))
     }
 
+    /// Sets up the training that the first rank has planned.
+    ///
+    /// # Errors
+    /// Fails as [`Plan::receive`] and [`Session::new`] do.
+    pub(super) fn follow(exchange: &Exchange) -> Result<Self> {
+        sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
+        let mut plan = Plan::receive(exchange)?;
+        let loaded = plan.load_task()?;
+        os::start_threads(plan.config.run.threads)?;
+        let exchange = exchange.clone().over(plan.config.shards())?;
+        let session = Self::new(plan, loaded, exchange)?;
+        session.agent.exchange.expect_alike(&session.scene)?;
+        // Together with the state that the saver begins with.
+        session.checkpoint();
+        Ok(session)
+    }
+
     /// Sets up the planned training of a task by a policy with this record.
     ///
     /// # Errors
@@ -81,19 +93,8 @@ impl Session {
             // As it is saved.
             config.run.shards = config.shards();
             let agent = Agent::for_task(&task, &config, exchange)?;
-            let mut session = Self {
-                scene: task.scene().fingerprint(),
-                hand,
-                config,
-                task,
-                agent,
-                best,
-                rise: None,
-                diverged: 0,
-                warned: false,
-                far: 0,
-                dumps,
-            };
+            let mut session =
+                Self { scene: task.scene().fingerprint(), hand, config, task, agent, best, rise: None, dumps };
             from.map_or(Ok(()), |(takes, checkpoint)| session.start(takes, checkpoint))?;
             Ok(session)
         };

@@ -249,7 +249,10 @@ sys.path.insert(0, sys.argv[1])
 from provenance import read, write
 texts, arrays, data = read(sys.argv[2])
 texts['format'] = 'shadow-repose checkpoint 4'
-texts['config'] = texts['config'].replace('[run]\n', '[run]\nfilm_every = 0\n')
+former = {'env': 'mirror = false', 'ppo': 'minibatch_size = 0', 'run': 'film_every = 0'}
+former['training'] = next(line for line in texts['config'].splitlines() if 'act_moving_average' in line)
+for section, line in former.items():
+    texts['config'] = texts['config'].replace(f'[{section}]', f'[{section}]{chr(10)}{line}')
 write(sys.argv[3], texts, arrays, data)
 ";
 

@@ -1,0 +1,253 @@
+//! What a rank does besides computing: the first one reports and saves, the others nothing.
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::{Error, Result};
+
+use super::lockstep::Stop;
+use super::log::{Ended, described, row, tags};
+use super::outcome::Outcome;
+use super::saver::Saver;
+use super::session::Session;
+use crate::config::EnvConfig;
+use crate::load::scene_option;
+use crate::os::{self, Requests, Status, StatusLine};
+use crate::ppo::{Checkpoint, Rise};
+use crate::repose::{HEADLINE, Score, divergence, measure};
+use crate::run::{Hparams, Report};
+
+/// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
+const FAR: f64 = 10.0;
+const FAR_FOR: u32 = 20;
+
+/// What a rank does besides computing. By default that is nothing.
+pub(super) trait Role {
+    /// Whether the user asks by a file to stop.
+    fn is_stopped_by_file(&self) -> bool {
+        false
+    }
+
+    /// Answers requests. Work that takes long calls this meanwhile.
+    fn attend(&mut self, _requests: &Requests) {}
+
+    /// Shows the score of an evaluation.
+    fn evaluated(&mut self, _env_steps: u64, _score: &Score) {}
+
+    /// Takes over the state at the end of an iteration, to save it.
+    fn keep(&mut self, _state: Checkpoint) {}
+
+    /// Reports an iteration.
+    ///
+    /// # Errors
+    /// Fails if the run folder cannot be written to for the first time.
+    fn report(&mut self, _session: &Session, _outcome: &Outcome) -> Result<()> {
+        Ok(())
+    }
+
+    /// Saves the state that was kept.
+    fn save(&mut self) {}
+
+    /// Ends a run that is asked to stop. The exit code is the program's.
+    ///
+    /// # Errors
+    /// Fails if the run folder cannot be written to.
+    fn stop(&mut self, stop: Stop) -> Result<ExitCode> {
+        Ok(os::exit_code(stop.signal))
+    }
+
+    /// Ends a run that has failed for this reason.
+    fn give_up(&mut self, reason: Error) -> Error {
+        reason
+    }
+
+    /// Ends a run that has made all its steps.
+    ///
+    /// # Errors
+    /// Fails if the run folder cannot be written to.
+    fn finish(&mut self, _session: &Session) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// A rank that only computes.
+pub(super) struct Follower;
+
+impl Role for Follower {}
+
+/// The first rank.
+pub(super) struct Lead {
+    report: Report,
+    saver: Saver,
+    /// The number of steps of this session in which the physics diverged.
+    diverged: u64,
+    /// Whether the warning about them was printed.
+    warned: bool,
+    /// The iterations in a row after which the policy had moved far more than it should.
+    far: u32,
+}
+
+impl Lead {
+    /// Prepares the report of a run. A quiet one shows no progress.
+    pub(super) fn new(session: &Session, saver: Saver, quiet: bool) -> Self {
+        let config = &session.config;
+        let tags = tags(config.randomization.happens());
+        let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
+        let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
+        let report = Report::new(saver.held.folder.path(), &tags, progress);
+        let report = report.described(described(&tags), config.to_text(), hparams);
+        Self { report, saver, diverged: 0, warned: false, far: 0 }
+    }
+
+    /// Writes into the folder of a new run for the first time.
+    ///
+    /// # Errors
+    /// Fails if the folder cannot be written to. It is then cleared.
+    pub(super) fn open_folder(&mut self) -> Result<()> {
+        self.saver.open_folder(&mut self.report).inspect_err(|_| self.give_back())
+    }
+
+    /// Clears the folder of a run that could not begin.
+    pub(super) fn give_back(&self) {
+        self.saver.give_back();
+    }
+
+    /// Warns of physics that diverge, once: the total follows at the end. Warns of updates that are too large.
+    fn warn(&mut self, session: &Session, outcome: &Outcome) {
+        let Outcome { iteration, steps, evaluation, .. } = outcome;
+        self.diverged += steps.diverged;
+        let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
+        if let Some(warning) = warning.filter(|_| !self.warned) {
+            self.warned = true;
+            self.report.warn(&warning);
+        }
+        let desired_kl = session.config.ppo.desired_kl.at(session.agent.env_steps);
+        let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
+        self.far = if is_far { self.far.saturating_add(1) } else { 0 };
+        if self.far == FAR_FOR {
+            self.report.warn(&format!(
+                "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: updates are too \
+                 large; lower ppo.learning_rate_range or ppo.learning_rate"
+            ));
+        }
+    }
+
+    /// Prints how many steps diverged, if there was a warning.
+    pub(super) fn say_how_many_diverged(&self) {
+        if self.warned {
+            os::say(&format!("warning: {} steps of this session diverged", self.diverged));
+        }
+    }
+
+    /// Prints how to look at a run that has finished.
+    pub(super) fn say_what_next(&self, env: &EnvConfig) {
+        let program = os::called_as();
+        let run = self.saver.held.folder.path();
+        let word = os::quoted_path(run);
+        let all = run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let all = os::quoted_path(all);
+        let play = format!("{program} play --ckpt {word}{}", scene_option(env));
+        os::say(&format!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {all}"));
+    }
+}
+
+impl Role for Lead {
+    fn is_stopped_by_file(&self) -> bool {
+        self.saver.held.folder.take_stop()
+    }
+
+    fn attend(&mut self, requests: &Requests) {
+        if self.saver.held.wrote && requests.take_save() {
+            self.save();
+        }
+    }
+
+    fn evaluated(&mut self, env_steps: u64, score: &Score) {
+        let found =
+            HEADLINE.map(|column| format!("{} {}", measure(column).label(), measure(column).text(score[column])));
+        let episodes = score.episodes;
+        self.report.say(&format!("{env_steps} steps: evaluation of {episodes} episodes: {}", found.join("; ")));
+    }
+
+    fn keep(&mut self, state: Checkpoint) {
+        self.saver.keep(state);
+    }
+
+    fn report(&mut self, session: &Session, outcome: &Outcome) -> Result<()> {
+        if let Err(error) = self.saver.open_folder(&mut self.report) {
+            self.report.finish();
+            return Err(self.saver.held.elsewhere(error));
+        }
+        for (name, text) in &outcome.dumps {
+            let dumped = self.saver.held.folder.dump(name, text);
+            dumped.unwrap_or_else(|error| self.report.warn(&format!("{error:#}")));
+        }
+        self.warn(session, outcome);
+        let ended = Ended::new(&outcome.ended, session.config.env.ctrl_dt, session.config.randomization.happens());
+        let shown = ended.shown();
+        let status = Status {
+            env_steps: session.agent.env_steps,
+            steps_per_s: outcome.iteration.steps_per_s(),
+            goals: shown["goals"],
+            drop_rate: shown["drop_rate"],
+            evaluation: outcome.evaluation["goals"],
+        };
+        self.report.iteration(session.agent.iteration, &row(outcome, &ended), &outcome.histograms, &status);
+        Ok(())
+    }
+
+    fn save(&mut self) {
+        self.saver.save_or_warn(&mut self.report);
+    }
+
+    fn stop(&mut self, stop: Stop) -> Result<ExitCode> {
+        self.saver.save_at_last(&mut self.report)?;
+        let held = &self.saver.held;
+        if held.wrote {
+            held.folder.mark_finished(stop.by_file);
+            let reason = if stop.by_file { "stopped by the file `stop`" } else { "stopped" };
+            os::say(&format!("{reason} after {}; resume with", held.steps_made()));
+            os::say(&format!("  {}", held.how_to_resume(&held.folder)));
+            self.saver.release();
+        } else {
+            os::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
+        }
+        Ok(os::exit_code(stop.signal))
+    }
+
+    fn give_up(&mut self, reason: Error) -> Error {
+        self.report.end(false);
+        let saved = self.saver.save_at_last(&mut self.report);
+        let held = &self.saver.held;
+        match saved {
+            Ok(()) if held.wrote => os::say(&format!("saved the state after {}", held.steps_made())),
+            Ok(()) => os::say("the run folder was not changed"),
+            Err(error) => os::say(&format!("error: {error:#}")),
+        }
+        reason
+    }
+
+    fn finish(&mut self, session: &Session) -> Result<()> {
+        self.report.end(true);
+        self.saver.save_at_last(&mut self.report)?;
+        let held = &self.saver.held;
+        held.folder.mark_finished(true);
+        let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
+        os::say(&format!("{why}: {}; {}", held.steps_made(), held.folder.path().display()));
+        if let Some(rise) = &session.rise {
+            os::say(&before_and_after(rise, session.config.run.eval_episodes));
+        }
+        self.saver.release();
+        Ok(())
+    }
+}
+
+/// The first evaluation and the best one as a table.
+fn before_and_after(rise: &Rise, episodes: usize) -> String {
+    let mut table = format!("  {:<20} {:>8} {:>8}", format!("{episodes} episodes"), "before", "best");
+    for (column, (before, best)) in HEADLINE.into_iter().zip(rise.before.into_iter().zip(rise.best)) {
+        let measure = measure(column);
+        table += &format!("\n  {:<20} {:>8} {:>8}", measure.label(), measure.text(before), measure.text(best));
+    }
+    table
+}
