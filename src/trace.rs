@@ -44,6 +44,7 @@ impl Trace {
             "fingertip_names": hand.parts.fingertips,
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
+            "mirror": task.mirror().map(|matrix| entries(&matrix, hand.layout.size)),
         });
         add_settings(config, &mut header);
         Self { header, episodes: Vec::new(), last: usize::MAX }
@@ -80,12 +81,13 @@ impl Trace {
 }
 
 fn record(moment: &Moment) -> Value {
-    let (env, simulation) = (moment.env, moment.env.simulation());
-    // A policy for the hand on the other side sees it mirrored.
-    let mut here = vec![0.0; moment.observation.len()];
-    env.observe(&mut here);
-    let (qpos, qvel, obs) = (simulation.qpos(), simulation.qvel(), doubles(&here));
-    let (episode, step) = (moment.episode, env.episode().length);
+    let env = moment.env;
+    let simulation = env.simulation();
+    let qpos = simulation.qpos();
+    let qvel = simulation.qvel();
+    let obs = doubles(moment.observation);
+    let episode = moment.episode;
+    let step = env.episode().length;
     let Some((action, end)) = moment.step else {
         let goal = env.goal();
         return json!({
@@ -113,6 +115,12 @@ fn record(moment: &Moment) -> Value {
         "diverged": details.diverged,
         "obs": obs,
     })
+}
+
+/// The entries of a square matrix that are not zero: row, column and value.
+fn entries(matrix: &[f32], size: usize) -> Value {
+    let entries = matrix.iter().enumerate().filter(|(_, value)| **value != 0.0);
+    entries.map(|(i, value)| json!([i / size, i % size, value])).collect()
 }
 
 /// Returns floats as doubles, so that a reader gets exactly the same values.

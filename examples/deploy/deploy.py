@@ -317,6 +317,12 @@ def check(policy, hand, trace):
     for key in sorted(header.keys() & hand.env.keys() - {"model"}):
         if header[key] != hand.env[key]:
             sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
+    # A policy for the hand on the other side sees the mirror image of this one.
+    mirror = np.eye(hand.size)
+    if header.get("mirror"):
+        rows, columns, values = np.array(header["mirror"]).T
+        mirror = np.zeros_like(mirror)
+        mirror[rows.astype(int), columns.astype(int)] = values
     largest, compared = [0.0, 0.0], 0
     for record, after in zip(records, records[1:] + [None]):
         if not all(np.isfinite(record[key]).all() for key in ("qpos", "qvel", "obs", "action") if key in record):
@@ -326,14 +332,15 @@ def check(policy, hand, trace):
         # Where a goal was reached, the observation already shows the next one.
         hand.goal = np.array(after["goal"] if same else record["goal"])
         hand.previous_action = np.clip(record["action"], -1, 1) if not record.get("reset") else np.zeros(len(hand.actuators))
-        seen, expected = hand.observe(), np.array(record["obs"])
+        observation, expected = hand.observe(), np.array(record["obs"])
+        seen = observation @ mirror
         if not same:  # the goal after an episode's last step is in no record
             goal = slice(hand.goal_at, hand.goal_at + 8)
             seen[goal] = expected[goal]
         # Unlike max, this keeps a NaN.
         largest[0] = np.maximum(largest[0], np.abs(seen - expected).max())
         if same:
-            action = policy.act(seen)
+            action = policy.act(observation)
             largest[1] = np.maximum(largest[1], np.abs(action - np.clip(after["action"], -1, 1)).max())
             compared += 1
     print(f"{len(records)} observations: {largest[0]:.1e} off at most; {compared} actions: {largest[1]:.1e}")

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use shadow_repose::config::Config;
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{Lesson, Randomization, Repose, StepDetails, Task, TaskReward, TrainingReward};
+use shadow_repose::repose::{Lesson, Randomization, Repose, Task, TaskReward, TrainingReward};
 
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
@@ -135,22 +135,26 @@ impl Hands {
     /// Returns the terms of the last step, and zeros where a new episode took the place of the step.
     fn step_terms<'py>(&self, py: Python<'py>, state: &mut State, restarted: &[bool]) -> PyResult<Terms<'py>> {
         let weight = state.lesson_from.map_or(1.0, |from| self.lesson(from).task_reward);
-        let details = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
-            true => StepDetails { rot_dist: hand.rot_dist(), ..StepDetails::default() },
-            false => *hand.last_step(),
+        let steps = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
+            true => (TaskReward::default(), TrainingReward::default(), hand.rot_dist()),
+            false => {
+                let step = hand.last_step();
+                (step.reward, step.training, step.rot_dist)
+            }
         });
-        let details: Vec<StepDetails> = details.collect();
+        let steps: Vec<(TaskReward, TrainingReward, f64)> = steps.collect();
         let terms = PyDict::new(py);
-        let put = |name: &str, of: &dyn Fn(&StepDetails) -> f64| {
-            terms.set_item(name, details.iter().map(|step| of(step) as f32).collect::<Vec<_>>().into_pyarray(py))
+        let put = |name: &str, values: Vec<f64>| {
+            let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
+            terms.set_item(name, values.into_pyarray(py))
         };
         for (i, (name, _)) in TaskReward::default().named().enumerate() {
-            put(name, &|step| weight * step.reward.values()[i])?;
+            put(name, steps.iter().map(|(reward, ..)| weight * reward.values()[i]).collect())?;
         }
         for (i, (name, _)) in TrainingReward::default().named().enumerate().filter(|_| self.training) {
-            put(name, &|step| step.training.values()[i])?;
+            put(name, steps.iter().map(|(_, training, _)| training.values()[i]).collect())?;
         }
-        let errors: Vec<f32> = details.iter().map(|step| step.rot_dist as f32).collect();
+        let errors: Vec<f32> = steps.iter().map(|(.., rot_dist)| *rot_dist as f32).collect();
         Ok((terms, errors.into_pyarray(py)))
     }
 }

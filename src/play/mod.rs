@@ -27,7 +27,9 @@ use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
 use crate::os::{self, Requests};
-use crate::repose::{Score, Task};
+#[cfg(feature = "video")]
+use crate::repose::Score;
+use crate::repose::Task;
 use crate::robustness::robustness;
 use crate::run;
 use crate::see;

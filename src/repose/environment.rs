@@ -29,8 +29,8 @@ pub struct Repose {
     sim: Simulation,
     rng: Rng,
     goal: Quat,
-    /// What the rewards of the last step depended on. Observations show its action as the previous one.
-    now: Step,
+    /// The last step. Observations show its action as the previous one.
+    last: Step,
     servos: Servos,
     conditions: Conditions,
     /// Control steps since the reset, plus those skipped by `skip_ahead`.
@@ -39,28 +39,8 @@ pub struct Repose {
     episode: EpisodeStats,
     /// The sums since they were last taken.
     sums: StepSums,
-    last: StepDetails,
     recorder: Recorder,
     diverged: Option<Diverged>,
-}
-
-/// Details of the last step.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct StepDetails {
-    /// The goal during the step.
-    pub goal: Quat,
-    /// Rotation error after the step, rad.
-    pub rot_dist: f64,
-    /// Distance of the object from the goal position after the step, m.
-    pub goal_dist: f64,
-    /// The reward by term.
-    pub reward: TaskReward,
-    /// What training adds to it, by term.
-    pub training: TrainingReward,
-    /// Whether the physics diverged.
-    pub diverged: bool,
-    /// The random force on the object in the step, N, if there are such forces in the episode.
-    pub push: Option<[f64; 3]>,
 }
 
 impl Repose {
@@ -80,7 +60,7 @@ impl Repose {
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
             goal: [1.0, 0.0, 0.0, 0.0],
-            now: Step {
+            last: Step {
                 action: vec![0.0; task.hand.actuators.len()],
                 previous_action: vec![0.0; task.hand.actuators.len()],
                 joint_pos: vec![0.0; task.hand.joints.len()],
@@ -91,14 +71,13 @@ impl Repose {
             held: 0,
             episode: EpisodeStats::default(),
             sums: StepSums::default(),
-            last: StepDetails::default(),
             recorder: Recorder::default(),
             diverged: None,
         }
     }
 
-    /// Returns details of the last step, which may have ended the episode before this one.
-    pub fn last_step(&self) -> &StepDetails {
+    /// The last step, which may have ended the episode before this one.
+    pub fn last_step(&self) -> &Step {
         &self.last
     }
 
@@ -161,17 +140,25 @@ impl Repose {
 
     /// Records what the rewards of a step depend on, after its physics.
     fn measure(&mut self, rot_dist_before: f64) {
-        let (object, object_velocity) = (self.object(), self.object_velocity());
-        let (task, now, qpos, qvel) = (&self.task, &mut self.now, self.sim.qpos(), self.sim.qvel());
+        let object = self.object();
+        let object_velocity = self.object_velocity();
+        let task = &self.task;
+        let last = &mut self.last;
+        let qpos = self.sim.qpos();
+        let qvel = self.sim.qvel();
         let offset = [0, 1, 2].map(|axis| object.position[axis] - task.config.goal_position.value[axis]);
-        (now.rot_dist_before, now.rot_dist) = (rot_dist_before, quat::angle_between(object.orientation, self.goal));
-        now.goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
-        now.within = now.rot_dist <= self.lesson.tolerance;
-        now.dropped = now.goal_dist >= task.config.fall_dist;
-        (now.object, now.object_velocity) = (object, object_velocity);
-        let cells = now.joint_pos.iter_mut().zip(&mut now.joint_vel);
+        last.goal = self.goal;
+        last.rot_dist_before = rot_dist_before;
+        last.rot_dist = quat::angle_between(object.orientation, self.goal);
+        last.goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
+        last.within = last.rot_dist <= self.lesson.tolerance;
+        last.dropped = last.goal_dist >= task.config.fall_dist;
+        last.object = object;
+        last.object_velocity = object_velocity;
+        let cells = last.joint_pos.iter_mut().zip(&mut last.joint_vel);
         for ((angle, speed), joint) in cells.zip(&task.hand.joints) {
-            (*angle, *speed) = (qpos[joint.qpos], qvel[joint.dof]);
+            *angle = qpos[joint.qpos];
+            *speed = qvel[joint.dof];
         }
     }
 
@@ -186,10 +173,10 @@ impl Repose {
 
     /// Clips the action, and writes as controls the targets that take effect now.
     fn actuate(&mut self, action: &[f32]) {
-        let now = &mut self.now;
-        std::mem::swap(&mut now.previous_action, &mut now.action);
-        now.action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        self.servos.apply(&now.action, &self.task.hand.actuators, &self.lesson);
+        let last = &mut self.last;
+        std::mem::swap(&mut last.previous_action, &mut last.action);
+        last.action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        self.servos.apply(&last.action, &self.task.hand.actuators, &self.lesson);
         self.send();
     }
 
@@ -265,7 +252,7 @@ impl Repose {
             cells.put("fingertips", linear);
             cells.put("fingertips", angular);
         }
-        cells.put("previous_action", self.now.action.iter().copied().map(f64::from));
+        cells.put("previous_action", self.last.action.iter().copied().map(f64::from));
         cells.finish();
         self.conditions.disturb(&self.rng, self.episode.length, &self.task, observation);
     }
@@ -308,7 +295,7 @@ impl Env for Repose {
         let target = |actuator: &Actuator| self.sim.length(*actuator).clamp(actuator.range[0], actuator.range[1]);
         self.servos.reset(hand.actuators.iter().map(target), self.conditions.delay(&self.task));
         self.send();
-        self.now.action.fill(0.0);
+        self.last.action.fill(0.0);
         self.age = 0;
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
         self.recorder.clear();
@@ -333,29 +320,33 @@ impl Env for Repose {
         }
 
         self.measure(rot_dist_before);
-        let (mut reward, mut added, mut reached) = (TaskReward::default(), TrainingReward::default(), false);
+        self.last.push = push;
+        self.last.diverged = diverged;
+        self.last.reward = TaskReward::default();
+        self.last.training = TrainingReward::default();
+        let mut reached = false;
         self.age += 1;
         self.episode.length += 1;
         self.episode.diverged = diverged;
-        self.episode.dropped = !diverged && self.now.dropped;
+        self.episode.dropped = !diverged && self.last.dropped;
         self.sums.steps += 1;
         self.sums.diverged += u64::from(diverged);
         if diverged {
             let (length, draw) = (self.episode.length, self.conditions.draw().cloned());
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
         } else {
-            reward = task_reward(&self.task.config, &self.now);
-            added = self.lesson.reward(&self.now);
+            let reward = task_reward(&self.task.config, &self.last);
+            let added = self.lesson.reward(&self.last);
+            self.last.reward = reward;
+            self.last.training = added;
             self.episode.reward += reward;
-            self.episode.rot_dist_sum += self.now.rot_dist;
-            self.episode.in_tolerance += u32::from(self.now.rot_dist <= self.task.config.success_tolerance);
+            self.episode.rot_dist_sum += self.last.rot_dist;
+            self.episode.in_tolerance += u32::from(self.last.rot_dist <= self.task.config.success_tolerance);
             self.sums.task += reward;
             self.sums.training += added;
-            self.sums.turned += rot_dist_before - self.now.rot_dist;
-            reached = self.hold(self.now.within);
+            self.sums.turned += rot_dist_before - self.last.rot_dist;
+            reached = self.hold(self.last.within);
         }
-        let Step { rot_dist, goal_dist, .. } = self.now;
-        self.last = StepDetails { goal: self.goal, rot_dist, goal_dist, reward, training: added, diverged, push };
 
         let end = if diverged || self.episode.dropped {
             Some(End::Terminated)
@@ -369,7 +360,8 @@ impl Env for Repose {
             self.replace_goal();
         }
         self.show(observation);
-        Transition { reward: self.lesson.total(reward.total(), &added) as f32, end }
+        let reward = self.lesson.total(self.last.reward.total(), &self.last.training);
+        Transition { reward: reward as f32, end }
     }
 
     /// Draws another goal and resets the hold counter.
@@ -387,7 +379,7 @@ impl Resumable for Repose {
     fn save(&self, state: &mut EnvState) {
         state.numbers.extend(self.sim.state().numbers());
         state.numbers.extend(self.goal);
-        state.numbers.extend(self.now.action.iter().copied().map(f64::from));
+        state.numbers.extend(self.last.action.iter().copied().map(f64::from));
         state.numbers.extend(self.servos.last());
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
@@ -418,15 +410,14 @@ impl Resumable for Repose {
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
-        self.now.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
-        let clipped = self.now.action.iter().all(|action| (-1.0..=1.0).contains(action));
-        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.now.action);
+        self.last.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
+        let clipped = self.last.action.iter().all(|action| (-1.0..=1.0).contains(action));
+        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.last.action);
         let targets = state.next(actuators)?;
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
         let under_way = state.next(under_way * actuators)?;
         self.servos.restore(targets, under_way, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
-        self.last = StepDetails::default();
         self.recorder.clear();
         self.show(observation);
         Ok(())

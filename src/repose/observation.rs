@@ -2,6 +2,7 @@
 
 use crate::quat;
 use crate::spaces::{ObjectAndGoal, Spaces};
+use Source::{Known, Measured};
 
 /// A group of consecutive values in an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -16,6 +17,16 @@ pub struct Group {
     pub unit: &'static str,
     /// The values that change their sign in the mirror, by index. For fingertips, the indices apply to each one.
     mirrored: &'static [usize],
+    source: Source,
+}
+
+/// Where the values of a group come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Source {
+    /// Sensors, which may have noise and offsets.
+    Measured,
+    /// They are known exactly, or follow from measured groups.
+    Known,
 }
 
 /// The number of values of a fingertip.
@@ -44,7 +55,6 @@ pub struct Layout {
 
 impl Layout {
     /// Returns the layout for a hand with this many joints, fingertips and actuators.
-    #[rustfmt::skip]
     pub fn new(joints: usize, fingertips: usize, actuators: usize) -> Self {
         const NOTHING: &[usize] = &[];
         // Points and velocities change their y, axes their x and z, and so do quaternions.
@@ -53,19 +63,29 @@ impl Layout {
         const QUATERNION: &[usize] = &[1, 3];
         const TIP: &[usize] = &[1, 4, 6, 8, 10, 12];
         let table = [
-            ("joint_pos", joints, "rad", NOTHING), ("joint_vel", joints, "rad/s * vel_obs_scale", NOTHING),
-            ("cube_pos", 3, "m", POINT), ("cube_quat", 4, "1", QUATERNION),
-            ("cube_linvel", 3, "m/s", POINT), ("cube_angvel", 3, "rad/s * vel_obs_scale", AXIS),
-            ("goal_pos", 3, "m", POINT), ("goal_quat", 4, "1", QUATERNION), ("relative_quat", 4, "1", QUATERNION),
-            ("fingertips", TIP_SIZE * fingertips, OF_FINGERTIPS, TIP),
-            ("previous_action", actuators, "1", NOTHING),
+            ("joint_pos", Measured, joints, "rad", NOTHING),
+            ("joint_vel", Measured, joints, "rad/s * vel_obs_scale", NOTHING),
+            ("cube_pos", Measured, 3, "m", POINT),
+            ("cube_quat", Measured, 4, "1", QUATERNION),
+            ("cube_linvel", Measured, 3, "m/s", POINT),
+            ("cube_angvel", Measured, 3, "rad/s * vel_obs_scale", AXIS),
+            ("goal_pos", Known, 3, "m", POINT),
+            ("goal_quat", Known, 4, "1", QUATERNION),
+            ("relative_quat", Known, 4, "1", QUATERNION),
+            ("fingertips", Measured, TIP_SIZE * fingertips, OF_FINGERTIPS, TIP),
+            ("previous_action", Known, actuators, "1", NOTHING),
         ];
         let mut size = 0;
-        let groups = table.map(|(name, length, unit, mirrored)| {
+        let groups = table.map(|(name, source, length, unit, mirrored)| {
             size += length;
-            Group { name, start: size - length, length, unit, mirrored }
+            Group { name, start: size - length, length, unit, mirrored, source }
         });
         Self { groups, size, actions: actuators }
+    }
+
+    /// The groups that sensors measure.
+    pub(super) fn measured(&self) -> impl Iterator<Item = &Group> {
+        self.groups.iter().filter(|group| group.source == Measured)
     }
 
     /// Returns the index of the first value of a group, by the group's place in the table.

@@ -8,11 +8,14 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::config::{EnvConfig, Ramp, TrainingConfig};
+use crate::quat::Quat;
 use crate::sim::{Pose, Velocity};
 
-/// What a reward may depend on: a step that did not diverge, after its physics. SI units and rad, in the world frame.
+/// A control step after its physics: what its rewards may depend on, and what they are. SI units and rad, in the world frame.
 #[derive(Clone, Debug, Default)]
 pub struct Step {
+    /// The goal during the step.
+    pub goal: Quat,
     /// Rotation error before the step, from 0 to π.
     pub rot_dist_before: f64,
     /// Rotation error after the step.
@@ -35,6 +38,14 @@ pub struct Step {
     pub joint_pos: Vec<f64>,
     /// The velocities of the joints, in observation order.
     pub joint_vel: Vec<f64>,
+    /// The random force on the object, if there are such forces in the episode.
+    pub push: Option<[f64; 3]>,
+    /// Whether the physics diverged. Then nothing above but the goal and the actions has a meaning, and there is no reward.
+    pub diverged: bool,
+    /// The reward by term.
+    pub reward: TaskReward,
+    /// What training adds to it, by term.
+    pub training: TrainingReward,
 }
 
 /// The description of a quantity for a reader: its name in columns, tags and JSON, and what it is, in a sentence.

@@ -9,10 +9,6 @@ use crate::os::shortened;
 use crate::quat::{self, Quat};
 use crate::rng::Rng;
 
-/// The groups that are measured. The others are known exactly, or follow from these.
-const MEASURED: [&str; 7] =
-    ["joint_pos", "joint_vel", "cube_pos", "cube_quat", "cube_linvel", "cube_angvel", "fingertips"];
-
 /// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct NoiseStd(Vec<(usize, f32)>);
@@ -23,11 +19,12 @@ impl NoiseStd {
     /// # Errors
     /// Fails on the name of a group that does not exist or is not measured.
     pub(super) fn new(groups: &ByGroup, layout: &Layout) -> Result<Self> {
+        let measured: Vec<&str> = layout.measured().map(|group| group.name).collect();
         for name in groups.keys() {
-            if !MEASURED.contains(&name.as_str()) {
+            if !measured.contains(&name.as_str()) {
                 let known = layout.groups.iter().any(|group| group.name == name);
                 let what = if known { "is not measured" } else { "is not a group of the observation" };
-                bail!("`{}` {what}; these groups can have noise: {}", shortened(name), MEASURED.join(", "));
+                bail!("`{}` {what}; these groups can have noise: {}", shortened(name), measured.join(", "));
             }
         }
         let of_group = |Group { name, start, length, .. }: Group| {

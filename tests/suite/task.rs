@@ -151,7 +151,7 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
     for held in [1, 2, 0] {
         put_object(&mut env, &task, goal);
         let transition = env.step(&STILL, &mut observation);
-        let details = *env.last_step();
+        let details = env.last_step().clone();
         assert_eq!((details.goal, details.reward["bonus"], transition.end), (goal, 2.0, None));
         assert!(details.rot_dist < 0.1);
         // The reward is computed against the goal in force.
