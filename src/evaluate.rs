@@ -380,8 +380,9 @@ mod tests {
             let actor = Actor::Mean(ppo.policy().freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
-            let mut observations = vec![0.1; 2 * 157];
-            for (row, q) in observations.chunks_exact_mut(157).zip([[1.0, 0.0], [0.0, 1.0]]) {
+            let Spaces { observation_size: size, .. } = task.spaces();
+            let mut observations = vec![0.1; 2 * size];
+            for (row, q) in observations.chunks_exact_mut(size).zip([[1.0, 0.0], [0.0, 1.0]]) {
                 let places = task.spaces().object_and_goal.unwrap();
                 for place in [places.object, places.goal] {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);

@@ -38,9 +38,9 @@ static ALLOCATOR: Watching = Watching;
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
     let config = Config::resolve(None, &sets).unwrap();
-    let mut agent =
-        Agent::for_task(&Task::new(&config.env, &config.hand).unwrap(), &config, Exchange::alone(config.shards()))
-            .unwrap();
+    let task = Task::new(&config.env, &config.hand).unwrap();
+    let size = task.spaces().observation_size;
+    let mut agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
     let mut iterate = || {
         LARGEST.store(0, Ordering::Relaxed);
         agent.iterate(&NEVER).unwrap().expect("nothing stops it");
@@ -48,8 +48,8 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     };
     let first = iterate();
     let later = [iterate(), iterate()];
-    // gemm packs the largest weight matrix, 157 × 256 floats, into its own buffer. An array of all weights, or of a block of rows
+    // gemm packs the largest weight matrix, of the first layer, into its own buffer. An array of all weights, or of a block of rows
     // in a net, would be larger. An array of all samples would be much larger.
-    let packed = 4 * 157 * config.ppo.hidden[0];
+    let packed = 4 * size * config.ppo.hidden[0];
     assert!(first > 500_000 && later.iter().all(|&largest| largest <= packed), "{first} bytes, then {later:?}");
 }

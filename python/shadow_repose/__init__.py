@@ -4,7 +4,7 @@
 
     envs = shadow_repose.VectorEnv(1024, policy="builtin")   # the task that the built-in policy was trained for
     policy = shadow_repose.Policy.load("builtin")
-    observations, _ = envs.reset(seed=0)                     # [1024, 157]
+    observations, _ = envs.reset(seed=0)                     # [1024, O]
     observations, rewards, terminated, truncated, info = envs.step(policy(observations))
 
 NumPy and Gymnasium are only imported where they are used.

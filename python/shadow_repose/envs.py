@@ -48,9 +48,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         ValueError: a setting is unknown or invalid, or the scene cannot be used. The message lists everything that is wrong.
         FileNotFoundError, PermissionError: the settings file or the policy does not exist, or cannot be read.
 
-    Observations are float32 `[N, O]`. For the built-in hand they are `[N, 157]`. `observation_layout` names their groups. Actions
-    `[N, A]`, here `[N, 20]`, are moves within the range of each actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z, and
-    units are SI.
+    Observations are float32 `[N, O]`. `observation_layout` names their groups. Actions `[N, A]` are moves within the range of each
+    actuator, and are clipped to [-1, 1]. Quaternions are w, x, y, z, and units are SI.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}

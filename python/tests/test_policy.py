@@ -14,6 +14,9 @@ import shadow_repose
 from shadow_repose import Policy, VectorEnv, evaluate, program
 
 
+SIZE = VectorEnv(1).single_observation_space.shape[0]
+
+
 def observations(rows):
     envs = VectorEnv(rows, policy="builtin", seed=5)
     return envs.reset()[0]
@@ -68,7 +71,7 @@ def test_a_policy_file_is_loaded_with_its_settings(tmp_path):
     assert evaluate(slippery, **short) != evaluate("builtin", **short)
 
 
-@pytest.mark.parametrize("given", [np.zeros((3, 156)), np.zeros((2, 3, 157)), "x", None, [[1], [2, 3]], 3.0])
+@pytest.mark.parametrize("given", [np.zeros((3, SIZE - 1)), np.zeros((2, 3, SIZE)), "x", None, [[1], [2, 3]], 3.0])
 def test_what_is_no_observation_is_an_exception(given):
     with pytest.raises((TypeError, ValueError)):
         Policy.load("builtin")(given)
@@ -104,7 +107,7 @@ def test_a_function_of_the_user_is_scored_as_a_policy_and_its_steps_are_written(
 
     own, built_in = evaluate(act, trace=traces[0], **short), evaluate(policy, trace=traces[1], **short)
     assert own.pop("checkpoint") is None and built_in.pop("checkpoint") is not None
-    assert own == built_in and set(sizes) == {(64, 157)}
+    assert own == built_in and set(sizes) == {(64, SIZE)}
     header, *steps = traces[0].read_text().splitlines()
     assert json.loads(header)["actor"] == "policy" and steps == traces[1].read_text().splitlines()[1:]
     html = tmp_path / "own.html"

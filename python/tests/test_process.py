@@ -27,14 +27,14 @@ def started(**options):
 
 def stepped_in_a_child(queue, envs):
     queue.put(envs.step(ZEROS)[0].tobytes())
-    queue.put(Policy.load("builtin")(np.zeros((200, 157))).tobytes())
+    queue.put(Policy.load("builtin")(np.zeros((200, *envs.single_observation_space.shape))).tobytes())
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_child_process_goes_on_with_the_same_bits_on_threads_of_its_own(method):
     envs = started()
     envs.step(ZEROS)
-    actions = Policy.load("builtin")(np.zeros((200, 157)))
+    actions = Policy.load("builtin")(np.zeros((200, *envs.single_observation_space.shape)))
     context = multiprocessing.get_context(method)
     queue = context.Queue()
     child = context.Process(target=stepped_in_a_child, args=(queue, envs))
@@ -130,7 +130,7 @@ def test_a_panic_is_an_exception_and_the_hands_go_on(capfd):
     envs = started()
     with pytest.raises(RuntimeError, match="internal error"):
         envs._hands._panic_for_a_test()
-    assert envs.step(ZEROS)[0].shape == (16, 157)
+    assert envs.step(ZEROS)[0].shape == envs.observation_space.shape
 
 
 def test_hands_that_are_made_and_closed_a_thousand_times_leave_nothing():
@@ -165,7 +165,7 @@ def test_hands_that_are_forgotten_are_freed():
 def test_one_hand_steps_in_processes_of_gymnasium():
     envs = AsyncVectorEnv([Env] * 2)
     observations, _ = envs.reset(seed=3)
-    assert observations.shape == (2, 157) and envs.step(np.zeros((2, 20)))[0].shape == (2, 157)
+    assert observations.shape == envs.observation_space.shape and envs.step(np.zeros((2, 20)))[0].shape == observations.shape
     envs.close()
 
 

@@ -16,7 +16,7 @@ mod tests {
     const BACKENDS: [config::Backend; 2] = [config::Backend::Fused, config::Backend::Candle];
 
     const SPACES: Spaces = Spaces {
-        observation_size: 157,
+        observation_size: 75,
         action_size: 20,
         object_and_goal: Some(ObjectAndGoal { object: 51, goal: 64, relative: 0, symmetry: 1 }),
         distance: |_, _| 0.0,
@@ -28,7 +28,7 @@ mod tests {
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
         config.bounds_coef = 0.1;
         let mut ppo = Ppo::new(&config, SPACES, 3, Exchange::alone(1)).unwrap();
-        ppo.policy.see(&[&[[0.3; 157], [0.9; 157]].concat()], &ppo.exchange);
+        ppo.policy.see(&[&[0.3, 0.9].map(|x| [x; SPACES.observation_size]).concat()], &ppo.exchange);
         let mut rollout = Rollout::new(16, &[32, 32, 21], &SPACES);
         let mut rng = rng::stream(0, "test", 0);
         let mut fill = |numbers: &mut [f32], scale: f64| {

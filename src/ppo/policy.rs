@@ -237,21 +237,22 @@ mod tests {
 
     #[test]
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
-        let spaces = Spaces { observation_size: 157, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
+        const SIZE: usize = 75;
+        let spaces = Spaces { observation_size: SIZE, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
         let net =
             NetConfig { symmetry: crate::config::Symmetry::None, ..Config::resolve(None, &[]).unwrap().ppo.net() };
         let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7).unwrap()));
-        let observations: Vec<f32> = (0..150 * 157).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
+        let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
         let (actions, values) = (policy.mean_actions(&observations), policy.values(&observations));
         assert_eq!([actions.len(), values.len()], [150 * 20, 150]);
         for rows in [0, 1, 2, 63, 64, 65, 150] {
-            let first = &observations[..rows * 157];
+            let first = &observations[..rows * SIZE];
             assert_eq!(policy.mean_actions(first), actions[..rows * 20], "{rows} rows");
             assert_eq!(policy.values(first), values[..rows], "{rows} rows");
         }
         let frozen = policy.policy().freeze();
         let mut means = vec![0.0; 64 * 20];
-        frozen.mean_actions(&observations[..64 * 157], &mut means, &mut frozen.workspace(64));
+        frozen.mean_actions(&observations[..64 * SIZE], &mut means, &mut frozen.workspace(64));
         assert_eq!(means, actions[..64 * 20], "as a score computes them");
     }
 }

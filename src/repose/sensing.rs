@@ -131,7 +131,7 @@ mod tests {
         let mut turns = rng::stream(2, "turns", 0);
         let mut off = || {
             let q = quat::canonical(quat::uniform([0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0))));
-            let mut observation = vec![0.1; 157];
+            let mut observation = vec![0.1; shadow().size];
             observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
             offset(&mut observation, &bias, &shadow());
             make_consistent(&mut observation, &shadow());
@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn quaternions_stay_of_length_one_and_the_relative_one_is_that_of_the_seen_cube() {
-        let mut observation = vec![0.1; 157];
+        let mut observation = vec![0.1; shadow().size];
         observation[shadow().start(GOAL_QUAT)..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
         observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
         for (i, added) in [(shadow().start(OBJECT_QUAT), -0.4), (shadow().start(TIPS) + TIP_QUAT, 3.0), (3, 0.25)] {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use shadow_repose::ppo::{Checkpoint, Evaluation};
 
-use crate::support::{metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
+use crate::support::{OBSERVATION_SIZE, metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
 
 /// Returns a folder with a finished run of two iterations in `run`.
 fn trained(more: &[&str]) -> tempfile::TempDir {
@@ -193,7 +193,7 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
             (episode, step) = (episode + 1, 0);
         }
         assert_eq!((record["episode"].as_u64(), record["step"].as_u64()), (Some(episode), Some(step)));
-        assert_eq!(record["obs"].as_array().unwrap().len(), 157);
+        assert_eq!(record["obs"].as_array().unwrap().len(), OBSERVATION_SIZE);
         assert_eq!(record["qpos"].as_array().unwrap().len(), 31);
         if step > 0 {
             let terms = record["reward"].as_object().unwrap();

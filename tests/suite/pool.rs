@@ -37,14 +37,14 @@ impl Block<'_> {
         self.seen.push((self.observations.clone(), self.rewards.clone()));
         for (i, end) in self.envs.ends.iter().enumerate() {
             let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
-            let previous_action = &self.observations[rows.clone()][137..];
+            let previous_action = &self.observations[rows.clone()][OBSERVATION_SIZE - 20..];
             // Where an episode ended, a new one has begun: only there is the previous action zero.
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
             if end.is_some() {
                 // The final observation belongs to this environment: it shows its last action.
                 let action = &actions[i * 20..][..20];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-                assert_eq!(self.envs.final_observations[rows][137..], last);
+                assert_eq!(self.envs.final_observations[rows][OBSERVATION_SIZE - 20..], last);
                 self.truncated += usize::from(*end == Some(End::Truncated));
             }
         }

@@ -161,7 +161,7 @@ fn parts_of_an_own_scene_may_have_other_names() {
         let folder = tempfile::tempdir().unwrap();
         let task = task(&[&format!("env.model={}", write(&folder, &edited(from, to)).display())]);
         let spaces = task.spaces();
-        assert_eq!((spaces.observation_size, spaces.action_size), (157, 20), "{to}");
+        assert_eq!((spaces.observation_size, spaces.action_size), (OBSERVATION_SIZE, 20), "{to}");
     }
 }
 

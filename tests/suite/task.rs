@@ -79,7 +79,7 @@ fn observations_land_at_their_indices() {
         assert_close(&observation[72 + 13 * i..85 + 13 * i], &expected);
         assert!(linear.iter().any(|v| v.abs() > 1e-3), "{name} moves");
     }
-    assert_close(&observation[137..], &[0.0; 20]);
+    assert_close(&observation[OBSERVATION_SIZE - 20..], &[0.0; 20]);
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn actions_are_clipped_and_scaled_to_the_control_ranges() {
     assert_eq!(ctrl(7), 0.0);
     let [low, high] = hand.actuators[19].range;
     assert!((ctrl(19) - (low + 0.75 * (high - low))).abs() < 1e-12);
-    assert_close(&observation[137..], &{
+    assert_close(&observation[OBSERVATION_SIZE - 20..], &{
         let mut expected = [0.0; 20];
         (expected[0], expected[7], expected[19]) = (1.0, -1.0, 0.5);
         expected

@@ -200,7 +200,7 @@ mod tests {
     use crate::spaces::Spaces;
 
     const SPACES: Spaces =
-        Spaces { observation_size: 157, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
+        Spaces { observation_size: 70, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
 
     #[test]
     fn packed_weights_change_no_bit() {
