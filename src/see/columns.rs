@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::draw::Page;
 use crate::env::Env;
 use crate::repose::{Repose, Task, TaskReward};
-use crate::sim::{Camera, Drawing};
+use crate::sim::{Camera, Drawing, DrawnCamera};
 
 /// The scalars before the terms of the reward.
 const SCALARS: [&str; 4] = ["step", "error", "held", "goals"];
@@ -19,6 +19,16 @@ const LARGEST: f64 = 1e9;
 
 /// The largest count: a page counts in 16 bits.
 pub(super) const MOST: u32 = 32_767;
+
+/// Near enough to the built-in hand for hand, cube and goal to fill the picture.
+const NEAR: DrawnCamera = DrawnCamera {
+    azimuth: 142.0,
+    elevation: -33.0,
+    distance: 0.58,
+    center: [0.315, 0.0, 0.362],
+    fovy: 40.0,
+    fit: false,
+};
 
 /// The scene of a task, and where the numbers of a row are.
 pub(super) struct Columns {
@@ -37,8 +47,13 @@ pub(super) struct Columns {
 
 impl Columns {
     pub(super) fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
-        let mut drawing = task.scene().drawing(task.config().model_file().is_none(), camera);
-        let (positions, quaternions) = (drawing.positions(), drawing.quaternions());
+        let is_builtin = task.config().model_file().is_none();
+        let mut drawing = task.scene().drawing(task.hand().side().filter(|_| is_builtin), camera);
+        if is_builtin && camera.is_none() {
+            drawing.camera = NEAR;
+        }
+        let positions = drawing.positions();
+        let quaternions = drawing.quaternions();
         let goal = positions + 7 * task.hand().goal.number();
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
         Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }

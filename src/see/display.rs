@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use anyhow::{Error, Result};
 
+use super::dress::{dress, mesh_files};
 use crate::cli::Shot;
 use crate::os;
 use crate::repose::Task;
-use crate::sim::{Look, Quality, mesh_files};
+use crate::sim::{Look, Quality};
 
 /// Loads the task for display as `shot` requests. If the meshes are not available, prints a note and shows the primitives.
 ///
@@ -15,17 +16,18 @@ use crate::sim::{Look, Quality, mesh_files};
 /// Fails like [`Task::for_display`].
 pub fn task_for_display(task: &Task, shot: &Shot, size: [u32; 2], quality: Quality) -> Result<Arc<Task>> {
     let note = |error: &Error| os::say(&format!("note: {error:#}; primitives are shown instead, as with --plain"));
-    let meshes = match shot.plain || task.config().model_file().is_some() {
-        true => Vec::new(),
-        false => os::hand_meshes(&mesh_files()).inspect_err(note).unwrap_or_default(),
-    };
+    // Only the built-in hand has meshes.
+    let prefix = task.hand().side().filter(|_| !shot.plain && task.config().model_file().is_none());
+    let meshes =
+        |prefix: &str| os::hand_meshes(&mesh_files()).inspect_err(note).ok().map(|meshes| dress(prefix, meshes));
     let quality = shot.quality.unwrap_or(quality);
-    let mut look = Look { meshes, size: shot.size.unwrap_or(size), camera: shot.camera, quality };
+    let mut look =
+        Look { dress: prefix.and_then(meshes), size: shot.size.unwrap_or(size), camera: shot.camera, quality };
     let shown = task.for_display(&look);
     match &shown {
-        Err(error) if !look.meshes.is_empty() => note(error),
+        Err(error) if look.dress.is_some() => note(error),
         _ => return shown,
     }
-    look.meshes.clear();
+    look.dress = None;
     task.for_display(&look)
 }

@@ -6,6 +6,7 @@
 mod clock;
 mod columns;
 mod display;
+mod dress;
 #[cfg(feature = "video")]
 mod film;
 mod live;
@@ -16,6 +17,7 @@ mod window;
 
 pub use columns::About;
 pub use display::task_for_display;
+pub use dress::{dress, mesh_files};
 #[cfg(feature = "video")]
 pub use film::{Film, screenshot};
 pub use live::{Acting, Live};

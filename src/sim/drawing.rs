@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtJoint, MjtObjBase};
+use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtJoint};
 use serde::Serialize;
 
 use super::Scene;
-use super::look::{Camera, HIDDEN};
+use super::look::{Camera, HIDDEN, is_of};
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z. A pose is in the frame of the parent or of the body.
 #[derive(Clone, Debug, Serialize)]
@@ -71,13 +71,18 @@ pub struct DrawnGeom {
 /// A point of view on a sphere around a centre, in degrees.
 #[derive(Clone, Debug, Serialize)]
 pub struct DrawnCamera {
-    azimuth: f64,
-    elevation: f64,
-    distance: f64,
-    center: [f64; 3],
-    fovy: f64,
+    /// Viewing direction around the vertical.
+    pub azimuth: f64,
+    /// Viewing direction above the horizontal.
+    pub elevation: f64,
+    /// Distance from the centre, m.
+    pub distance: f64,
+    /// The centre, m.
+    pub center: [f64; 3],
+    /// The vertical field of view.
+    pub fovy: f64,
     /// Whether the page may come nearer, until all of the first picture fills it.
-    fit: bool,
+    pub fit: bool,
 }
 
 /// A mesh, or a part of one: corners, each with its normal, and triangles of corners.
@@ -115,19 +120,16 @@ const MOST_CORNERS: usize = 65_535;
 /// The colour of a shape that has none.
 const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
 
-/// Near enough to the built-in hand for hand, cube and goal to fill the picture, and what the camera looks at.
-const NEAR: (Camera, [f64; 3]) = (Camera { azimuth: 142.0, elevation: -33.0, distance: 0.58 }, [0.315, 0.0, 0.362]);
-
 fn is_false(flag: &bool) -> bool {
     !flag
 }
 
 impl Scene {
-    /// Returns what a page needs to draw this scene, perhaps from this camera.
-    pub fn drawing(&self, is_builtin: bool, from: Option<Camera>) -> Drawing {
+    /// What a page needs to draw this scene, perhaps from this camera. `dressed` is the beginning of the names of the bodies that
+    /// wear a [`super::Dress`], if it was loaded.
+    pub fn drawing(&self, dressed: Option<&str>, from: Option<Camera>) -> Drawing {
         let model = &*self.model;
-        // Only the built-in hand is shown by meshes over its primitives.
-        let dressed = is_builtin && model.ffi().nmesh > 0;
+        let dressed = dressed.filter(|_| model.ffi().nmesh > 0);
         let (mut geoms, mut meshes, mut parts, mut floor) = (Vec::new(), Vec::new(), BTreeMap::new(), None);
         for geom in 0..model.ngeom() as usize {
             if floor.is_none() && is_floor(model, geom) {
@@ -151,7 +153,7 @@ impl Scene {
             bodies: (0..model.nbody() as usize).map(|body| drawn_body(model, body)).collect(),
             geoms,
             floor,
-            camera: camera(model, is_builtin, from),
+            camera: camera(model, from),
             start: start(model),
             meshes,
         }
@@ -193,7 +195,7 @@ fn is_floor(model: &MjModel, geom: usize) -> bool {
 }
 
 /// Returns a shape, unless it is of a kind that a page does not draw, or hidden.
-fn drawn_geom(model: &MjModel, geom: usize, dressed: bool) -> Option<DrawnGeom> {
+fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<DrawnGeom> {
     let kind = match model.geom_type()[geom] {
         MjtGeomBase::mjGEOM_PLANE => "plane",
         MjtGeomBase::mjGEOM_SPHERE => "sphere",
@@ -205,9 +207,8 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: bool) -> Option<DrawnGeom> 
         _ => return None,
     };
     let body = model.geom_bodyid()[geom] as usize;
-    let of_hand = || model.id_to_name(MjtObjBase::mjOBJ_BODY, body).is_some_and(|name| name.starts_with("rh_"));
     // The primitives of a dressed hand are hidden, but for a plain picture.
-    let plain = dressed && kind != "mesh" && of_hand();
+    let plain = kind != "mesh" && dressed.is_some_and(|bodies| is_of(model, geom, bodies));
     if model.geom_group()[geom] >= HIDDEN && !plain {
         return None;
     }
@@ -226,7 +227,7 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: bool) -> Option<DrawnGeom> 
         specular: shine(model.mat_specular()),
         shininess: shine(model.mat_shininess()),
         mesh: None,
-        fine: dressed && kind == "mesh",
+        fine: dressed.is_some() && kind == "mesh",
         plain,
     })
 }
@@ -261,23 +262,15 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     parts
 }
 
-fn camera(model: &MjModel, is_builtin: bool, from: Option<Camera>) -> DrawnCamera {
-    let (global, stat) = (&model.vis().global, model.stat());
-    let of = |Camera { azimuth, elevation, distance }, center, fovy, fit| DrawnCamera {
-        azimuth,
-        elevation,
-        distance,
-        center,
-        fovy,
-        fit,
-    };
-    let own =
-        Camera { azimuth: global.azimuth.into(), elevation: global.elevation.into(), distance: 1.5 * stat.extent };
-    match from {
-        Some(from) => of(from, stat.center, global.fovy.into(), false),
-        None if is_builtin => of(NEAR.0, NEAR.1, 40.0, false),
-        None => of(own, stat.center, global.fovy.into(), true),
-    }
+fn camera(model: &MjModel, from: Option<Camera>) -> DrawnCamera {
+    let global = &model.vis().global;
+    let stat = model.stat();
+    let Camera { azimuth, elevation, distance } = from.unwrap_or(Camera {
+        azimuth: global.azimuth.into(),
+        elevation: global.elevation.into(),
+        distance: 1.5 * stat.extent,
+    });
+    DrawnCamera { azimuth, elevation, distance, center: stat.center, fovy: global.fovy.into(), fit: from.is_none() }
 }
 
 fn start(model: &MjModel) -> Vec<f64> {

@@ -1,4 +1,4 @@
-//! The look of a scene: the real hand's meshes over the colliding primitives, and the size and quality of pictures.
+//! The look of a scene: meshes over the colliding primitives, and the size and quality of pictures.
 //!
 //! Nothing here changes the physics: meshes have no mass and collide with nothing, and they come after the existing objects.
 
@@ -14,42 +14,28 @@ pub(super) const HIDDEN: i32 = 3;
 /// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 
-/// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
-type Part = (&'static str, &'static str, &'static str, f64);
-
-/// The parts, by the beginning of the bodies' names. The values come from MuJoCo Menagerie's Shadow Hand.
-const PARTS: [(&str, &[Part]); 5] =
-    [("rh_", &HAND), ("rh_ff", &FINGER), ("rh_mf", &FINGER), ("rh_rf", &FINGER), ("rh_lf", &FINGER)];
-
-const HAND: [Part; 8] = [
-    ("forearm", "forearm_0.obj", "metal", 0.0),
-    ("forearm", "forearm_1.obj", "shell", 0.0),
-    ("wrist", "wrist.obj", "metal", 0.0),
-    ("palm", "palm.obj", "shell", 0.0),
-    ("lfmetacarpal", "lf_metacarpal.obj", "shell", 0.0),
-    ("thproximal", "th_proximal.obj", "shell", 0.0),
-    ("thmiddle", "th_middle.obj", "shell", 0.0),
-    ("thdistal", "th_distal_pst.obj", "rubber", 0.0),
-];
-
-const FINGER: [Part; 4] = [
-    ("knuckle", "f_knuckle.obj", "metal", 0.0005),
-    ("proximal", "f_proximal.obj", "shell", 0.0),
-    ("middle", "f_middle.obj", "shell", 0.0),
-    ("distal", "f_distal_pst.obj", "rubber", 0.0),
-];
-
-/// Returns each part with the beginning of its body's name.
-fn parts() -> impl Iterator<Item = (&'static str, &'static Part)> {
-    PARTS.into_iter().flat_map(|(prefix, parts)| parts.iter().map(move |part| (prefix, part)))
+/// Meshes that are shown over the primitives of some bodies.
+#[derive(Clone, Debug)]
+pub struct Dress {
+    /// The beginning of the names of the bodies whose primitives are hidden.
+    pub bodies: String,
+    /// The files of the meshes: name and content.
+    pub files: Vec<(&'static str, Vec<u8>)>,
+    /// The meshes on the bodies.
+    pub pieces: Vec<Piece>,
 }
 
-/// Returns the mesh files of the hand, sorted and without duplicates.
-pub fn mesh_files() -> Vec<&'static str> {
-    let mut files: Vec<&str> = parts().map(|(_, (_, file, ..))| *file).collect();
-    files.sort_unstable();
-    files.dedup();
-    files
+/// A mesh on a body.
+#[derive(Clone, Debug)]
+pub struct Piece {
+    /// The name of the body.
+    pub body: String,
+    /// The name of the mesh's file.
+    pub file: &'static str,
+    /// A material of the scene.
+    pub material: &'static str,
+    /// The height of the mesh above the body's origin, m.
+    pub height: f64,
 }
 
 /// The rendering quality of pictures.
@@ -75,8 +61,8 @@ pub struct Camera {
 /// The look of a scene.
 #[derive(Clone, Debug)]
 pub struct Look {
-    /// The contents of [`mesh_files`], in that order, for the built-in hand. If empty, its primitives are shown.
-    pub meshes: Vec<Vec<u8>>,
+    /// Meshes for the built-in scene. Without them its primitives are shown.
+    pub dress: Option<Dress>,
     /// Width and height of pictures in pixels.
     pub size: [u32; 2],
     /// A camera that replaces the scene's own.
@@ -86,7 +72,7 @@ pub struct Look {
 }
 
 impl Look {
-    /// Applies everything but the meshes to a model.
+    /// Applies everything but the dress to a model.
     pub(super) fn set_up(&self, model: &mut MjModel) {
         if let Some(camera) = self.camera {
             let global = &mut model.vis_mut().global;
@@ -105,37 +91,39 @@ impl Look {
             visual.quality.offsamples = 8;
         }
     }
+}
 
-    /// Compiles the built-in scene with the meshes on its hand.
+impl Dress {
+    /// Compiles the built-in scene with the meshes on its bodies.
     ///
     /// # Errors
     /// Fails if MuJoCo cannot read a file as a mesh.
-    pub(super) fn dress(&self, compilation: &Compilation) -> Result<MjModel> {
+    pub(super) fn compile(&self, compilation: &Compilation) -> Result<MjModel> {
         let mut spec = compilation.spec(None)?;
         let mut files = MjVfs::new();
-        for (name, content) in mesh_files().into_iter().zip(&self.meshes) {
+        for (name, content) in &self.files {
             files.add_from_buffer(name, content).map_err(|error| anyhow!("{name}: {error}"))?;
             spec.add_mesh().with_name(name).with_file(name).with_scale([MILLIMETRE; 3]);
         }
-        for (prefix, &(part, mesh, material, height)) in parts() {
-            let body = format!("{prefix}{part}");
-            let body = spec.body_mut(&body).with_context(|| format!("there is no body {body} for the mesh {mesh}"))?;
-            let geom = body.add_geom().with_type(MjtGeomBase::mjGEOM_MESH).with_meshname(mesh).with_material(material);
-            geom.with_pos([0.0, 0.0, height]).with_group(VISUAL);
+        for Piece { body, file, material, height } in &self.pieces {
+            let found = spec.body_mut(body);
+            let body = found.with_context(|| format!("there is no body {body} for the mesh {file}"))?;
+            let geom = body.add_geom().with_type(MjtGeomBase::mjGEOM_MESH).with_meshname(file).with_material(material);
+            geom.with_pos([0.0, 0.0, *height]).with_group(VISUAL);
             geom.with_contype(0).with_conaffinity(0).with_density(0.0);
         }
         let mut model = spec.compile_with_vfs(&files).map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
-        hide_primitives(&mut model);
+        for geom in 0..model.ngeom() as usize {
+            if is_of(&model, geom, &self.bodies) && model.geom_group()[geom] != VISUAL {
+                model.geom_group_mut()[geom] = HIDDEN;
+            }
+        }
         Ok(model)
     }
 }
 
-fn hide_primitives(model: &mut MjModel) {
-    for geom in 0..model.ngeom() as usize {
-        let body = model.geom_bodyid()[geom] as usize;
-        let of_hand = model.id_to_name(MjtObjBase::mjOBJ_BODY, body).is_some_and(|name| name.starts_with("rh_"));
-        if of_hand && model.geom_group()[geom] != VISUAL {
-            model.geom_group_mut()[geom] = HIDDEN;
-        }
-    }
+/// Whether a shape is of one of the bodies whose names begin with `bodies`.
+pub(super) fn is_of(model: &MjModel, geom: usize, bodies: &str) -> bool {
+    let body = model.geom_bodyid()[geom] as usize;
+    model.id_to_name(MjtObjBase::mjOBJ_BODY, body).is_some_and(|name| name.starts_with(bodies))
 }

@@ -27,10 +27,10 @@ mod variation;
 mod viewer;
 
 pub use compilation::{Compilation, Cone, origin};
-pub use drawing::{Drawing, DrawnMesh};
+pub use drawing::{Drawing, DrawnCamera, DrawnMesh};
 pub use fatal::{before_fatal_error, stepping};
 pub use files::scene_files;
-pub use look::{Camera, Look, Quality, mesh_files};
+pub use look::{Camera, Dress, Look, Piece, Quality};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
 pub use simulation::{Physics, Pose, Simulation, SimulationState, Velocity};

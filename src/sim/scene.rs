@@ -114,8 +114,8 @@ impl Scene {
     /// Fails like [`Scene::load`], or if meshes cannot be read.
     pub fn load_for_display(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
         let mut scene = Self::load(file, compilation)?;
-        if file.is_none() && !look.meshes.is_empty() {
-            scene = Self::checked(look.dress(compilation)?, compilation)?;
+        if let (None, Some(dress)) = (file, &look.dress) {
+            scene = Self::checked(dress.compile(compilation)?, compilation)?;
         }
         // A scene to which nothing can be added is shown as it is.
         if let Some(file) = file

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use shadow_repose::sim::mesh_files;
+use shadow_repose::see::mesh_files;
 
 use crate::support::{command, names, stderr};
 

@@ -11,7 +11,8 @@ use openh264::decoder::Decoder;
 use openh264::formats::YUVSource;
 use shadow_repose::env::Env;
 use shadow_repose::repose::{Repose, Task};
-use shadow_repose::sim::{Camera, Look, Quality, mesh_files};
+use shadow_repose::see::{dress, mesh_files};
+use shadow_repose::sim::{Camera, Look, Quality};
 use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
@@ -184,7 +185,7 @@ fn an_interrupted_film_shows_what_was_played() {
 fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
     let tetrahedron = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n".to_vec();
     let look = Look {
-        meshes: vec![tetrahedron; mesh_files().len()],
+        dress: Some(dress("rh_", vec![tetrahedron; mesh_files().len()])),
         size: [320, 240],
         camera: Some(Camera { azimuth: 10.0, elevation: -80.0, distance: 2.0 }),
         quality: Quality::Fast,
@@ -219,7 +220,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     assert!(bare.contains("<geom mass="));
     std::fs::write(&path, bare).unwrap();
     let plain = task(&[&format!("env.model={}", path.display())]);
-    let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
+    let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast };
     let furnished = plain.for_display(&look).unwrap();
     let geoms = [&plain, &furnished].map(|task| task.scene().geoms());
     assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
@@ -236,7 +237,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
 fn a_plain_box_and_a_goal_that_is_added_have_faces_that_can_be_told_apart() {
     let model = concat!("env.model=", env!("CARGO_MANIFEST_DIR"), "/tests/suite/three_fingers.xml");
     let plain = task(&[model]);
-    let look = Look { meshes: Vec::new(), size: [320, 240], camera: None, quality: Quality::Fast };
+    let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast };
     let geoms = [&plain, &plain.for_display(&look).unwrap()].map(|task| task.scene().geoms());
     assert_eq!(geoms[1], geoms[0] + 12);
 }
@@ -244,7 +245,7 @@ fn a_plain_box_and_a_goal_that_is_added_have_faces_that_can_be_told_apart() {
 #[test]
 fn meshes_that_are_no_meshes_are_an_error_with_their_name() {
     let look = Look {
-        meshes: vec![b"rubbish".to_vec(); mesh_files().len()],
+        dress: Some(dress("rh_", vec![b"rubbish".to_vec(); mesh_files().len()])),
         size: [64, 64],
         camera: None,
         quality: Quality::Fast,

@@ -1,0 +1,50 @@
+//! The meshes of the real Shadow Hand, which are shown over the primitives of the built-in scene.
+
+use crate::sim::{Dress, Piece};
+
+/// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
+type Part = (&'static str, &'static str, &'static str, f64);
+
+/// The parts, by what the bodies' names begin with after the hand's prefix. The values come from MuJoCo Menagerie's Shadow Hand.
+const PARTS: [(&str, &[Part]); 5] = [("", &HAND), ("ff", &FINGER), ("mf", &FINGER), ("rf", &FINGER), ("lf", &FINGER)];
+
+const HAND: [Part; 8] = [
+    ("forearm", "forearm_0.obj", "metal", 0.0),
+    ("forearm", "forearm_1.obj", "shell", 0.0),
+    ("wrist", "wrist.obj", "metal", 0.0),
+    ("palm", "palm.obj", "shell", 0.0),
+    ("lfmetacarpal", "lf_metacarpal.obj", "shell", 0.0),
+    ("thproximal", "th_proximal.obj", "shell", 0.0),
+    ("thmiddle", "th_middle.obj", "shell", 0.0),
+    ("thdistal", "th_distal_pst.obj", "rubber", 0.0),
+];
+
+const FINGER: [Part; 4] = [
+    ("knuckle", "f_knuckle.obj", "metal", 0.0005),
+    ("proximal", "f_proximal.obj", "shell", 0.0),
+    ("middle", "f_middle.obj", "shell", 0.0),
+    ("distal", "f_distal_pst.obj", "rubber", 0.0),
+];
+
+/// The mesh files of the hand, sorted and without duplicates.
+pub fn mesh_files() -> Vec<&'static str> {
+    let mut files: Vec<&str> = PARTS.iter().flat_map(|(_, parts)| parts.iter().map(|part| part.1)).collect();
+    files.sort_unstable();
+    files.dedup();
+    files
+}
+
+/// The meshes on a hand whose names have this prefix, given the contents of [`mesh_files`] in that order.
+pub fn dress(prefix: &str, contents: Vec<Vec<u8>>) -> Dress {
+    let pieces = PARTS.iter().flat_map(|(finger, parts)| {
+        parts.iter().map(move |&(part, file, material, height)| {
+            let body = format!("{prefix}{finger}{part}");
+            Piece { body, file, material, height }
+        })
+    });
+    Dress {
+        bodies: prefix.to_owned(),
+        files: mesh_files().into_iter().zip(contents).collect(),
+        pieces: pieces.collect(),
+    }
+}
