@@ -10,7 +10,7 @@ use crate::cli::{Along, PlotArgs};
 use crate::draw::{self, Chart, Curve, Picture, Subplot};
 use crate::os::{self, OutputFile, similar};
 use crate::run::{self, MetricsTable, value_at};
-use crate::tags::quantity;
+use crate::tags::tag;
 
 /// A metric, and what is drawn instead where no run has its values.
 type Metric<'a> = (&'a str, Option<&'a str>);
@@ -69,7 +69,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
         let name = other.filter(|other| !known(usual) && known(other)).unwrap_or(usual);
         let curves: Vec<Curve> = runs.iter().map(|run| run.curve(name)).collect();
         let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
-        let mut title = quantity(name).map_or_else(|| name.to_owned(), |known| known.title);
+        let mut title = tag(name).map_or_else(|| name.to_owned(), |known| known.title);
         let curves = if args.seeds {
             let curves: Vec<Curve> = curves.into_iter().filter(|curve| !curve.points.is_empty()).collect();
             if curves.len() < runs.len() {

@@ -5,7 +5,7 @@ use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TR
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Quantity {
+pub struct Tag {
     /// What it is, in a few words, with its unit in brackets if it has one.
     pub title: String,
     /// What it is, in a sentence.
@@ -52,10 +52,10 @@ const OTHERS: [(&str, &str, &str); 21] = [
 ];
 
 /// Returns the quantity with this name, if a training logs it.
-pub fn quantity(name: &str) -> Option<Quantity> {
+pub fn tag(name: &str) -> Option<Tag> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {
-        return Some(Quantity { title: (*title).to_owned(), description: (*description).to_owned() });
+        return Some(Tag { title: (*title).to_owned(), description: (*description).to_owned() });
     }
     let (group, part) = name.split_once('/')?;
     let term = |list: Vec<Description>| {
@@ -69,7 +69,7 @@ pub fn quantity(name: &str) -> Option<Quantity> {
         _ => None,
     };
     if let Some(description) = description {
-        return Some(Quantity { title: format!("{group}: {part}"), description });
+        return Some(Tag { title: format!("{group}: {part}"), description });
     }
     GROUPS.iter().find_map(|(group, measures, of, episodes)| {
         let column = name.strip_prefix(group).filter(|column| measures.contains(column))?;
@@ -83,7 +83,7 @@ pub fn quantity(name: &str) -> Option<Quantity> {
             "" | "%" => String::new(),
             unit => format!(" ({unit})"),
         };
-        Some(Quantity {
+        Some(Tag {
             title: format!("{}{unit}, {of}", measure.title),
             description: format!("{} {episodes} {better}", measure.description),
         })

@@ -63,7 +63,7 @@ fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Re
     let about = see::About { title: scene, policy: None, seed: Some(args.seed) };
     let own = sliders.clone();
     let step = move |player: &mut Player| player.step_changed(&ACTORS[actor].2, |action| own.change(action));
-    let acting = see::Acting { step: Rc::new(step), policy: None, task: task.clone() };
+    let acting = see::LiveActor { step: Rc::new(step), policy: None, task: task.clone() };
     see::Live::open(port, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }
 

@@ -9,5 +9,5 @@ mod page;
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
 pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
 #[cfg(feature = "video")]
-pub use film::{FilmFormat, FilmWriter, Frame, write_png};
+pub use film::{CaptionedFrame, FilmFormat, FilmWriter, write_png};
 pub use page::{Mesh, Page};

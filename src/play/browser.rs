@@ -18,7 +18,7 @@ use crate::os::{self, Stamp};
 use crate::ppo::FixedPolicy;
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
-use crate::see::{self, About, Acting, Live};
+use crate::see::{self, About, Live, LiveActor};
 use crate::sim::Quality;
 
 /// The text for the origin of a built-in policy.
@@ -91,7 +91,7 @@ pub(super) fn live(
         None => {
             let about = about(baseline.name(), None, Some(args.seed));
             let step = Rc::new(move |player: &mut Player| player.step(&baseline));
-            (about, Acting { step, policy: None, task: task.clone() })
+            (about, LiveActor { step, policy: None, task: task.clone() })
         }
     };
     if let Some(followed) = &followed {
@@ -124,7 +124,7 @@ pub(super) fn live(
 }
 
 /// The policy as an actor in this task, in which the actions of each checkpoint of a run are smoothed as it has learnt it.
-fn acting_of(loaded: &Loaded, args: &PlayArgs, task: &Task) -> Result<Acting> {
+fn acting_of(loaded: &Loaded, args: &PlayArgs, task: &Task) -> Result<LiveActor> {
     let config = for_playing(&loaded.checkpoint, loaded.origin.path(), &args.set)?;
     let task = task.smoothed_as_in(&config.env);
     let (policy, stochastic) = (FixedPolicy::new(loaded.policy.clone()), args.stochastic);
@@ -132,7 +132,7 @@ fn acting_of(loaded: &Loaded, args: &PlayArgs, task: &Task) -> Result<Acting> {
         let frozen = policy.frozen();
         player.step(&if stochastic { Actor::Stochastic(frozen) } else { Actor::Mean(frozen) })
     };
-    Ok(Acting { step: Rc::new(step), policy: Some(loaded.name.clone()), task })
+    Ok(LiveActor { step: Rc::new(step), policy: Some(loaded.name.clone()), task })
 }
 
 /// Writes the episodes of the trace in the file `path` as the file `html`.

@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 
 use super::conditions::Conditions;
 use super::divergence::{Diverged, Recorder};
-use super::observation::Cells;
+use super::observation::Writer;
 use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::Servos;
@@ -19,7 +19,7 @@ use crate::config::{EnvConfig, SuccessHold};
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Actuator, Physics, Pose, Simulation, Velocity};
+use crate::sim::{Actuator, Pose, Simulation, Validity, Velocity};
 use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
@@ -230,7 +230,7 @@ impl Repose {
     pub fn observe(&self, observation: &mut [f32]) {
         let (hand, config) = (&self.task.hand, &self.task.config);
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
-        let mut cells = Cells::new(&hand.layout, observation);
+        let mut cells = Writer::new(&hand.layout, observation);
         cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
         cells.put("joint_vel", hand.joints.iter().map(|joint| config.vel_obs_scale * qvel[joint.dof]));
 
@@ -313,7 +313,7 @@ impl Env for Repose {
         let left = quat::mul(self.goal, quat::conj(self.object().orientation));
         let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, push, torque);
-        let diverged = self.sim.step(self.task.config.substeps()) == Physics::Diverged;
+        let diverged = self.sim.step(self.task.config.substeps()) == Validity::Diverged;
         if diverged {
             // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
             self.send();

@@ -2,7 +2,7 @@
 
 use crate::quat;
 use crate::spaces::{ObjectAndGoal, Spaces};
-use Source::{Known, Measured};
+use Sensing::{Known, Measured};
 
 /// A group of consecutive values in an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,12 +17,12 @@ pub struct Group {
     pub unit: &'static str,
     /// The values that change their sign in the mirror, by index. For fingertips, the indices apply to each one.
     mirrored: &'static [usize],
-    source: Source,
+    sensing: Sensing,
 }
 
 /// Where the values of a group come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Source {
+pub(super) enum Sensing {
     /// Sensors, which may have noise and offsets.
     Measured,
     /// They are known exactly, or follow from measured groups.
@@ -76,16 +76,16 @@ impl Layout {
             ("previous_action", Known, actuators, "1", NOTHING),
         ];
         let mut size = 0;
-        let groups = table.map(|(name, source, length, unit, mirrored)| {
+        let groups = table.map(|(name, sensing, length, unit, mirrored)| {
             size += length;
-            Group { name, start: size - length, length, unit, mirrored, source }
+            Group { name, start: size - length, length, unit, mirrored, sensing }
         });
         Self { groups, size, actions: actuators }
     }
 
     /// The groups that sensors measure.
     pub(super) fn measured(&self) -> impl Iterator<Item = &Group> {
-        self.groups.iter().filter(|group| group.source == Measured)
+        self.groups.iter().filter(|group| group.sensing == Measured)
     }
 
     /// Returns the index of the first value of a group, by the group's place in the table.
@@ -128,14 +128,14 @@ fn rotation_error(spaces: &Spaces, observation: &[f32]) -> f32 {
 }
 
 /// An observation that is being written, group by group.
-pub(super) struct Cells<'a> {
+pub(super) struct Writer<'a> {
     layout: &'a Layout,
     cells: &'a mut [f32],
     written: usize,
     part: usize,
 }
 
-impl<'a> Cells<'a> {
+impl<'a> Writer<'a> {
     pub(super) fn new(layout: &'a Layout, observation: &'a mut [f32]) -> Self {
         assert_eq!(observation.len(), layout.size, "observation length");
         Self { layout, cells: observation, written: 0, part: 0 }
@@ -189,23 +189,23 @@ mod tests {
     #[test]
     fn numbers_that_do_not_fit_into_their_part_are_refused() {
         let layout = Layout::new(24, 5, 20);
-        let refused = |write: fn(&mut Cells)| {
+        let refused = |write: fn(&mut Writer)| {
             let mut observation = [0.0; 157];
-            let mut cells = Cells::new(&layout, &mut observation);
+            let mut cells = Writer::new(&layout, &mut observation);
             std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| write(&mut cells))).is_err()
         };
         assert!(!refused(|cells| cells.put("joint_pos", [0.0; 24])));
         assert!(refused(|cells| cells.put("joint_pos", [0.0; 25])), "too many");
         assert!(refused(|cells| cells.put("joint_vel", [0.0; 24])), "out of order");
-        let all = |cells: &mut Cells| {
+        let all = |cells: &mut Writer| {
             for part in Layout::new(24, 5, 20).groups {
                 (0..part.length).for_each(|_| cells.put(part.name, [0.0]));
             }
         };
         let mut observation = [0.0; 157];
-        let mut cells = Cells::new(&layout, &mut observation);
+        let mut cells = Writer::new(&layout, &mut observation);
         all(&mut cells);
         cells.finish();
-        assert!(refused(|cells| Cells::new(cells.layout, &mut [0.0; 157]).finish()), "nothing was written");
+        assert!(refused(|cells| Writer::new(cells.layout, &mut [0.0; 157]).finish()), "nothing was written");
     }
 }

@@ -3,12 +3,13 @@
 use crate::sim::{Dress, Piece};
 
 /// A part of the hand: the end of its body's name, mesh file, material in the built-in scene, height above the body's origin in m.
-type Part = (&'static str, &'static str, &'static str, f64);
+type MeshPart = (&'static str, &'static str, &'static str, f64);
 
 /// The parts, by what the bodies' names begin with after the hand's prefix. The values come from MuJoCo Menagerie's Shadow Hand.
-const PARTS: [(&str, &[Part]); 5] = [("", &HAND), ("ff", &FINGER), ("mf", &FINGER), ("rf", &FINGER), ("lf", &FINGER)];
+const PARTS: [(&str, &[MeshPart]); 5] =
+    [("", &HAND), ("ff", &FINGER), ("mf", &FINGER), ("rf", &FINGER), ("lf", &FINGER)];
 
-const HAND: [Part; 8] = [
+const HAND: [MeshPart; 8] = [
     ("forearm", "forearm_0.obj", "metal", 0.0),
     ("forearm", "forearm_1.obj", "shell", 0.0),
     ("wrist", "wrist.obj", "metal", 0.0),
@@ -19,7 +20,7 @@ const HAND: [Part; 8] = [
     ("thdistal", "th_distal_pst.obj", "rubber", 0.0),
 ];
 
-const FINGER: [Part; 4] = [
+const FINGER: [MeshPart; 4] = [
     ("knuckle", "f_knuckle.obj", "metal", 0.0005),
     ("proximal", "f_proximal.obj", "shell", 0.0),
     ("middle", "f_middle.obj", "shell", 0.0),

@@ -29,7 +29,7 @@ type Stepping = dyn Fn(&mut Player) -> Option<End>;
 
 /// Who acts in an episode.
 #[derive(Clone)]
-pub struct Acting {
+pub struct LiveActor {
     /// Takes one step.
     pub step: Rc<Stepping>,
     /// The page's name for the policy, if it differs from the name for the whole page.
@@ -47,13 +47,13 @@ pub struct Live {
     /// Control steps from row to row.
     every: u64,
     episodes: Episodes,
-    hands: Vec<Hand>,
+    hands: Vec<LiveHand>,
 }
 
 /// A hand on the page.
-struct Hand {
+struct LiveHand {
     player: Player,
-    acting: Acting,
+    acting: LiveActor,
     /// The number of its episode.
     episode: usize,
     has_ended: bool,
@@ -70,7 +70,7 @@ impl Live {
         port: u16,
         (about, camera): (&About, Option<Camera>),
         hands: usize,
-        acting: &Acting,
+        acting: &LiveActor,
         sliders: Option<Sliders>,
     ) -> Result<Self> {
         let task = &acting.task;
@@ -86,9 +86,9 @@ impl Live {
         let episodes = Episodes::scored(seed, usize::MAX);
         let hand = |episode| {
             let player = Player::new(task, Episodes { first: episode, ..episodes });
-            Hand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
+            LiveHand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
         };
-        let hands: Vec<Hand> = (0..hands).map(hand).collect();
+        let hands: Vec<LiveHand> = (0..hands).map(hand).collect();
         let hello = hello(&key, seed, &hands, sliders.as_ref());
         let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
         let (port, machine) = (server.port(), Machine::this().name);
@@ -100,7 +100,7 @@ impl Live {
     }
 
     /// Shows the hands for as long as the program runs. `next` says who acts in each further episode.
-    pub fn show(mut self, next: &mut dyn FnMut() -> Acting) -> ! {
+    pub fn show(mut self, next: &mut dyn FnMut() -> LiveActor) -> ! {
         let start = Instant::now();
         let mut clock = Clock::new(self.hands[0].acting.task.config().ctrl_dt);
         let mut steps = 0_u64;
@@ -132,7 +132,7 @@ impl Live {
         }
     }
 
-    fn begin(&mut self, hand: usize, episode: usize, acting: Acting) {
+    fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
         let own = &mut self.hands[hand];
         own.player = Player::new(&acting.task, Episodes { first: episode, ..self.episodes });
         (own.acting, own.episode, own.has_ended) = (acting, episode, false);
@@ -159,7 +159,7 @@ impl Live {
     }
 }
 
-impl Hand {
+impl LiveHand {
     /// Returns what the page says of its episode, which is drawn from this seed.
     fn about(&self, seed: u64) -> Value {
         let mut about = json!({ "seed": format!("{seed}, episode {}", self.episode) });
@@ -177,7 +177,7 @@ impl Hand {
 }
 
 /// Returns the first event for a viewer: the key of the page, and what is under way.
-fn hello(key: &str, seed: u64, hands: &[Hand], sliders: Option<&Sliders>) -> String {
+fn hello(key: &str, seed: u64, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
     let episodes: Vec<Value> = hands.iter().map(|hand| hand.about(seed)).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
     if let Some(sliders) = sliders {
@@ -203,7 +203,7 @@ mod tests {
             let config = Config::resolve(None, &sets).unwrap();
             Task::new(&config.env, &config.hand).unwrap()
         };
-        let acting = |task: &Arc<Task>| Acting { step: Rc::new(|_| None), policy: None, task: task.clone() };
+        let acting = |task: &Arc<Task>| LiveActor { step: Rc::new(|_| None), policy: None, task: task.clone() };
         let about = About { title: "A hand".into(), policy: None, seed: None };
         let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
         let mut live = Live::open(0, (&about, None), 1, &acting(&first), None).unwrap();

@@ -20,7 +20,7 @@ pub use display::task_for_display;
 pub use dress::{dress, mesh_files};
 #[cfg(feature = "video")]
 pub use film::{Film, screenshot};
-pub use live::{Acting, Live};
+pub use live::{Live, LiveActor};
 pub use replay::{MOST_EPISODES, Replay};
 pub use sliders::Sliders;
 #[cfg(feature = "viewer")]

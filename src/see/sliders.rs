@@ -12,9 +12,9 @@ const MALFORMED: &str = "Send a list of pairs: the number of an actuator, and a 
 
 /// A slider for each actuator, in action order. An actuator obeys its slider from the first time that this is moved.
 #[derive(Clone)]
-pub struct Sliders(Arc<Mutex<State>>);
+pub struct Sliders(Arc<Mutex<SliderStates>>);
 
-struct State {
+struct SliderStates {
     sliders: Vec<Slider>,
     /// Whether one has moved since this was last asked.
     moved: bool,
@@ -39,7 +39,7 @@ impl Sliders {
         let hand = task.hand();
         let sliders = hand.parts.actuators.iter().zip(&hand.actuators);
         let sliders = sliders.map(|(name, actuator)| Slider { name: name.clone(), range: actuator.range, value: None });
-        Self(Arc::new(Mutex::new(State { sliders: sliders.collect(), moved: false })))
+        Self(Arc::new(Mutex::new(SliderStates { sliders: sliders.collect(), moved: false })))
     }
 
     /// Changes an action to what the sliders ask for: -1 and 1 are the ends of the range of an actuator.
@@ -90,7 +90,7 @@ impl Sliders {
         self.state().sliders.iter().map(described).collect()
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, SliderStates> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -33,7 +33,7 @@ pub use files::scene_files;
 pub use look::{Camera, Dress, Look, Piece, Quality};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
-pub use simulation::{Physics, Pose, Simulation, SimulationState, Velocity};
+pub use simulation::{Pose, Simulation, SimulationState, Validity, Velocity};
 pub use structure::Parts;
 pub use variation::{Change, Variants};
 

@@ -11,7 +11,7 @@ use crate::quat::{self, Quat};
 /// The validity of the state after a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
-pub enum Physics {
+pub enum Validity {
     /// The state can be used.
     Sound,
     /// The state or a control was not finite or was far too large. MuJoCo has reset what it could not use.
@@ -79,15 +79,15 @@ impl Simulation {
     ///
     /// `mj_step` would leave the bodies one substep behind the joints. Its two halves in the opposite order are bit for bit the
     /// same computation and end with both at the same instant.
-    pub fn step(&mut self, substeps: usize) -> Physics {
+    pub fn step(&mut self, substeps: usize) -> Validity {
         for _ in 0..substeps {
             self.data.step2();
             self.data.step1();
             if self.diverged() {
-                return Physics::Diverged;
+                return Validity::Diverged;
             }
         }
-        Physics::Sound
+        Validity::Sound
     }
 
     /// Begins a replay with [`Simulation::step_whole`] from the state of a simulation of `scene`, which is this simulation's scene

@@ -5,7 +5,7 @@ use crate::ppo::{Rollout, RolloutBlock};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, OF_EVALUATIONS, OF_TRAINING, Score};
 use crate::run::{self, Descriptions, Histogram, histogram};
-use crate::tags::quantity;
+use crate::tags::tag;
 
 /// The scores of the episodes that ended in an iteration.
 pub(super) struct Ended {
@@ -66,7 +66,7 @@ const ADVANTAGES: &str = "histogram/advantages";
 /// Returns the values with these names and all other things that are logged, with their descriptions.
 pub(super) fn described(names: &[String]) -> Descriptions {
     let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
-    all.map(|name| (name.to_owned(), quantity(name).map(|known| known.description).unwrap_or_default())).collect()
+    all.map(|name| (name.to_owned(), tag(name).map(|known| known.description).unwrap_or_default())).collect()
 }
 
 /// Returns the histograms of the rollout that was just learnt from.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use shadow_repose::env::Env;
 use shadow_repose::repose::{Hand, Repose, Task};
-use shadow_repose::sim::{Compilation, Cone, Parts, Physics, Scene, Simulation};
+use shadow_repose::sim::{Compilation, Cone, Parts, Scene, Simulation, Validity};
 
 use crate::support::{OBSERVATION_SIZE, SCENE, config, env_config, started, task};
 
@@ -97,7 +97,7 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
     for step in 0..50 {
         let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();
         simulation.ctrl_mut().copy_from_slice(&ctrl);
-        assert_eq!(simulation.step(1), Physics::Sound);
+        assert_eq!(simulation.step(1), Validity::Sound);
         bare.ctrl_mut().copy_from_slice(&ctrl);
         bare.step_whole(1);
         assert_eq!(simulation.qpos(), bare.qpos(), "step {step}");

@@ -25,12 +25,12 @@ const WAITING: usize = 4;
 const MOST_FRAMES: usize = 2_000_000;
 
 /// A frame `[height, width, 3]`, and the lines of text in its corner.
-pub type Frame = (Vec<u8>, Vec<String>);
+pub type CaptionedFrame = (Vec<u8>, Vec<String>);
 
 /// A film being written. The file appears once the film is finished.
 pub struct FilmWriter {
     path: PathBuf,
-    frames: SyncSender<Frame>,
+    frames: SyncSender<CaptionedFrame>,
     encoder: JoinHandle<Result<OutputFile>>,
 }
 
@@ -62,7 +62,7 @@ impl FilmWriter {
 
     /// Adds a frame. Does nothing if the encoder has failed: [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`]
     /// returns the reason.
-    pub fn push(&mut self, frame: Frame) {
+    pub fn push(&mut self, frame: CaptionedFrame) {
         let _ = self.frames.send(frame);
     }
 
@@ -83,7 +83,7 @@ impl FilmWriter {
     }
 }
 
-fn captioned(frames: Receiver<Frame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
+fn captioned(frames: Receiver<CaptionedFrame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
     frames.into_iter().map(move |(mut rgb, lines)| {
         caption::draw(&mut rgb, format.size, &lines);
         rgb
