@@ -9,7 +9,7 @@ use std::any::Any;
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
-/// Returns the number of items in each block when `items` of a total of `in_all` items are split. There are enough
+/// The number of items in each block when `items` of a total of `in_all` items are split. There are enough
 /// blocks for many threads, and enough items in each for full vectors of work.
 pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
     let size = (in_all / 32).clamp(8, 64);
@@ -54,7 +54,7 @@ pub fn in_rounds<B: Send>(
     done.into_iter().map(|waiting| waiting.block).collect()
 }
 
-/// Returns the message of a panic.
+/// The message of a panic.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")

@@ -59,12 +59,12 @@ pub struct Iteration<L> {
 }
 
 impl<L> Iteration<L> {
-    /// Returns the control steps per second.
+    /// The control steps per second.
     pub fn steps_per_s(&self) -> f64 {
         self.steps as f64 / (self.collect_s + self.update_s)
     }
 
-    /// Returns the times and the speed, by name.
+    /// The times and the speed, by name.
     pub fn time_named(&self) -> [(&'static str, f64); 3] {
         [("collect_s", self.collect_s), ("update_s", self.update_s), ("steps_per_s", self.steps_per_s())]
     }
@@ -130,7 +130,8 @@ impl<E: Env> Agent<E> {
         let Some(update) = self.ppo.update(&mut self.rollout, self.iteration + 1, stop)? else { return Ok(None) };
         self.rollout.carry_over();
         let steps = self.exchange.of_all(self.rollout.samples()) as u64;
-        (self.iteration, self.env_steps) = (self.iteration + 1, self.env_steps + steps);
+        self.iteration += 1;
+        self.env_steps += steps;
         let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
         Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
     }
@@ -144,7 +145,9 @@ impl<E: Env> Agent<E> {
         let lesson = (self.lessons)(self.env_steps);
         self.pool.set_lesson(lesson);
         self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
-        let (ppo, iteration, horizon) = (&self.ppo, self.iteration + 1, self.rollout.horizon());
+        let ppo = &self.ppo;
+        let iteration = self.iteration + 1;
+        let horizon = self.rollout.horizon();
         let acting = ppo.acting();
         let parts = self.pool.blocks.iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.work);
         let blocks =
@@ -223,7 +226,8 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
     let own = iteration.checked_sub(before).zip(env_steps.checked_sub(steps_before));
     // An iteration makes at least as many steps as the first one, and at most as many as the last one.
-    let (least, most) = (config.steps_per_iteration(), (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as u64);
+    let least = config.steps_per_iteration();
+    let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as u64;
     let possible = own.is_some_and(|(own, steps)| {
         let bounds = own.checked_mul(least).zip(own.checked_mul(most));
         bounds.is_some_and(|(least, most)| (least..=most).contains(&steps)) && steps.is_multiple_of(least)
@@ -231,7 +235,8 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
     for name in [NUMBERS, COUNTERS] {
         let shape = checkpoint.shape(name).context("it holds a policy alone, which can be played but not resumed")?;
-        let (rows, expected) = (shape.first().copied().unwrap_or(0), config.env.num_envs);
+        let rows = shape.first().copied().unwrap_or(0);
+        let expected = config.env.num_envs;
         ensure!(rows == expected, "it holds the states of {rows} environments, expected {expected}");
     }
     Ok(())

@@ -11,39 +11,55 @@ use crate::ranks::Exchange;
 use crate::repose::{Repose, Task};
 
 /// The numbers of environments that are compared, the key of their speed in JSON, and how much a step brings compared with a step of
-/// 1024 environments. The worth of a step comes from trainings of 15 M steps with the default settings (`docs/RECIPES.md`).
+/// 1024 environments. The worth of a step comes from training runs of 15 M steps with the default settings (`docs/RECIPES.md`).
 const COMPARED: [(usize, &str, f64); 3] =
     [(512, "steps_per_s_of_512", 0.56), (1024, "steps_per_s_of_1024", 1.0), (2048, "steps_per_s_of_2048", 0.74)];
 
-/// Whole iterations of each training that are measured, in turn, after one that is not.
+/// Whole iterations of each training run that are measured, in turn, after one that is not.
 const ITERATIONS: usize = 2;
 
-/// Measures trainings with different numbers of environments and tells which learns most in the same time. A number that the settings do
-/// not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
+/// A training run of a number of environments that is measured.
+struct Candidate {
+    envs: usize,
+    key: &'static str,
+    worth: f64,
+    agent: Agent<Repose>,
+    /// The control steps per second of each iteration.
+    rates: Vec<f64>,
+}
+
+/// Measures training runs with different numbers of environments and tells which learns most in the same time. A number that the
+/// settings do not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
 pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
-    let mut trainings: Vec<(usize, &str, f64, Agent<Repose>)> = Vec::new();
-    for (envs, key, share) in COMPARED {
+    let mut candidates = Vec::new();
+    for (envs, key, worth) in COMPARED {
         let number = format!("env.num_envs={envs}").parse().expect("a setting");
         let Ok(config) = config.changed(None, &[number]) else { continue };
-        trainings.push((envs, key, share, Agent::for_task(task, &config, Exchange::alone(config.shards()))?));
+        let agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
+        candidates.push(Candidate { envs, key, worth, agent, rates: Vec::new() });
     }
-    let mut rates = vec![Vec::new(); trainings.len()];
     for round in 0..=ITERATIONS {
-        for ((.., agent), rates) in trainings.iter_mut().zip(&mut rates) {
+        for Candidate { agent, rates, .. } in &mut candidates {
             let speed = agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s();
             rates.extend((round > 0).then_some(speed));
         }
     }
-    let speeds = rates.into_iter().map(median);
-    let found: Vec<_> =
-        trainings.iter().zip(speeds).map(|((envs, key, share, _), v)| (*envs, *key, *share, v)).collect();
-    let line = |&(envs, _, share, speed): &(usize, _, f64, f64)| {
-        format!("{envs:>5} environments        {speed:>10.0} steps/s   worth {:.0} steps/s with 1024\n", share * speed)
-    };
-    let mut lines: String = found.iter().map(line).collect();
-    let best = found.iter().max_by(|a, b| (a.2 * a.3).total_cmp(&(b.2 * b.3)));
-    let mut figures: Vec<(&'static str, f64)> = found.iter().map(|&(_, key, _, speed)| (key, speed)).collect();
-    if let Some(&(envs, ..)) = best {
+    let mut figures = Vec::new();
+    let mut lines = String::new();
+    let mut best = None;
+    let mut most = 0.0;
+    for Candidate { envs, key, worth, rates, .. } in candidates {
+        let speed = median(rates);
+        let learning = worth * speed;
+        figures.push((key, speed));
+        lines +=
+            &format!("{envs:>5} environments        {speed:>10.0} steps/s   worth {learning:.0} steps/s with 1024\n");
+        if learning > most {
+            most = learning;
+            best = Some(envs);
+        }
+    }
+    if let Some(envs) = best {
         lines += &format!("env.num_envs={envs} learns most in the same time on this machine\n");
         figures.push(("advised_num_envs", envs as f64));
     }

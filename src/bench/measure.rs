@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 /// The stop flag of measured work, which is never set.
 pub(super) static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// Returns the median, or the upper one of two.
+/// The median, or the upper one of two.
 pub(super) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]

@@ -19,7 +19,7 @@ use crate::os;
 use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Task};
-use crate::rng;
+use crate::rng::{self, Rng};
 use crate::schedule::in_rounds;
 use environments::environments;
 use measure::{Found, NEVER, median};
@@ -55,7 +55,9 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env, &config.hand)?;
     config.env = task.config().clone();
-    let (threads, num_envs, hidden) = (rayon::current_num_threads(), config.env.num_envs, &config.ppo.hidden);
+    let threads = rayon::current_num_threads();
+    let num_envs = config.env.num_envs;
+    let hidden = &config.ppo.hidden;
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
     let mut lines = format!("{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n");
@@ -76,24 +78,33 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
 /// The measurement of a part.
 type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
 
-/// Measures the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
-fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
-    let envs = config.env.num_envs;
-    let bursts = STEPS.div_ceil(envs * BURST);
-    let randomization = Randomization::new(task, &config.randomization)?;
-    let recording = (0..envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
-    let mut pool = EnvPool::new(config.run.seed, recording, &Exchange::alone(1));
-    let mut lesson = Lesson::task(&config.env);
-    lesson.randomized = Lesson::at(0, config).randomized;
-    pool.set_lesson(lesson);
-    let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
-    pool.reset(rollout.first_observations_mut());
-    let mut noise = rng::stream(config.run.seed, "bench", 0);
-    let std = config.ppo.std.at(0) as f32;
-    // Returns the seconds that the steps took.
-    let mut burst = |pool: &mut EnvPool<RecordingEnv>| {
+/// Environments that record their physics, and the random actions that they take.
+struct Bursts {
+    pool: EnvPool<RecordingEnv>,
+    rollout: Rollout,
+    noise: Rng,
+    std: f32,
+}
+
+impl Bursts {
+    fn new(task: &Arc<Task>, config: &Config) -> Result<Self> {
+        let randomization = Randomization::new(task, &config.randomization)?;
+        let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
+        let mut pool = EnvPool::new(config.run.seed, envs, &Exchange::alone(1));
+        let mut lesson = Lesson::task(&config.env);
+        lesson.randomized = Lesson::at(0, config).randomized;
+        pool.set_lesson(lesson);
+        let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
+        pool.reset(rollout.first_observations_mut());
+        let noise = rng::stream(config.run.seed, "bench", 0);
+        Ok(Self { pool, rollout, noise, std: config.ppo.std.at(0) as f32 })
+    }
+
+    /// Steps the environments through a burst, and tells the seconds that it took.
+    fn step(&mut self) -> f64 {
+        let Self { pool, rollout, noise, std } = self;
         let actions = rollout.blocks.iter_mut().flat_map(|block| &mut block.actions);
-        actions.for_each(|action| *action = std * Distribution::<f32>::sample(&StandardNormal, &mut noise));
+        actions.for_each(|action| *action = *std * Distribution::<f32>::sample(&StandardNormal, noise));
         pool.envs_mut().for_each(RecordingEnv::begin);
         let start = Instant::now();
         let stepped = in_rounds(pool.blocks.iter_mut().zip(&mut rollout.blocks), BURST, |(envs, rollout), t| {
@@ -101,19 +112,27 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
         });
         drop(stepped);
         start.elapsed().as_secs_f64()
-    };
+    }
+}
+
+/// Measures the env steps per second of bare physics and of the pool, as medians of the rounds, and the median of their ratios.
+fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
+    let envs = config.env.num_envs;
+    let mut bursts = Bursts::new(task, config)?;
     // Unmeasured steps first, so that most cubes lie in the hand. Many environments take fewer of them.
     for _ in 0..(2 * STEPS / envs).clamp(4, 64) / BURST {
-        burst(&mut pool);
+        bursts.step();
     }
+    let in_round = STEPS.div_ceil(envs * BURST);
     let mut rates: [Vec<f64>; 3] = Default::default();
     for _ in 0..ROUNDS {
-        let (mut pool_seconds, mut bare_seconds) = (0.0, 0.0);
-        for _ in 0..bursts {
-            pool_seconds += burst(&mut pool);
-            bare_seconds += replay(&mut pool)?;
+        let mut pool_seconds = 0.0;
+        let mut bare_seconds = 0.0;
+        for _ in 0..in_round {
+            pool_seconds += bursts.step();
+            bare_seconds += replay(&mut bursts.pool)?;
         }
-        let done = (bursts * BURST * envs) as f64;
+        let done = (in_round * BURST * envs) as f64;
         let found = [done / bare_seconds, done / pool_seconds, bare_seconds / pool_seconds];
         rates.iter_mut().zip(found).for_each(|(rates, rate)| rates.push(rate));
     }
@@ -164,7 +183,8 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     }
     let speed = median(if rates.len() > 1 { rates.split_off(1) } else { rates });
     let total = config.run.total_steps as f64;
-    let (hours, millions) = (total / speed / 3600.0, total / 1e6);
+    let hours = total / speed / 3600.0;
+    let millions = total / 1e6;
     let line = format!("end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n");
     Ok((vec![("end_to_end_steps_per_s", speed), ("default_training_hours", hours)], line))
 }

@@ -63,7 +63,8 @@ impl RecordingEnv {
     }
 
     fn start(&mut self) {
-        let (state, draw) = (self.env.simulation().state(), self.env.draw().cloned());
+        let state = self.env.simulation().state();
+        let draw = self.env.draw().cloned();
         self.starts.push(Start { after: self.steps.len(), state, draw });
     }
 

@@ -42,7 +42,7 @@ pub trait Env: Send {
     /// The variant of the task that is trained at a given step of a run.
     type Lesson: Copy + Send;
 
-    /// Returns the description of observations and actions that a learner needs.
+    /// The description of observations and actions that a learner needs.
     fn spaces(&self) -> Spaces;
 
     /// Switches to `lesson` from the next step on.
@@ -60,7 +60,7 @@ pub trait Env: Send {
     /// Continues under another goal after a step that ended with [`End::Redirected`], and writes the observation that shows it.
     fn redirect(&mut self, observation: &mut [f32]);
 
-    /// Returns the record of the episode so far.
+    /// The record of the episode so far.
     fn episode(&self) -> Self::Episode;
 }
 

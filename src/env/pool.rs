@@ -66,12 +66,13 @@ struct Draw {
     stride: u64,
 }
 
-/// What a step of an environment reads and writes.
-struct Cells<'a> {
-    action: &'a [f32],
-    reward: &'a mut f32,
+/// An environment with its part of its block.
+struct Member<'a, E: Env> {
+    /// Its number, counted over all ranks.
+    number: usize,
+    slot: &'a mut Slot<E>,
+    draw: Draw,
     end: &'a mut Option<End>,
-    observation: &'a mut [f32],
     final_observation: &'a mut [f32],
 }
 
@@ -82,7 +83,8 @@ impl<E: Env> EnvPool<E> {
     /// # Panics
     /// Panics if there are none, or if they do not divide evenly into the shards of this rank.
     pub fn new(seed: u64, envs: Vec<E>, exchange: &Exchange) -> Self {
-        let (shards, spaces) = (exchange.own_shards(), envs[0].spaces());
+        let shards = exchange.own_shards();
+        let spaces = envs[0].spaces();
         let in_shard = envs.len() / shards.len();
         assert_eq!(
             in_shard * shards.len(),
@@ -92,7 +94,8 @@ impl<E: Env> EnvPool<E> {
         );
         let all = in_shard * exchange.shards();
         let sizes = block_sizes(in_shard, all);
-        let (first_block, mut first) = (shards.start * sizes.len(), shards.start * in_shard);
+        let first_block = shards.start * sizes.len();
+        let mut first = shards.start * in_shard;
         let mut slots = (first as u64..).zip(envs).map(|(next_episode, env)| Slot { env, next_episode });
         let block = |(number, size)| {
             first += size;
@@ -110,17 +113,17 @@ impl<E: Env> EnvPool<E> {
         Self { blocks: (first_block..).zip(sizes.repeat(shards.len())).map(block).collect() }
     }
 
-    /// Returns the description of observations and actions.
+    /// The description of observations and actions.
     pub fn spaces(&self) -> Spaces {
         self.blocks[0].spaces
     }
 
-    /// Returns the number of environments.
+    /// The number of environments.
     pub fn count(&self) -> usize {
         self.block_sizes().iter().sum()
     }
 
-    /// Returns the number of environments in each block.
+    /// The number of environments in each block.
     pub fn block_sizes(&self) -> Vec<usize> {
         self.blocks.iter().map(EnvBlock::count).collect()
     }
@@ -130,8 +133,8 @@ impl<E: Env> EnvPool<E> {
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = self.spaces().observation_size;
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
-            for (i, (slot, row)) in block.slots.iter_mut().zip(rows.chunks_exact_mut(size)).enumerate() {
-                stepping("environment", block.first + i, || slot.start_aged(block.draw, row));
+            for (member, row) in block.members().zip(rows.chunks_exact_mut(size)) {
+                stepping("environment", member.number, || member.slot.start_aged(member.draw, row));
             }
         });
     }
@@ -147,13 +150,10 @@ impl<E: Env> EnvPool<E> {
     /// Starts the next episode of each environment that is `marked`, at a random age if `aged`, and writes its row of the
     /// `observations` `[N, O]`.
     pub fn restart(&mut self, marked: &[bool], aged: bool, observations: &mut [f32]) {
-        let size = self.spaces().observation_size;
-        let slots = self.blocks.iter_mut().flat_map(|block| {
-            let numbered = (block.first..).zip(&mut block.slots).zip(&mut block.ends);
-            numbered.map(|((number, slot), end)| (block.draw, number, slot, end))
-        });
-        let rows = slots.zip(observations.chunks_exact_mut(size)).zip(marked).filter(|(_, marked)| **marked);
-        rows.collect::<Vec<_>>().into_par_iter().for_each(|(((draw, number, slot, end), row), _)| {
+        let rows = observations.chunks_exact_mut(self.spaces().observation_size);
+        let members = self.blocks.iter_mut().flat_map(EnvBlock::members).zip(rows).zip(marked);
+        let chosen: Vec<_> = members.filter(|(_, marked)| **marked).map(|(member, _)| member).collect();
+        chosen.into_par_iter().for_each(|(Member { number, slot, draw, end, .. }, row)| {
             *end = None;
             stepping("environment", number, || if aged { slot.start_aged(draw, row) } else { slot.start(draw, row) });
         });
@@ -173,20 +173,10 @@ impl<E: Env> EnvPool<E> {
         rewards: &mut [f32],
         observations: &mut [f32],
     ) -> Result<Vec<(usize, E::Episode)>> {
-        let Spaces { observation_size: size, action_size, .. } = self.spaces();
-        let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());
-        assert_eq!(found, [n * action_size, n, n * size], "lengths of the actions, rewards and observations");
-        let slots = self.blocks.iter_mut().flat_map(|block| {
-            let written = block.ends.iter_mut().zip(block.final_observations.chunks_exact_mut(size));
-            (block.first..).zip(&mut block.slots).zip(written).map(|own| (block.draw, own))
-        });
-        let given = actions.chunks_exact(action_size).zip(rewards).zip(observations.chunks_exact_mut(size));
-        let work = slots.zip(given).enumerate().collect::<Vec<_>>();
-        let ended = work.into_par_iter().with_max_len(MOST_AT_ONCE).map(|(place, (own, given))| {
-            let (draw, ((number, slot), (end, final_observation))) = own;
-            let ((action, reward), observation) = given;
-            let cells = Cells { action, reward, end, observation, final_observation };
-            let episode = slot.step(number, draw, autoreset, cells)?;
+        let rows = rows(self.spaces(), self.count(), actions, rewards, observations);
+        let members: Vec<_> = self.blocks.iter_mut().flat_map(EnvBlock::members).zip(rows).collect();
+        let ended = members.into_par_iter().enumerate().with_max_len(MOST_AT_ONCE).map(|(place, (member, row))| {
+            let episode = member.step(autoreset, row)?;
             Ok(episode.map(|episode| (place, episode)))
         });
         Ok(ended.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
@@ -197,19 +187,19 @@ impl<E: Env> EnvPool<E> {
         self.envs_mut().for_each(|env| env.set_lesson(lesson));
     }
 
-    /// Returns the episodes that ended since the last call, ordered by block, then step, then environment.
+    /// The episodes that ended since the last call, ordered by block, then step, then environment.
     pub fn take_finished(&mut self) -> Vec<E::Episode> {
         self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
     }
 
-    /// Returns the environments in order.
+    /// The environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
         self.blocks.iter_mut().flat_map(EnvBlock::envs_mut)
     }
 }
 
 impl<E: Resumable> EnvPool<E> {
-    /// Returns the state of every environment. It does not include finished episodes that have not been taken yet.
+    /// The state of every environment. It does not include finished episodes that have not been taken yet.
     pub fn save(&self) -> EnvState {
         let mut state = EnvState::default();
         for slot in self.blocks.iter().flat_map(|block| &block.slots) {
@@ -225,7 +215,8 @@ impl<E: Resumable> EnvPool<E> {
     /// # Errors
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
-        let (size, first) = (self.spaces().observation_size, self.blocks[0].first);
+        let size = self.spaces().observation_size;
+        let first = self.blocks[0].first;
         let states = state.rows(self.blocks[0].draw.stride as usize)?.skip(first);
         let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
         let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
@@ -245,12 +236,12 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// Returns the number n of environments in this block.
+    /// The number n of environments in this block.
     pub fn count(&self) -> usize {
         self.slots.len()
     }
 
-    /// Returns the environments in order.
+    /// The environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
         self.slots.iter_mut().map(|slot| &mut slot.env)
     }
@@ -262,48 +253,80 @@ impl<E: Env> EnvBlock<E> {
     /// # Errors
     /// Fails with the environment's number if an environment panics. The pool must not be stepped again.
     pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
-        let Spaces { observation_size: size, action_size, .. } = self.spaces;
-        let (found, n) = ([actions.len(), rewards.len(), observations.len()], self.count());
-        assert_eq!(found, [n * action_size, n, n * size], "lengths of the block's actions, rewards and observations");
-        let rows = observations.chunks_exact_mut(size).zip(self.final_observations.chunks_exact_mut(size));
-        let results = rewards.iter_mut().zip(&mut self.ends).zip(rows);
-        let slots = (self.first..).zip(&mut self.slots).zip(actions.chunks_exact(action_size));
-        for (((number, slot), action), ((reward, end), (observation, final_observation))) in slots.zip(results) {
-            let cells = Cells { action, reward, end, observation, final_observation };
-            self.finished.extend(slot.step(number, self.draw, Autoreset::SameStep, cells)?);
+        let rows = rows(self.spaces, self.count(), actions, rewards, observations);
+        let mut finished = std::mem::take(&mut self.finished);
+        for (member, row) in self.members().zip(rows) {
+            finished.extend(member.step(Autoreset::SameStep, row)?);
         }
+        self.finished = finished;
         Ok(())
+    }
+
+    /// The environments in order, each with its part of the block.
+    fn members(&mut self) -> impl Iterator<Item = Member<'_, E>> {
+        let draw = self.draw;
+        let finals = self.final_observations.chunks_exact_mut(self.spaces.observation_size);
+        let own = self.slots.iter_mut().zip(&mut self.ends).zip(finals);
+        (self.first..).zip(own).map(move |(number, ((slot, end), final_observation))| Member {
+            number,
+            slot,
+            draw,
+            end,
+            final_observation,
+        })
     }
 }
 
-impl<E: Env> Slot<E> {
-    /// Steps the environment, or starts its next episode where that takes the place of a step. Returns the episode that ended.
+/// The action `[A]`, the reward and the observation `[O]` of an environment: what a step reads, and what it writes.
+type Row<'a> = ((&'a [f32], &'a mut f32), &'a mut [f32]);
+
+/// The rows of `n` environments in the arrays `[n, A]`, `[n]` and `[n, O]`.
+///
+/// # Panics
+/// Panics if the arrays have other lengths.
+fn rows<'a>(
+    Spaces { observation_size, action_size, .. }: Spaces,
+    n: usize,
+    actions: &'a [f32],
+    rewards: &'a mut [f32],
+    observations: &'a mut [f32],
+) -> impl Iterator<Item = Row<'a>> {
+    let found = [actions.len(), rewards.len(), observations.len()];
+    assert_eq!(found, [n * action_size, n, n * observation_size], "lengths of the actions, rewards and observations");
+    actions.chunks_exact(action_size).zip(rewards).zip(observations.chunks_exact_mut(observation_size))
+}
+
+impl<E: Env> Member<'_, E> {
+    /// Steps the environment, or starts its next episode where that takes the place of a step. The result is the episode that
+    /// ended.
     ///
     /// # Errors
     /// Fails with the environment's number if it panics.
-    fn step(&mut self, number: usize, draw: Draw, autoreset: Autoreset, cells: Cells) -> Result<Option<E::Episode>> {
-        let Cells { action, reward, end, observation, final_observation } = cells;
+    fn step(self, autoreset: Autoreset, ((action, reward), observation): Row) -> Result<Option<E::Episode>> {
+        let Self { number, slot, draw, end, final_observation } = self;
         let step = || {
             if autoreset == Autoreset::NextStep && matches!(end, Some(End::Truncated | End::Terminated)) {
-                (*reward, *end) = (0.0, None);
-                self.start(draw, observation);
+                *reward = 0.0;
+                *end = None;
+                slot.start(draw, observation);
                 return None;
             }
-            let transition: Transition = self.env.step(action, observation);
-            (*reward, *end) = (transition.reward, transition.end);
+            let transition: Transition = slot.env.step(action, observation);
+            *reward = transition.reward;
+            *end = transition.end;
             if end.is_some() {
                 final_observation.copy_from_slice(observation);
             }
             match transition.end {
                 None => None,
                 Some(End::Redirected) => {
-                    self.env.redirect(observation);
+                    slot.env.redirect(observation);
                     None
                 }
                 Some(End::Truncated | End::Terminated) => {
-                    let episode = self.env.episode();
+                    let episode = slot.env.episode();
                     if autoreset == Autoreset::SameStep {
-                        self.start(draw, observation);
+                        slot.start(draw, observation);
                     }
                     Some(episode)
                 }
@@ -313,7 +336,9 @@ impl<E: Env> Slot<E> {
         stepping("environment", number, || catch_unwind(AssertUnwindSafe(step)))
             .map_err(|panic| anyhow!("environment {number} panicked: {}", panic_message(&*panic)))
     }
+}
 
+impl<E: Env> Slot<E> {
     fn start(&mut self, draw: Draw, row: &mut [f32]) {
         self.env.reset(rng::stream(draw.seed, "episode", self.next_episode), row);
         self.next_episode += draw.stride;

@@ -22,7 +22,7 @@ pub struct SavedEnv<'a> {
 }
 
 impl EnvState {
-    /// Returns the states of these environments, one part after another.
+    /// The states of these environments, one part after another.
     pub fn joined(parts: Vec<Self>) -> Self {
         let join = |mut all: Self, part: Self| {
             all.numbers.extend(part.numbers);
@@ -32,12 +32,13 @@ impl EnvState {
         parts.into_iter().reduce(join).unwrap_or_default()
     }
 
-    /// Returns the rows of each of `count` environments.
+    /// The rows of each of `count` environments.
     ///
     /// # Errors
     /// Fails if the tables do not divide into `count` rows.
     pub fn rows(&self, count: usize) -> Result<impl Iterator<Item = SavedEnv<'_>>> {
-        let [numbers, counters] = [self.numbers.len(), self.counters.len()];
+        let numbers = self.numbers.len();
+        let counters = self.counters.len();
         let even =
             numbers.is_multiple_of(count) && counters.is_multiple_of(count) && numbers >= count && counters >= count;
         ensure!(even, "{numbers} numbers and {counters} counters are not the states of {count} environments");
@@ -64,7 +65,7 @@ impl<'a> SavedEnv<'a> {
         self.numbers.split_off(..count).context("the state has too few numbers")
     }
 
-    /// Returns how many numbers are left.
+    /// How many numbers are left.
     pub fn numbers_left(&self) -> usize {
         self.numbers.len()
     }

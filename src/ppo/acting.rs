@@ -25,7 +25,8 @@ impl Acting<'_> {
         let Spaces { observation_size, action_size, .. } = *self.policy.spaces();
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
-        let (actions, means) = (&mut block.actions[acted.clone()], &mut block.means[acted]);
+        let actions = &mut block.actions[acted.clone()];
+        let means = &mut block.means[acted];
         self.policy.actions_and_values(observations, (means, &mut block.values[one.clone()]), work);
         let std = self.policy.std();
         let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
@@ -45,7 +46,7 @@ impl Acting<'_> {
         }
     }
 
-    /// Returns the factor on the policy's noise. Near the goal, the policy's own noise is as small as the required
+    /// The factor on the policy's noise. Near the goal, the policy's own noise is as small as the required
     /// precision demands. Far from it, so little noise would only slow learning down. What a sample reveals about
     /// better actions is proportional to the noise. So is the distance by which an update with a given KL divergence
     /// moves the policy.
@@ -83,7 +84,8 @@ impl Acting<'_> {
 
     /// Writes the values of the observations after the last step.
     pub fn finish(&self, block: &mut RolloutBlock, horizon: usize, work: &mut Workspace) {
-        let (seen, one) = (block.step(horizon, self.policy.spaces().observation_size), block.step(horizon, 1));
+        let seen = block.step(horizon, self.policy.spaces().observation_size);
+        let one = block.step(horizon, 1);
         self.policy.values(&block.observations[seen], &mut block.values[one], work);
     }
 }

@@ -68,16 +68,17 @@ impl Adam {
     }
 }
 
-/// Returns the chunks of these ranges of parameters, whose squares are added up separately.
+/// The chunks of these ranges of parameters, whose squares are added up separately.
 pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let chunks = |group: &Range<usize>| {
-        let (firsts, end) = (group.clone().step_by(NORM_CHUNK), group.end);
+        let firsts = group.clone().step_by(NORM_CHUNK);
+        let end = group.end;
         firsts.map(move |first| first..end.min(first + NORM_CHUNK))
     };
     groups.iter().flat_map(chunks).collect()
 }
 
-/// Returns the Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
+/// The Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
 /// group.
 pub(super) fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
@@ -85,7 +86,7 @@ pub(super) fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     groups.iter().map(of_group).sum::<f64>().sqrt()
 }
 
-/// Returns the sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
+/// The sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
 pub(super) fn sum_of_squares(x: &[f32]) -> f64 {
     let mut lanes = [0.0f32; 32];
     widest!({

@@ -22,7 +22,7 @@ mod tests {
         distance: |_, _| 0.0,
     };
 
-    /// Returns a learner with this backend, and a rollout that a slightly different policy could have collected.
+    /// A learner with this backend, and a rollout that a slightly different policy could have collected.
     fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
         let mut config = Config::resolve(None, &[]).unwrap().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);

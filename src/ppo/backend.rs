@@ -42,13 +42,13 @@ impl Losses {
         [surrogate, value_error, excess, kl, clipped]
     }
 
-    /// Returns the means, given sums over `count` things.
+    /// The means, given sums over `count` things.
     pub(super) fn means(mut self, count: usize) -> Self {
         self.summed().into_iter().for_each(|sum| *sum /= count as f64);
         self
     }
 
-    /// Returns the loss that is minimised.
+    /// The loss that is minimised.
     pub(super) fn total(&self, config: &PpoConfig) -> f64 {
         -self.surrogate + config.value_coef * self.value_error + config.bounds_coef * self.excess
     }

@@ -79,7 +79,7 @@ impl Checkpoint {
         Ok(Self { config, progress, provenance, scene, hand, content })
     }
 
-    /// Returns the bytes of a file.
+    /// The bytes of a file.
     ///
     /// # Errors
     /// Fails if a value is not finite.
@@ -98,7 +98,7 @@ impl Checkpoint {
         content.to_bytes()
     }
 
-    /// Returns only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
+    /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
     /// settings, where it tells scenes apart.
     pub fn policy_alone(&self) -> Self {
         let needed =
@@ -114,7 +114,7 @@ impl Checkpoint {
         self.content.arrays.insert(name.to_owned(), array);
     }
 
-    /// Returns the shape of an array, if it exists.
+    /// The shape of an array, if it exists.
     pub fn shape(&self, name: &str) -> Option<&[usize]> {
         self.content.arrays.get(name).map(Array::shape)
     }
@@ -319,7 +319,7 @@ mod tests {
         format!("{:#}", restored.expect_err("must be refused"))
     }
 
-    /// Returns a learner that has taken one optimizer step.
+    /// A learner that has taken one optimizer step.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
         let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Exchange::alone(1)).unwrap();
         ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);

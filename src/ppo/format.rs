@@ -50,7 +50,7 @@ pub(super) struct Content {
 }
 
 impl Content {
-    /// Returns the bytes of a file with this content.
+    /// The bytes of a file with this content.
     ///
     /// # Errors
     /// Fails if an array has a value that is not finite, or a shape that does not match its length.
@@ -88,7 +88,7 @@ impl Content {
     }
 }
 
-/// Returns the file with these texts and arrays and their checksum. The texts are sorted by name, so that files with
+/// The file with these texts and arrays and their checksum. The texts are sorted by name, so that files with
 /// equal content are equal. safetensors writes texts in the order of a hash map, which differs from run to run.
 fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
@@ -132,7 +132,7 @@ fn read(bytes: &[u8]) -> Result<Raw<'_>> {
     Ok((texts, views))
 }
 
-/// Returns the file with these bytes and a checksum that matches its content, for tests of what follows the checksum.
+/// The file with these bytes and a checksum that matches its content, for tests of what follows the checksum.
 ///
 /// # Errors
 /// Fails if the bytes are not a complete safetensors file.
@@ -142,7 +142,7 @@ pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
     seal(texts, views)
 }
 
-/// Returns the CRC-32 of all names, texts, types, shapes and values. It does not depend on the layout of the header.
+/// The CRC-32 of all names, texts, types, shapes and values. It does not depend on the layout of the header.
 fn checksum(texts: &HashMap<String, String>, views: &[(String, TensorView)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |part: &[u8]| {
@@ -178,7 +178,7 @@ impl Array {
         Ok(array)
     }
 
-    /// Returns the type of the values, and their bytes.
+    /// The type of the values, and their bytes.
     fn bytes(&self) -> (Dtype, Vec<u8>) {
         match self {
             Self::F32(_, values) => (Dtype::F32, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
@@ -187,7 +187,7 @@ impl Array {
         }
     }
 
-    /// Returns the sizes of its dimensions.
+    /// The sizes of its dimensions.
     pub fn shape(&self) -> &[usize] {
         match self {
             Self::F32(shape, _) | Self::F64(shape, _) | Self::U64(shape, _) => shape,
@@ -220,7 +220,7 @@ mod tests {
         format!("{:#}", Content::parse(bytes).unwrap_err())
     }
 
-    /// Returns the position of these bytes in the file.
+    /// The position of these bytes in the file.
     fn find(bytes: &[u8], part: &[u8]) -> usize {
         bytes.windows(part.len()).position(|window| window == part).expect("it is in the file")
     }

@@ -31,7 +31,7 @@ mod tests {
     use super::*;
     use crate::spaces::Spaces;
 
-    /// Returns a block of three steps.
+    /// A block of three steps.
     fn block(rewards: &[f32], values: &[f32], dones: &[bool]) -> RolloutBlock {
         let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
         let mut block = Rollout::new(3, &[rewards.len() / 3], &spaces).blocks.remove(0);

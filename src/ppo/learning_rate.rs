@@ -2,7 +2,7 @@
 
 use crate::config::PpoConfig;
 
-/// Returns the learning rate after a minibatch, given the KL divergence of the current policy from the policy that collected, as
+/// The learning rate after a minibatch, given the KL divergence of the current policy from the policy that collected, as
 /// in the reference implementation. It is fixed if the desired divergence is 0.
 pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f64; 2]) -> f64 {
     if desired_kl == 0.0 {
@@ -16,7 +16,7 @@ pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f
     }
 }
 
-/// Returns the learning rate of a fork with the settings `config`. It is the configured rate if the user changed it or fixed
+/// The learning rate of a fork with the settings `config`. It is the configured rate if the user changed it or fixed
 /// it, else the adapted rate within its bounds. The parent had the settings `before` and had adapted it to `rate`.
 pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f64 {
     if config.desired_kl.0.to == 0.0 || config.learning_rate != before.learning_rate {

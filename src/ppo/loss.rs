@@ -13,7 +13,12 @@ use crate::config::PpoConfig;
 /// The losses of a minibatch. An action has A values.
 pub(super) struct Loss<'a> {
     rollout: &'a Rollout,
-    config: &'a PpoConfig,
+    /// How far ratios may be from 1, and values from those at collection.
+    clip: f32,
+    value_clip: f32,
+    /// The weights of these losses in the loss that is minimised.
+    value_coef: f32,
+    bounds_coef: f32,
     /// The weight of one sample in the means over the minibatch.
     sample_weight: f32,
     /// The logarithm of the standard deviation of an action.
@@ -36,19 +41,29 @@ pub(super) struct Sums {
 
 impl<'a> Loss<'a> {
     /// Creates the losses of a minibatch of `samples` samples of `rollout` under `policy`.
-    pub(super) fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &'a PpoConfig) -> Self {
-        let (log_std, action_size) = (policy.log_std, policy.spaces.action_size);
-        let log_scale = repeat_n(log_std + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
-        let (sample_weight, inverse_std) = (1.0 / samples as f32, (-log_std).exp());
-        Self { rollout, config, sample_weight, log_std, inverse_std, log_scale, action_size }
+    pub(super) fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &PpoConfig) -> Self {
+        let log_std = policy.log_std;
+        let action_size = policy.spaces.action_size;
+        Self {
+            rollout,
+            clip: config.clip as f32,
+            value_clip: config.value_clip() as f32,
+            value_coef: config.value_coef as f32,
+            bounds_coef: config.bounds_coef as f32,
+            sample_weight: 1.0 / samples as f32,
+            log_std,
+            inverse_std: (-log_std).exp(),
+            log_scale: repeat_n(log_std + 0.5 * std::f32::consts::TAU.ln(), action_size).sum(),
+            action_size,
+        }
     }
 
-    /// Returns the sums over no samples.
+    /// The sums over no samples.
     pub(super) fn of_none(&self) -> Sums {
         Sums { losses: Losses::default(), squared_shifts: vec![0.0; self.action_size] }
     }
 
-    /// Returns the losses of a group, given the sums of [`Loss::actor`] and [`Loss::critic`].
+    /// The losses of a group, given the sums of [`Loss::actor`] and [`Loss::critic`].
     pub(super) fn of_group(&self, actor: &Sums, critic: &Sums) -> Losses {
         // The divergence of Gaussians with the same standard deviation.
         let variance = (2.0 * f64::from(self.log_std)).exp();
@@ -70,29 +85,25 @@ impl<'a> Loss<'a> {
     #[inline(always)]
     fn actor_sample(&self, (block, i): (&RolloutBlock, usize), mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
         let Sums { losses: sums, squared_shifts } = sums;
-        let [clip, bounds_coef] = [self.config.clip, self.config.bounds_coef].map(|x| x as f32);
         let row = RolloutBlock::row(mean.len(), i);
-        let (action, old_mean) = (&block.actions[row.clone()], &block.means[row]);
-        // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
         let inverse_scale = 1.0 / block.noise_scales[i];
-        for ((z, action), mean) in grad.iter_mut().zip(action).zip(mean) {
+        // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
+        for ((z, action), mean) in grad.iter_mut().zip(&block.actions[row.clone()]).zip(mean) {
             *z = (action - mean) * (self.inverse_std * inverse_scale);
         }
         let log_prob = -0.5 * grad.iter().map(|z| z * z).sum::<f32>() - self.log_scale;
         let ratio = (log_prob - block.log_probs[i]).exp();
-        let advantage = block.advantages[i];
-        let (free, bounded) = (ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage);
-        // A NaN ratio takes the second branch and makes the sum NaN.
-        let (surrogate, slope) = if free <= bounded { (free, -self.sample_weight * free) } else { (bounded, 0.0) };
+        let (surrogate, slope) = self.surrogate(ratio, block.advantages[i]);
         let error = (ratio - 1.0).abs();
         sums.surrogate += f64::from(surrogate);
-        sums.clipped += f64::from(u8::from(error > clip));
+        sums.clipped += f64::from(u8::from(error > self.clip));
         sums.ratio_error = sums.ratio_error.max(f64::from(error));
-        for ((sum, mean), old_mean) in squared_shifts.iter_mut().zip(mean).zip(old_mean) {
+        for ((sum, mean), old_mean) in squared_shifts.iter_mut().zip(mean).zip(&block.means[row]) {
             let shift = (mean - old_mean) * inverse_scale;
             *sum += shift * shift;
         }
-        let (mut excess, pull) = (0.0, 2.0 * bounds_coef * self.sample_weight);
+        let pull = 2.0 * self.bounds_coef * self.sample_weight;
+        let mut excess = 0.0;
         for (z, mean) in grad.iter_mut().zip(mean) {
             let beyond = mean - mean.clamp(-1.0, 1.0);
             excess += beyond * beyond;
@@ -101,20 +112,30 @@ impl<'a> Loss<'a> {
         sums.excess += f64::from(excess);
     }
 
+    /// The clipped surrogate of a sample, and the derivative of the loss with respect to the logarithm of its ratio.
+    #[inline(always)]
+    fn surrogate(&self, ratio: f32, advantage: f32) -> (f32, f32) {
+        let free = ratio * advantage;
+        let bounded = ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage;
+        // A NaN ratio takes the second branch and makes the sum NaN.
+        if free <= bounded { (free, -self.sample_weight * free) } else { (bounded, 0.0) }
+    }
+
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
     pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
-        let [clip, value_coef] = [self.config.value_clip(), self.config.value_coef].map(|x| x as f32);
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
-            let (old, target) = (block.values[i], block.returns[i]);
-            let step = (value - old).clamp(-clip, clip);
-            let (free, bounded) = (value - target, old + step - target);
-            let inside = (value - old).abs() <= clip;
+            let old = block.values[i];
+            let target = block.returns[i];
+            let step = (value - old).clamp(-self.value_clip, self.value_clip);
+            let free = value - target;
+            let bounded = old + step - target;
+            let inside = (value - old).abs() <= self.value_clip;
             // Where clipping the step makes the error larger, the error does not depend on the value.
             let (error, slope) =
                 if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
             sums.losses.value_error += f64::from(error * error);
-            *grad = value_coef * self.sample_weight * slope;
+            *grad = self.value_coef * self.sample_weight * slope;
         }
     }
 }

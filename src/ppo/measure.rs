@@ -53,14 +53,14 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     Ok(StepTimes { seconds, waiting: worked.map(|worked| (1.0 - worked / of_threads).max(0.0)) })
 }
 
-/// Returns the matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the
+/// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the
 /// gradient of the inputs is needed. It is not needed for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
     let nets = [&policy.layout.actor, &policy.layout.critic];
     nets.into_iter().flat_map(|layers| layers.iter().enumerate().map(|(i, layer)| (layer.outputs, layer.inputs, i > 0)))
 }
 
-/// Returns the number of floating-point operations of these products for one sample, both nets.
+/// The number of floating-point operations of these products for one sample, both nets.
 pub fn flops_per_sample(policy: &Policy) -> f64 {
     products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
 }
@@ -68,16 +68,21 @@ pub fn flops_per_sample(policy: &Policy) -> f64 {
 /// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads. Their
 /// data stays in the caches as far as it fits. Returns 10⁹ floating-point operations per second for each repeat.
 pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
-    let (policy, arithmetic, blocks) = (&ppo.policy, ppo.arithmetic, samples.div_ceil(ROWS));
+    let policy = &ppo.policy;
+    let arithmetic = ppo.arithmetic;
+    let blocks = samples.div_ceil(ROWS);
     let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");
     let pass = |_: usize| {
-        let (x, dz) = (vec![0.5f32; ROWS * widest], vec![0.1f32; ROWS * widest]);
-        let (mut out, weights) = (vec![0.0; (ROWS * widest).max(widest * widest)], vec![0.01f32; widest * widest]);
+        let x = vec![0.5f32; ROWS * widest];
+        let dz = vec![0.1f32; ROWS * widest];
+        let mut out = vec![0.0; (ROWS * widest).max(widest * widest)];
+        let weights = vec![0.01f32; widest * widest];
         let mut multiplier = Multiplier::new(arithmetic);
         let start = Instant::now();
         for (o, i, inner) in products(policy) {
             let weight = Matrix::new(&weights[..o * i], o, i);
-            let (x, dz) = (Matrix::new(&x[..ROWS * i], ROWS, i), Matrix::new(&dz[..ROWS * o], ROWS, o));
+            let x = Matrix::new(&x[..ROWS * i], ROWS, i);
+            let dz = Matrix::new(&dz[..ROWS * o], ROWS, o);
             multiplier.product(&mut out[..ROWS * o], x, weight.transposed(), None, false);
             multiplier.product(&mut out[..o * i], dz.transposed(), x, None, true);
             if inner {

@@ -50,7 +50,7 @@ impl Normalizer {
     }
 }
 
-/// Returns the sum of `f(value, mean)` over the perceived rows of these arrays in each column, with the mean of the column.
+/// The sum of `f(value, mean)` over the perceived rows of these arrays in each column, with the mean of the column.
 fn column_sums(
     arrays: &[&[f32]],
     means: &[f64],
@@ -59,7 +59,8 @@ fn column_sums(
 ) -> Vec<f64> {
     let size = means.len();
     let of_task = |rows: &[f32]| {
-        let (mut sums, mut seen) = (vec![0.0; size], vec![0.0; size]);
+        let mut sums = vec![0.0; size];
+        let mut seen = vec![0.0; size];
         widest!({
             for row in rows.chunks_exact(size) {
                 seen.copy_from_slice(row);

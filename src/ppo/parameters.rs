@@ -60,22 +60,22 @@ impl Layout {
         Self { actor: net(spaces.action_size), critic: net(1) }
     }
 
-    /// Returns the layers of the actor, then the layers of the critic.
+    /// The layers of the actor, then the layers of the critic.
     pub fn layers(&self) -> impl Iterator<Item = &Layer> {
         self.actor.iter().chain(&self.critic)
     }
 
-    /// Returns the number of weights and biases.
+    /// The number of weights and biases.
     pub fn count(&self) -> usize {
         self.nets()[1].end
     }
 
-    /// Returns the ranges of actor and critic.
+    /// The ranges of actor and critic.
     pub fn nets(&self) -> [Range<usize>; 2] {
         [&self.actor, &self.critic].map(|net| net[0].weight.start..net[net.len() - 1].bias.end)
     }
 
-    /// Returns each parameter tensor with its name, in order.
+    /// Each parameter tensor with its name, in order.
     pub fn views(&self) -> Vec<View> {
         let mut views = Vec::new();
         for (net, layers) in [("actor", &self.actor), ("critic", &self.critic)] {

@@ -46,7 +46,7 @@ impl Perception {
         Ok(Self { object_and_goal, rotations })
     }
 
-    /// Returns the rotations that map the object onto itself. The first one may be repeated at the end.
+    /// The rotations that map the object onto itself. The first one may be repeated at the end.
     pub fn rotations(&self) -> &[[f32; 4]] {
         &self.rotations
     }
@@ -63,7 +63,7 @@ impl Perception {
         }
     }
 
-    /// Returns the rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
+    /// The rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
     #[inline(always)]
     fn nearest(&self, q: [f32; 4]) -> [f32; 4] {
         // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.

@@ -61,7 +61,8 @@ impl Policy {
     /// Fails if the observations do not have the symmetry of `net`.
     pub fn new(net: &NetConfig, spaces: Spaces) -> Result<Self> {
         let layout = Layout::new(&net.hidden, &spaces);
-        let (parameters, normalizer) = (vec![0.0; layout.count()], Normalizer::new(spaces.observation_size));
+        let parameters = vec![0.0; layout.count()];
+        let normalizer = Normalizer::new(spaces.observation_size);
         let perception = Perception::new(net.symmetry, &spaces)?;
         Ok(Self { layout, parameters, log_std: 0.0, normalizer, activation: net.activation, spaces, perception })
     }
@@ -86,7 +87,7 @@ impl Policy {
         Ok(policy)
     }
 
-    /// Returns the standard deviation of each action at noise scale 1. Training may scale the noise (see `Acting`).
+    /// The standard deviation of each action at noise scale 1. Training may scale the noise (see `Acting`).
     pub fn std(&self) -> f32 {
         self.log_std.exp()
     }
@@ -97,12 +98,12 @@ impl Policy {
         self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
     }
 
-    /// Returns the way it currently reads observations.
+    /// The way it currently reads observations.
     pub fn input_transform(&self) -> InputTransform {
         InputTransform::new(self.perception, &self.normalizer)
     }
 
-    /// Returns actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
+    /// Actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
     pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
         let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
         let mut nets = [&self.layout.actor, &self.layout.critic].map(net);
@@ -110,12 +111,12 @@ impl Policy {
         nets
     }
 
-    /// Returns the policy in its current state.
+    /// The policy in its current state.
     pub fn freeze(&self) -> FrozenPolicy<'_> {
         self.freeze_for(Arithmetic::F32)
     }
 
-    /// Returns the policy in its current state, prepared for workspaces of this arithmetic.
+    /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
         let [actor, critic] = self.nets(arithmetic, false);
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
@@ -123,18 +124,18 @@ impl Policy {
 }
 
 impl FrozenPolicy<'_> {
-    /// Returns a reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
+    /// A reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
     /// time, in f32.
     pub fn workspace(&self, rows: usize) -> Workspace {
         Workspace::new(&self.policy.layout.actor, rows, false, Arithmetic::F32)
     }
 
-    /// Returns the sizes and the structure of observations and actions.
+    /// The sizes and the structure of observations and actions.
     pub fn spaces(&self) -> &Spaces {
         &self.policy.spaces
     }
 
-    /// Returns the standard deviation of each action (see [`Policy::std`]).
+    /// The standard deviation of each action (see [`Policy::std`]).
     pub fn std(&self) -> f32 {
         self.policy.std()
     }
@@ -181,28 +182,29 @@ impl FixedPolicy {
         Self { copies: [&policy.layout.actor, &policy.layout.critic].map(net), policy }
     }
 
-    /// Returns the policy.
+    /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
     }
 
-    /// Returns the mean actions `[B, A]` for raw observations `[B, O]`. More than one group is shared among the threads of rayon's
+    /// The mean actions `[B, A]` for raw observations `[B, O]`. More than one group is shared among the threads of rayon's
     /// current pool.
     pub fn mean_actions(&self, observations: &[f32]) -> Vec<f32> {
         let width = self.policy.spaces.action_size;
         self.in_groups(observations, width, |policy, seen, means, work| policy.mean_actions(seen, means, work))
     }
 
-    /// Returns the values `[B]` of raw observations `[B, O]`, shared among threads in the same way.
+    /// The values `[B]` of raw observations `[B, O]`, shared among threads in the same way.
     pub fn values(&self, observations: &[f32]) -> Vec<f32> {
         self.in_groups(observations, 1, |policy, seen, values, work| policy.values(seen, values, work))
     }
 
-    /// Returns the policy for acting, without copying its weights.
+    /// The policy for acting, without copying its weights.
     pub fn frozen(&self) -> FrozenPolicy<'_> {
         let policy = &self.policy;
         let net = |layers, copies| Net::new(layers, &policy.parameters, policy.activation).with_copies(copies);
-        let (actor, critic) = (net(&policy.layout.actor, &self.copies[0]), net(&policy.layout.critic, &self.copies[1]));
+        let actor = net(&policy.layout.actor, &self.copies[0]);
+        let critic = net(&policy.layout.critic, &self.copies[1]);
         FrozenPolicy { policy, actor, critic, transform: policy.input_transform() }
     }
 
@@ -212,7 +214,8 @@ impl FixedPolicy {
         width: usize,
         compute: impl Fn(&FrozenPolicy, &[f32], &mut [f32], &mut Workspace) + Sync,
     ) -> Vec<f32> {
-        let (frozen, size) = (self.frozen(), self.policy.spaces.observation_size);
+        let frozen = self.frozen();
+        let size = self.policy.spaces.observation_size;
         let rows = observations.len() / size;
         let mut results = vec![0.0; rows.next_multiple_of(GROUP) * width];
         let group = |(seen, results): (&[f32], &mut [f32])| {

@@ -57,7 +57,7 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Returns whether it is better than the best so far: more goals, or the same number with a smaller error.
+    /// Whether it is better than the best so far: more goals, or the same number with a smaller error.
     pub fn beats(self, best: Option<Self>) -> bool {
         let order = |it: Self| (it.goals, -it.rot_dist);
         // If every episode diverged at once, there is no rotation error to compare.

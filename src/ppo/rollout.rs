@@ -49,7 +49,8 @@ impl Rollout {
     pub fn new(horizon: usize, block_sizes: &[usize], spaces: &Spaces) -> Self {
         let block = |&envs: &usize| RolloutBlock::new(horizon, envs, spaces);
         let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
-        let (mut block_of, mut firsts) = (Vec::new(), Vec::new());
+        let mut block_of = Vec::new();
+        let mut firsts = Vec::new();
         for (i, block) in blocks.iter().enumerate() {
             firsts.push(block_of.len() as u32);
             block_of.resize(block_of.len() + block.samples(), i as u32);
@@ -57,17 +58,17 @@ impl Rollout {
         Self { blocks, block_of, firsts }
     }
 
-    /// Returns the number of steps T.
+    /// The number of steps T.
     pub fn horizon(&self) -> usize {
         self.blocks[0].horizon
     }
 
-    /// Returns the number of samples, T × N.
+    /// The number of samples, T × N.
     pub fn samples(&self) -> usize {
         self.block_of.len()
     }
 
-    /// Returns the block that holds a sample, and the sample's row in the block's arrays.
+    /// The block that holds a sample, and the sample's row in the block's arrays.
     pub fn locate(&self, sample: u32) -> (&RolloutBlock, usize) {
         let block = self.block_of[sample as usize] as usize;
         (&self.blocks[block], (sample - self.firsts[block]) as usize)
@@ -91,7 +92,7 @@ impl Rollout {
         }
     }
 
-    /// Returns the observations `[n, O]` of each block that the first step acts on.
+    /// The observations `[n, O]` of each block that the first step acts on.
     pub fn first_observations_mut(&mut self) -> Vec<&mut [f32]> {
         self.blocks.iter_mut().map(RolloutBlock::first_observations_mut).collect()
     }
@@ -118,27 +119,27 @@ impl RolloutBlock {
         }
     }
 
-    /// Returns the number of samples, T × n.
+    /// The number of samples, T × n.
     pub fn samples(&self) -> usize {
         self.rewards.len()
     }
 
-    /// Returns the observations `[T, n, O]` that were acted on.
+    /// The observations `[T, n, O]` that were acted on.
     pub fn acted_on(&self) -> &[f32] {
         &self.observations[..self.samples() * self.observation_size]
     }
 
-    /// Returns the range of a sample in an array `[T, n, width]`.
+    /// The range of a sample in an array `[T, n, width]`.
     pub fn row(width: usize, sample: usize) -> Range<usize> {
         sample * width..(sample + 1) * width
     }
 
-    /// Returns the observations `[n, O]` that the first step acts on.
+    /// The observations `[n, O]` that the first step acts on.
     pub fn first_observations_mut(&mut self) -> &mut [f32] {
         &mut self.observations[..self.envs * self.observation_size]
     }
 
-    /// Returns the range of step `t` in an array `[T, n, width]`.
+    /// The range of step `t` in an array `[T, n, width]`.
     pub fn step(&self, t: usize, width: usize) -> Range<usize> {
         let size = self.envs * width;
         t * size..(t + 1) * size

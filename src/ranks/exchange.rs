@@ -49,42 +49,42 @@ impl Exchange {
         Ok(Self { shards, ..self })
     }
 
-    /// Returns the number of all shards.
+    /// The number of all shards.
     pub fn shards(&self) -> usize {
         self.shards
     }
 
-    /// Returns the shards of this rank.
+    /// The shards of this rank.
     pub fn own_shards(&self) -> Range<usize> {
         self.own(self.shards)
     }
 
-    /// Returns this rank's part of `count` things in a row: parts differ by one thing at most.
+    /// This rank's part of `count` things in a row: parts differ by one thing at most.
     pub fn own(&self, count: usize) -> Range<usize> {
         part(count, self.rank(), self.ranks())
     }
 
-    /// Returns the number of things of all ranks, if each has `own` of them.
+    /// The number of things of all ranks, if each has `own` of them.
     pub fn of_all(&self, own: usize) -> usize {
         own * self.ranks()
     }
 
-    /// Returns whether there is no other rank.
+    /// Whether there is no other rank.
     pub fn is_alone(&self) -> bool {
         self.ranks.is_none()
     }
 
-    /// Returns whether this is the rank that reports and saves.
+    /// Whether this is the rank that reports and saves.
     pub fn is_first(&self) -> bool {
         self.rank() == 0
     }
 
-    /// Returns the number of this rank.
+    /// The number of this rank.
     pub(super) fn rank(&self) -> usize {
         self.ranks.as_ref().map_or(0, |ranks| ranks.rank())
     }
 
-    /// Returns the number of all ranks.
+    /// The number of all ranks.
     pub(super) fn ranks(&self) -> usize {
         self.ranks.as_ref().map_or(1, |ranks| ranks.size())
     }
@@ -114,7 +114,7 @@ impl Exchange {
         .expect("there is a shard")
     }
 
-    /// Returns the values of all ranks, in their order.
+    /// The values of all ranks, in their order.
     pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
         let Some(ranks) = &self.ranks else { return vec![own] };
         let own = to_bytes(&own);
@@ -122,7 +122,7 @@ impl Exchange {
         all.iter().map(|bytes| from_bytes(bytes)).collect()
     }
 
-    /// Returns the value of the first rank. The others pass `None`.
+    /// The value of the first rank. The others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
         let Some(ranks) = &self.ranks else { return first.expect("this is the first rank") };
         from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
@@ -141,7 +141,7 @@ impl Exchange {
         }
     }
 
-    /// Returns the traffic since the last call, by name: the time spent (s, including the wait for others) and the bytes sent
+    /// The traffic since the last call, by name: the time spent (s, including the wait for others) and the bytes sent
     /// by this rank. Both are `NaN` for a single rank.
     pub fn take_traffic(&self) -> [(&'static str, f64); 2] {
         let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));

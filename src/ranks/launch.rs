@@ -29,18 +29,18 @@ const TOLD: [(&str, &str); 3] = [
     ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID"),
 ];
 
-/// Returns what a launcher has said, if this process is one of several.
+/// What a launcher has said, if this process is one of several.
 fn launched() -> Option<Launched> {
     told(|name| std::env::var(name).ok())
 }
 
-/// Returns whether OpenMPI's mpirun has started this process, be it alone or with others. It binds one or two processes to a core
+/// Whether OpenMPI's mpirun has started this process, be it alone or with others. It binds one or two processes to a core
 /// each.
 pub fn launched_by_mpirun() -> bool {
     std::env::var_os(TOLD[0].0).is_some()
 }
 
-/// Returns whether this process speaks for all processes that were started together.
+/// Whether this process speaks for all processes that were started together.
 pub fn is_spokesman() -> bool {
     launched().is_none_or(|launched| launched.rank == 0)
 }

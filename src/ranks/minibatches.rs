@@ -42,7 +42,7 @@ impl Exchange {
         Minibatches { exchange: self.clone(), order, of_shard: size / self.shards(), shuffles }
     }
 
-    /// Returns the minibatch of these samples of this rank, shard after shard, equally many of each.
+    /// The minibatch of these samples of this rank, shard after shard, equally many of each.
     pub fn minibatch<'a>(&self, samples: &'a [u32]) -> Minibatch<'a> {
         let in_shard = samples.len() / self.own_shards().len();
         self.grouped(samples.chunks(in_shard).collect())
@@ -73,7 +73,7 @@ impl Minibatches {
     }
 }
 
-/// Returns the number of groups that the `samples` samples of each shard are split into. It is a power of two, so that all groups
+/// The number of groups that the `samples` samples of each shard are split into. It is a power of two, so that all groups
 /// can be added as a tree. It depends on nothing but `samples` and `shards`.
 fn groups_of_shard(samples: usize, shards: usize) -> usize {
     let mut groups = (GROUPS / shards).max(1);

@@ -29,10 +29,10 @@ pub use slices::Slices;
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {
-    /// Returns the number of ranks.
+    /// The number of ranks.
     fn size(&self) -> usize;
 
-    /// Returns the index of this rank.
+    /// The index of this rank.
     fn rank(&self) -> usize;
 
     /// Sends `numbers[slices[i]]` to rank i, for every i. Returns what the ranks have sent to this one, in their order.
@@ -41,10 +41,10 @@ pub trait Ranks: Send + Sync {
     /// Replaces `numbers[slices[i]]` by the values that rank i has there, for every i.
     fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]);
 
-    /// Returns the bytes of all ranks, in their order.
+    /// The bytes of all ranks, in their order.
     fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>>;
 
-    /// Returns the bytes of rank 0.
+    /// The bytes of rank 0.
     fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8>;
 
     /// Ends all ranks at once.

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use mpi::Threading;
 use mpi::datatype::{Partition, PartitionMut};
 use mpi::topology::SimpleCommunicator;
-use mpi::traits::{Communicator, CommunicatorCollectives, Root};
+use mpi::traits::{Communicator, CommunicatorCollectives, Equivalence, Root};
 
 use super::Ranks;
 
@@ -32,18 +32,35 @@ pub(super) fn join() -> Result<(Universe, Mpi)> {
     let (universe, granted) = mpi::initialize_with_threading(Threading::Serialized).context("MPI was started twice")?;
     ensure!(granted >= Threading::Serialized, "this MPI allows calls from one thread only ({granted:?})");
     let world = universe.world();
-    let (rank, size) = (world.rank() as usize, world.size() as usize);
+    let rank = world.rank() as usize;
+    let size = world.size() as usize;
     Ok((universe, Mpi { rank, size }))
 }
 
-/// Returns the communicator. It cannot be kept: with some versions of MPI it must not be passed between threads.
+/// The communicator. It cannot be kept: with some versions of MPI it must not be passed between threads.
 fn world() -> SimpleCommunicator {
     SimpleCommunicator::world()
 }
 
-/// Returns these numbers as MPI counts them.
+/// These numbers as MPI counts them.
 fn counts(numbers: impl Iterator<Item = usize>) -> Vec<i32> {
     numbers.map(|n| n.try_into().expect("fewer than 2^31 weights, and bytes of states")).collect()
+}
+
+fn lengths(slices: &[Range<usize>]) -> Vec<i32> {
+    counts(slices.iter().map(Range::len))
+}
+
+fn firsts(slices: &[Range<usize>]) -> Vec<i32> {
+    counts(slices.iter().map(|slice| slice.start))
+}
+
+/// The slices of `array` that the ranks write, one after another.
+fn places<'a, T: Equivalence>(
+    array: &'a mut [T],
+    slices: &[Range<usize>],
+) -> PartitionMut<'a, [T], Vec<i32>, Vec<i32>> {
+    PartitionMut::new(array, lengths(slices), firsts(slices))
 }
 
 impl Ranks for Mpi {
@@ -58,35 +75,30 @@ impl Ranks for Mpi {
     fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let own = slices[self.rank].len();
         let mut received = vec![0.0; own * self.size];
-        let [sent_counts, sent_firsts] =
-            [counts(slices.iter().map(Range::len)), counts(slices.iter().map(|slice| slice.start))];
-        let [counts, firsts] = [counts((0..self.size).map(|_| own)), counts((0..self.size).map(|rank| rank * own))];
-        let sent = Partition::new(numbers, sent_counts, sent_firsts);
-        world().all_to_all_varcount_into(&sent, &mut PartitionMut::new(&mut received[..], counts, firsts));
+        let of_ranks: Vec<Range<usize>> = (0..self.size).map(|rank| rank * own..(rank + 1) * own).collect();
+        let sent = Partition::new(numbers, lengths(slices), firsts(slices));
+        world().all_to_all_varcount_into(&sent, &mut places(&mut received, &of_ranks));
         received
     }
 
     fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]) {
         let own = numbers[slices[self.rank].clone()].to_vec();
-        let [counts, firsts] = [counts(slices.iter().map(Range::len)), counts(slices.iter().map(|slice| slice.start))];
-        world().all_gather_varcount_into(&own[..], &mut PartitionMut::new(numbers, counts, firsts));
+        world().all_gather_varcount_into(&own[..], &mut places(numbers, slices));
     }
 
     fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
         let mut lengths = vec![0_u64; self.size];
         world().all_gather_into(&(bytes.len() as u64), &mut lengths[..]);
-        let lengths: Vec<usize> = lengths.into_iter().map(|length| length as usize).collect();
-        let firsts = lengths.iter().scan(0, |end, length| {
-            *end += length;
-            Some(*end - length)
-        });
-        let (firsts, mut all) = (counts(firsts), vec![0; lengths.iter().sum()]);
-        let mut places = PartitionMut::new(&mut all[..], counts(lengths.iter().copied()), firsts);
-        world().all_gather_varcount_into(&bytes[..], &mut places);
-        drop(places);
-        let mut rest = &all[..];
-        let cut = |length| rest.split_off(..length).expect("the bytes of all ranks").to_vec();
-        lengths.into_iter().map(cut).collect()
+        let mut end = 0;
+        let slice = |length: u64| {
+            let first = end;
+            end += length as usize;
+            first..end
+        };
+        let slices: Vec<Range<usize>> = lengths.into_iter().map(slice).collect();
+        let mut all = vec![0; end];
+        world().all_gather_varcount_into(&bytes[..], &mut places(&mut all, &slices));
+        slices.into_iter().map(|slice| all[slice].to_vec()).collect()
     }
 
     fn broadcast(&self, mut bytes: Vec<u8>) -> Vec<u8> {

@@ -35,11 +35,12 @@ impl Slices {
             |chunk: usize| chunks.get(chunk).map_or_else(|| chunks.last().map_or(0, |last| last.end), |it| it.start);
         let dealt = (0..ranks).map(|rank| part(chunks.len(), rank, ranks));
         let all: Vec<Range<usize>> = dealt.map(|dealt| begin(dealt.start)..begin(dealt.end)).collect();
-        let (own, dealt) = (all[rank].clone(), part(chunks.len(), rank, ranks));
+        let own = all[rank].clone();
+        let dealt = part(chunks.len(), rank, ranks);
         Self { exchange, chunks: chunks.to_vec(), dealt, all, own }
     }
 
-    /// Returns the range of this rank's values.
+    /// The range of this rank's values.
     pub fn own(&self) -> Range<usize> {
         self.own.clone()
     }
@@ -77,7 +78,7 @@ impl Slices {
         self.exchange.all_gather_slices(numbers, &self.all, self.own.len());
     }
 
-    /// Returns the values with the slices of all ranks.
+    /// The values with the slices of all ranks.
     pub fn all_gathered<'a>(&self, numbers: &'a [f32]) -> Cow<'a, [f32]> {
         let mut numbers = Cow::from(numbers);
         if !self.exchange.is_alone() {

@@ -36,7 +36,7 @@ pub(super) struct Batch {
 }
 
 impl Gaussian {
-    /// Returns the log-density of `actions` `[M, A]` for each sample, `[M]`. It omits the logarithm of the scales, here
+    /// The log-density of `actions` `[M, A]` for each sample, `[M]`. It omits the logarithm of the scales, here
     /// and where the actions were drawn, since only ratios are used.
     ///
     /// # Errors
@@ -48,7 +48,7 @@ impl Gaussian {
         (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
     }
 
-    /// Returns the mean over the samples of the KL divergence from the Gaussians with these means `[M, A]` and the same
+    /// The mean over the samples of the KL divergence from the Gaussians with these means `[M, A]` and the same
     /// standard deviations.
     ///
     /// # Errors
@@ -59,7 +59,7 @@ impl Gaussian {
     }
 }
 
-/// Returns the loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
+/// The loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
 /// the distribution `new` and `values` `[M]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7. The value is clipped in the same way.
@@ -68,15 +68,8 @@ impl Gaussian {
 /// Fails if the shapes do not match.
 pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: &Tensor) -> Result<(Tensor, Losses)> {
     let ratios = (new.log_prob(&batch.actions)? - &batch.old_log_probs)?.exp()?;
-    let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
-    let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
-    let policy = surrogate.mean_all()?.neg()?;
-
-    let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
-    let clipped = (&batch.old_values + step)?;
-    let error = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?;
-    let value = error.mean_all()?;
-
+    let policy = surrogate(config, batch, &ratios)?.neg()?;
+    let value = value_error(config, batch, values)?;
     let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
 
@@ -94,6 +87,19 @@ pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: 
     Ok((total, sums))
 }
 
+/// The mean clipped surrogate for these ratios `[M]`.
+fn surrogate(config: &PpoConfig, batch: &Batch, ratios: &Tensor) -> Result<Tensor> {
+    let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
+    (ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?.mean_all()
+}
+
+/// The mean clipped squared error of these values `[M]`.
+fn value_error(config: &PpoConfig, batch: &Batch, values: &Tensor) -> Result<Tensor> {
+    let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
+    let clipped = (&batch.old_values + step)?;
+    (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?.mean_all()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -104,7 +110,7 @@ mod tests {
         Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
     }
 
-    /// Returns Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales.
+    /// Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales.
     fn gaussian(means: &[f32], scales: &[f32]) -> Gaussian {
         Gaussian {
             means: tensor(means, &[scales.len(), 2]),

@@ -62,7 +62,8 @@ impl GradientBackend for Reference {
         let mut sums = Vec::new();
         self.gradients.clear();
         for group in &of.groups {
-            let (batch, mut variables) = (gathered(policy, rollout, group)?, Vec::new());
+            let batch = gathered(policy, rollout, group)?;
+            let mut variables = Vec::new();
             let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
             let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?.squeeze(1)?;
             let log_std = Tensor::full(policy.log_std, policy.spaces.action_size, &Device::Cpu)?;
@@ -86,7 +87,7 @@ impl GradientBackend for Reference {
     }
 }
 
-/// Returns what the net of these layers computes from `x` `[M, O]`. Adds to `variables` the variables that hold its parameters,
+/// What the net of these layers computes from `x` `[M, O]`. Adds to `variables` the variables that hold its parameters,
 /// each with the range of its values among the parameters of the policy.
 fn forward(policy: &Policy, layers: &[Layer], x: &Tensor, variables: &mut Vec<(Range<usize>, Var)>) -> Result<Tensor> {
     let mut x = x.clone();

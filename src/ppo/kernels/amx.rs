@@ -58,11 +58,11 @@ struct Setup(u8, [u8; 15], [[u16; 8]; 2], [[u8; 8]; 2]);
 const SETUP: Setup = Setup(1, [0; 15], [[ROW_BYTES as u16; 8], [0; 8]], [[LINES as u8; 8], [0; 8]]);
 
 /// The configured tiles of this thread, released on drop.
-struct Session;
+struct Configured;
 
-impl Drop for Session {
+impl Drop for Configured {
     fn drop(&mut self) {
-        // SAFETY: `product` alone creates a session, after such an instruction. The tiles hold nothing that is still needed.
+        // SAFETY: `product` alone creates one, after such an instruction. The tiles hold nothing that is still needed.
         unsafe { asm!("tilerelease", options(nomem, nostack)) };
     }
 }
@@ -70,9 +70,9 @@ impl Drop for Session {
 impl Unit for Tiles {
     fn product(&self, out: &mut [f32], columns: usize, operands: [&Packed; 2], add: bool) {
         // SAFETY: `request` alone creates `Tiles`, and only where the processor has these instructions and the kernel permits
-        // them. The compiler uses no tiles itself, so the configuration stays loaded until the session ends.
+        // them. The compiler uses no tiles itself, so the configuration stays loaded until `_configured` is dropped.
         unsafe { asm!("ldtilecfg [{}]", in(reg) &SETUP, options(readonly, nostack)) };
-        let _session = Session;
+        let _configured = Configured;
         // SAFETY: the tiles are configured.
         in_blocks(out, columns, operands, add, |out, columns, tiles, add| unsafe {
             multiply(out, columns, tiles, add)

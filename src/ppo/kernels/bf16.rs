@@ -35,7 +35,7 @@ pub(super) const BLOCK: usize = 2 * LINES;
 
 /// A unit of the processor that multiplies bf16 matrices. A value proves that the unit is there and may be used.
 pub trait Unit: Debug + Sync {
-    /// Returns the order in which it reads this left operand best. The right operand is always in pairs.
+    /// The order in which it reads this left operand best. The right operand is always in pairs.
     fn order_of_left(&self, _lhs: Matrix) -> Order {
         Order::Lines
     }
@@ -56,7 +56,8 @@ pub(super) fn in_blocks<F>(out: &mut [f32], columns: usize, [lhs, rhs]: [&Packed
 where
     F: Fn(&mut [f32], usize, [&[Tile]; 2], bool),
 {
-    let (rows, depth) = (out.len() / columns, lhs.depth);
+    let rows = out.len() / columns;
+    let depth = lhs.depth;
     assert_eq!(out.len(), rows * columns, "elements of the product");
     assert_eq!(depth, rhs.depth, "tiles along the lines of both matrices");
     assert_eq!(rhs.order, Order::Pairs, "order of the right matrix");
@@ -66,7 +67,8 @@ where
     // The tiles of the right matrix in use stay in the cache while the tiles of the left one stream past.
     for (j, rhs) in rhs.tiles.chunks_exact(pair).enumerate() {
         for (i, lhs) in lhs.tiles.chunks_exact(pair).enumerate() {
-            let (height, width) = ((rows - i * BLOCK).min(BLOCK), (columns - j * BLOCK).min(BLOCK));
+            let height = (rows - i * BLOCK).min(BLOCK);
+            let width = (columns - j * BLOCK).min(BLOCK);
             let first = i * BLOCK * columns + j * BLOCK;
             if (height, width) == (BLOCK, BLOCK) {
                 multiply(&mut out[first..], columns, [lhs, rhs], add);
@@ -122,29 +124,31 @@ impl Packed {
 
     /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
     pub fn pack(&mut self, matrix: Matrix, order: Order) {
-        self.parts(matrix, order).for_each(Tiles::pack);
+        self.parts(matrix, order).for_each(TileChunk::pack);
     }
 
     /// Makes room for a right operand, and returns its parts, each of which is to be packed.
-    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = Tiles<'a>> {
+    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = TileChunk<'a>> {
         self.parts(rhs.transposed(), Order::Pairs)
     }
 
-    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = Tiles<'a>> {
+    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = TileChunk<'a>> {
         let [lines, numbers] = matrix.size();
-        (self.depth, self.order) = (numbers.div_ceil(DEPTH), order);
-        let (groups, depth) = (lines.div_ceil(2 * LINES) * 2, self.depth);
+        self.depth = numbers.div_ceil(DEPTH);
+        self.order = order;
+        let groups = lines.div_ceil(2 * LINES) * 2;
+        let depth = self.depth;
         self.tiles.resize(groups * depth, Tile([0; LINES * DEPTH]));
         let parts = self.tiles.chunks_mut(PART).enumerate();
-        parts.map(move |(i, tiles)| Tiles { tiles, first: i * PART, depth, matrix, order })
+        parts.map(move |(i, tiles)| TileChunk { tiles, first: i * PART, depth, matrix, order })
     }
 }
 
-/// Tiles that are packed together.
+/// TileChunk that are packed together.
 const PART: usize = 32;
 
 /// Some of the tiles of a matrix that is packed.
-pub(super) struct Tiles<'a> {
+pub(super) struct TileChunk<'a> {
     tiles: &'a mut [Tile],
     /// The number of the first of them.
     first: usize,
@@ -154,12 +158,13 @@ pub(super) struct Tiles<'a> {
     order: Order,
 }
 
-impl Tiles<'_> {
+impl TileChunk<'_> {
     /// Fills the tiles.
     pub(super) fn pack(self) {
         widest!({
             for (i, Tile(tile)) in (self.first..).zip(self.tiles) {
-                let (line, number) = (i / self.depth * LINES, i % self.depth * DEPTH);
+                let line = i / self.depth * LINES;
+                let number = i % self.depth * DEPTH;
                 pack_tile(tile, self.matrix, [line, number], self.order);
             }
         });
@@ -169,8 +174,9 @@ impl Tiles<'_> {
 /// Fills a tile, starting at this line and this position in the line.
 #[inline(always)]
 fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [usize; 2], order: Order) {
-    let ([lines, numbers], data) = (matrix.size(), matrix.data());
-    let (lines, numbers) = (lines.saturating_sub(line).min(LINES), (numbers - number).min(DEPTH));
+    let [lines, numbers] = matrix.size();
+    let lines = lines.saturating_sub(line).min(LINES);
+    let numbers = (numbers - number).min(DEPTH);
     if (lines, numbers) != (LINES, DEPTH) {
         tile.fill(0);
     }
@@ -181,40 +187,52 @@ fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [u
     let [across, along] = matrix.strides().map(|stride| stride as usize);
     if along == 1 {
         for i in 0..lines {
-            let from = &data[(line + i) * across + number..][..numbers];
-            match order {
-                Order::Lines => tile[i * DEPTH..].iter_mut().zip(from).for_each(|(to, &x)| *to = round(x)),
-                Order::Pairs => {
-                    let mut row = [0; DEPTH];
-                    row.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
-                    let (pairs, _) = row.as_chunks::<2>();
-                    for (to, pair) in tile[2 * i..].chunks_mut(DEPTH).zip(pairs) {
-                        to[..2].copy_from_slice(pair);
-                    }
-                }
-            }
+            let from = &matrix.data()[(line + i) * across + number..][..numbers];
+            put_line(tile, i, from, order);
         }
     } else {
         let column = |j: usize| {
             let mut column = [0; LINES];
             if j < numbers {
-                let from = &data[(number + j) * along + line..][..lines];
+                let from = &matrix.data()[(number + j) * along + line..][..lines];
                 column.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
             }
             column
         };
         for j in (0..numbers).step_by(2) {
-            let pairs = column(j).into_iter().zip(column(j + 1));
-            match order {
-                Order::Pairs => {
-                    let (to, _) = tile[j * LINES..][..DEPTH].as_chunks_mut::<2>();
-                    to.iter_mut().zip(pairs).for_each(|(to, (even, odd))| *to = [even, odd]);
-                }
-                Order::Lines => {
-                    for (to, (even, odd)) in tile.chunks_mut(DEPTH).zip(pairs) {
-                        to[j..j + 2].copy_from_slice(&[even, odd]);
-                    }
-                }
+            put_columns(tile, j, [column(j), column(j + 1)], order);
+        }
+    }
+}
+
+/// Rounds line `i` of a tile and puts it in its place.
+#[inline(always)]
+fn put_line(tile: &mut [u16; LINES * DEPTH], i: usize, from: &[f32], order: Order) {
+    match order {
+        Order::Lines => tile[i * DEPTH..].iter_mut().zip(from).for_each(|(to, &x)| *to = round(x)),
+        Order::Pairs => {
+            let mut row = [0; DEPTH];
+            row.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
+            let (pairs, _) = row.as_chunks::<2>();
+            for (to, pair) in tile[2 * i..].chunks_mut(DEPTH).zip(pairs) {
+                to[..2].copy_from_slice(pair);
+            }
+        }
+    }
+}
+
+/// Puts the values `j` and `j + 1` of all lines of a tile in their places.
+#[inline(always)]
+fn put_columns(tile: &mut [u16; LINES * DEPTH], j: usize, [even, odd]: [[u16; LINES]; 2], order: Order) {
+    let pairs = even.into_iter().zip(odd);
+    match order {
+        Order::Pairs => {
+            let (to, _) = tile[j * LINES..][..DEPTH].as_chunks_mut::<2>();
+            to.iter_mut().zip(pairs).for_each(|(to, (even, odd))| *to = [even, odd]);
+        }
+        Order::Lines => {
+            for (to, (even, odd)) in tile.chunks_mut(DEPTH).zip(pairs) {
+                to[j..j + 2].copy_from_slice(&[even, odd]);
             }
         }
     }

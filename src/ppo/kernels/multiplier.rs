@@ -19,7 +19,7 @@ pub enum Arithmetic {
 }
 
 impl Arithmetic {
-    /// Returns the arithmetic for a precision.
+    /// The arithmetic for a precision.
     ///
     /// # Errors
     /// Fails if the precision requires a unit that this machine lacks.
@@ -33,7 +33,7 @@ impl Arithmetic {
         })
     }
 
-    /// Returns whether right operands have to be rearranged for its products.
+    /// Whether right operands have to be rearranged for its products.
     pub(super) fn packs(self) -> bool {
         matches!(self, Self::Bf16(_))
     }

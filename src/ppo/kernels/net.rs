@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
-use super::bf16::{Packed, Tiles};
+use super::bf16::{Packed, TileChunk};
 use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
@@ -60,12 +60,12 @@ impl Workspace {
         }
     }
 
-    /// Returns the largest number of rows that it holds.
+    /// The largest number of rows that it holds.
     pub fn rows(&self) -> usize {
         self.rows
     }
 
-    /// Returns the outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
+    /// The outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
     /// respect to them.
     pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
         let last = self.outputs.last().expect("a net has layers");
@@ -103,26 +103,31 @@ impl<'a> Net<'a> {
                 }
             }
         }
-        parts.into_par_iter().for_each(Tiles::pack);
+        parts.into_par_iter().for_each(TileChunk::pack);
     }
 
-    /// Returns copies of its weights for [`Self::with_copies`].
+    /// Copies of its weights for [`Self::with_copies`].
     pub(crate) fn copies(&self) -> Vec<Vec<f32>> {
         self.layers.iter().map(Dense::transposed).collect()
     }
 
-    /// Returns the net with copies of its weights, as [`Self::prepare`] makes them for acting.
+    /// The net with copies of its weights, as [`Self::prepare`] makes them for acting.
     pub(crate) fn with_copies(mut self, copies: &'a [Vec<f32>]) -> Self {
         self.layers.iter_mut().zip(copies).for_each(|(layer, copy)| layer.weight_t = Some(copy.into()));
         self
     }
 
-    /// Returns the number of outputs.
+    /// The number of inputs.
+    pub(crate) fn inputs(&self) -> usize {
+        self.layers[0].inputs
+    }
+
+    /// The number of outputs.
     pub(crate) fn outputs(&self) -> usize {
         self.layers.last().expect("a net has layers").outputs
     }
 
-    /// Returns the activation after layer `l`, or none after the last one.
+    /// The activation after layer `l`, or none after the last one.
     fn activation_of(&self, l: usize) -> Option<Activation> {
         (l + 1 < self.layers.len()).then_some(self.activation)
     }
@@ -159,7 +164,8 @@ impl<'a> Net<'a> {
             let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
             work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), None, add);
             if l > 0 {
-                let (out, packed) = (&mut below[..rows * layer.inputs], layer.packed[1].as_ref());
+                let out = &mut below[..rows * layer.inputs];
+                let packed = layer.packed[1].as_ref();
                 work.multiplier.product(out, grad, layer.weight, packed, false);
                 std::mem::swap(above, below);
             }
@@ -168,7 +174,7 @@ impl<'a> Net<'a> {
 }
 
 impl Dense<'_> {
-    /// Returns a copy of the weight, transposed.
+    /// A copy of the weight, transposed.
     fn transposed(&self) -> Vec<f32> {
         let mut weight_t = vec![0.0; self.inputs * self.outputs];
         for (output, row) in self.weight.data().chunks_exact(self.inputs).enumerate() {
@@ -177,7 +183,7 @@ impl Dense<'_> {
         weight_t
     }
 
-    /// Returns the transposed weight, for a product with `rows` rows.
+    /// The transposed weight, for a product with `rows` rows.
     fn weight_t(&self, rows: usize) -> Matrix<'_> {
         // gemm adds up single rows and small products in an order that depends on how the weight is stored.
         let ordered = rows > 1 && rows * self.outputs > LARGEST_SMALL;

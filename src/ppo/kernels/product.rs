@@ -25,30 +25,31 @@ impl<'a> Matrix<'a> {
         Self { data, size: [rows, columns], strides: [columns as isize, 1] }
     }
 
-    /// Returns the values in memory order.
+    /// The values in memory order.
     pub fn data(&self) -> &'a [f32] {
         self.data
     }
 
-    /// Returns the numbers of rows and columns.
+    /// The numbers of rows and columns.
     pub fn size(&self) -> [usize; 2] {
         self.size
     }
 
-    /// Returns the distances in the data between neighbours in a column and in a row. One of them is 1.
+    /// The distances in the data between neighbours in a column and in a row. One of them is 1.
     pub fn strides(&self) -> [isize; 2] {
         self.strides
     }
 
-    /// Returns a matrix of other data with the same layout.
+    /// A matrix of other data with the same layout.
     pub fn with_data<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
         assert_eq!(data.len(), self.data.len(), "elements of a matrix");
         Matrix { data, size: self.size, strides: self.strides }
     }
 
-    /// Returns the transposed matrix, without copying.
+    /// The transposed matrix, without copying.
     pub fn transposed(self) -> Self {
-        let ([rows, columns], [down, right]) = (self.size, self.strides);
+        let [rows, columns] = self.size;
+        let [down, right] = self.strides;
         Self { data: self.data, size: [columns, rows], strides: [right, down] }
     }
 }
@@ -58,10 +59,12 @@ impl<'a> Matrix<'a> {
 /// # Panics
 /// Panics if the sizes do not match.
 pub(super) fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
-    let ([m, k], [rhs_rows, n]) = (lhs.size, rhs.size);
+    let [m, k] = lhs.size;
+    let [rhs_rows, n] = rhs.size;
     assert_eq!(k, rhs_rows, "columns of the first and rows of the second matrix");
     assert_eq!(out.len(), m * n, "elements of the product");
-    let [[down, right], [rhs_down, rhs_right]] = [lhs.strides, rhs.strides];
+    let [down, right] = lhs.strides;
+    let [rhs_down, rhs_right] = rhs.strides;
     // SAFETY: the strides of `Matrix` stay within its slice, and `out` has m rows of n elements.
     unsafe {
         #[rustfmt::skip]

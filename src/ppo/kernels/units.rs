@@ -43,21 +43,27 @@ fn checked(unit: Answer<&'static str>, wrong: &'static str) -> Answer<&'static s
     unit.and_then(|unit| if multiplies_rightly(unit) { Ok(unit) } else { Err(wrong) })
 }
 
-/// Returns whether products of whole numbers, which need no rounding, are exact.
+/// Whether products of whole numbers, which need no rounding, are exact.
 fn multiplies_rightly(unit: &dyn Unit) -> bool {
-    let (rows, depth, columns) = (37, 70, 50);
+    let rows = 37;
+    let depth = 70;
+    let columns = 50;
     let numbers = |count: usize, step: usize| (0..count).map(|i| (i * step % 17) as f32 - 8.0).collect::<Vec<f32>>();
-    let (a, b) = (numbers(rows * depth, 5), numbers(depth * columns, 3));
-    let (by_rows, by_columns) = (Matrix::new(&a, rows, depth), Matrix::new(&a, depth, rows).transposed());
+    let a = numbers(rows * depth, 5);
+    let b = numbers(depth * columns, 3);
+    let by_rows = Matrix::new(&a, rows, depth);
+    let by_columns = Matrix::new(&a, depth, rows).transposed();
     [by_rows, by_columns].into_iter().all(|a| {
-        let (mut lhs, mut rhs) = (Packed::default(), Packed::default());
+        let mut lhs = Packed::default();
+        let mut rhs = Packed::default();
         lhs.pack(a, unit.order_of_left(a));
         rhs.pack_right(Matrix::new(&b, depth, columns));
         let mut out = vec![1.0; rows * columns];
         unit.product(&mut out, columns, [&lhs, &rhs], true);
         let [down, right] = a.strides().map(|stride| stride as usize);
         (0..rows * columns).all(|i| {
-            let (row, column) = (i / columns, i % columns);
+            let row = i / columns;
+            let column = i % columns;
             let terms = (0..depth).map(|k| a.data()[row * down + k * right] * b[k * columns + column]);
             out[i] == 1.0 + terms.sum::<f32>()
         })
