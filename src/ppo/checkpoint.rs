@@ -7,7 +7,7 @@
 use anyhow::{Context, Result, anyhow, bail, ensure};
 
 use super::format::{Array, Content};
-use super::parameters::{Layout, View};
+use super::parameters::{ParameterLayout, View};
 use super::{Normalizer, Policy, Ppo, Progress};
 use crate::config::NetConfig;
 use crate::os::shortened;
@@ -165,7 +165,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
-        let layout = Layout::new(&net.hidden, spaces);
+        let layout = ParameterLayout::new(&net.hidden, spaces);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
     }

@@ -33,7 +33,7 @@ pub use format::{Array, Damaged, expect_safetensors, sealed};
 pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
-pub use parameters::{Layer, Layout, View};
+pub use parameters::{Layer, ParameterLayout, View};
 pub use perception::{CLIP, InputTransform, Perception};
 pub use policy::{FixedPolicy, FrozenPolicy, GROUP, Policy};
 pub use progress::{Evaluation, Fork, Progress, Rise};

@@ -9,7 +9,7 @@ use crate::spaces::Spaces;
 
 /// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Layout {
+pub struct ParameterLayout {
     /// The layers of the actor.
     pub actor: Vec<Layer>,
     /// The layers of the critic.
@@ -40,7 +40,7 @@ pub struct View {
     pub range: Range<usize>,
 }
 
-impl Layout {
+impl ParameterLayout {
     /// Creates the layout of nets with these hidden layers, for observations and actions of the sizes in `spaces`.
     pub fn new(hidden: &[usize], spaces: &Spaces) -> Self {
         let mut at = 0;
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn the_views_cover_all_numbers_once_and_have_the_names_of_the_files() {
-        let layout = Layout::new(
+        let layout = ParameterLayout::new(
             &[5, 4],
             &Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 },
         );

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
-use super::parameters::{Layer, Layout};
+use super::parameters::{Layer, ParameterLayout};
 use super::perception::{InputTransform, Perception};
 use crate::config::{Activation, NetConfig};
 use crate::ranks::Exchange;
@@ -24,7 +24,7 @@ pub const GROUP: usize = 64;
 /// A Gaussian policy whose actions are independent and have the same standard deviation, and its value function. It reads raw observations.
 pub struct Policy {
     /// The location of each parameter.
-    pub layout: Layout,
+    pub layout: ParameterLayout,
     /// All weights and biases.
     pub parameters: Vec<f32>,
     /// The logarithm of the standard deviation of each action.
@@ -60,7 +60,7 @@ impl Policy {
     /// # Errors
     /// Fails if the observations do not have the symmetry of `net`.
     pub fn new(net: &NetConfig, spaces: Spaces) -> Result<Self> {
-        let layout = Layout::new(&net.hidden, &spaces);
+        let layout = ParameterLayout::new(&net.hidden, &spaces);
         let parameters = vec![0.0; layout.count()];
         let normalizer = Normalizer::new(spaces.observation_size);
         let perception = Perception::new(net.symmetry, &spaces)?;

@@ -200,7 +200,7 @@ impl Dense<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::parameters::Layout;
+    use super::super::super::parameters::ParameterLayout;
     use super::*;
     use crate::config::Precision;
     use crate::spaces::Spaces;
@@ -211,7 +211,7 @@ mod tests {
     #[test]
     fn packed_weights_change_no_bit() {
         let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
-        let layout = Layout::new(&[70, 33], &SPACES);
+        let layout = ParameterLayout::new(&[70, 33], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
-        let layout = Layout::new(&[300, 64], &SPACES);
+        let layout = ParameterLayout::new(&[300, 64], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
         let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
         work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
