@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::{Config, Override, Ramp, Source};
+use shadow_repose::config::{Config, Override, Ramp, Reader, Settings, Source};
 use shadow_repose::load;
 use shadow_repose::os::StatusLine;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
@@ -32,9 +32,10 @@ pub(crate) const TARGETS: [(&str, Target); 6] = [
 /// Reads a file of settings.
 pub(crate) fn config(data: &[u8]) -> [bool; 2] {
     let Ok(text) = str::from_utf8(data) else { return [false; 2] };
-    let source = Source { path: "my.toml".into(), text: text.into() };
-    let Ok(config) = Config::resolve(Some(&source), &[]) else { return [false; 2] };
-    let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]);
+    let source = Source::new("my.toml", text);
+    let Ok(config) = Settings::new().file(source).resolve() else { return [false; 2] };
+    let written = Source::new("config.toml", config.to_text());
+    let again = Settings::new().file(written).resolve();
     assert_eq!(again.expect("what is written can be read"), config);
     [true; 2]
 }
@@ -43,17 +44,17 @@ pub(crate) fn config(data: &[u8]) -> [bool; 2] {
 pub(crate) fn set(data: &[u8]) -> [bool; 2] {
     let parse = |text: &str| text.lines().map(str::parse).collect::<Result<Vec<Override>, _>>();
     let sets = str::from_utf8(data).ok().and_then(|text| parse(text).ok());
-    [sets.is_some_and(|sets| Config::resolve(None, &sets).is_ok()); 2]
+    [sets.is_some_and(|sets| Settings::new().sets(&sets).resolve().is_ok()); 2]
 }
 
 /// Resumes from the bytes of a checkpoint of one environment: learner and environment, which then run an iteration.
 pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
     static TASK: OnceLock<Arc<Task>> = OnceLock::new();
-    let builtin = || Config::resolve(None, &[]).and_then(|config| Task::new(&config.env, &config.hand));
-    let task = TASK.get_or_init(|| builtin().unwrap());
+    let Config { env, hand, .. } = Config::default();
+    let task = TASK.get_or_init(|| Task::new(&env, &hand).unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
         let mut checkpoint = Checkpoint::parse(bytes)?;
-        let mut config = load::for_training(&checkpoint, Path::new("x.safetensors"), &[])?;
+        let mut config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Run, &[])?;
         // The rest of the memory of a training grows with these, which are the user's choice.
         config.ppo.horizon = Ramp::constant(3.0);
         (config.env.num_envs, config.ppo.minibatches, config.ppo.epochs) = (1, 1, 1);
@@ -74,9 +75,10 @@ pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
 pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
         let checkpoint = Checkpoint::parse(bytes)?;
-        let config = load::for_playing(&checkpoint, Path::new("x.safetensors"), &[])?;
-        let spaces = load::record(&checkpoint, &config.net)?.spaces();
-        let policy = Policy::load(&config.net, spaces, &checkpoint)?;
+        let config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Player { env_steps: 0 }, &[])?;
+        let net = config.ppo.net();
+        let spaces = load::record(&checkpoint, &net)?.spaces();
+        let policy = Policy::load(&net, spaces, &checkpoint)?;
         let frozen = policy.freeze();
         let (mut action, mut work) = (vec![0.0; spaces.action_size], frozen.workspace(1));
         frozen.mean_actions(&vec![0.5; spaces.observation_size], &mut action, &mut work);

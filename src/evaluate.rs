@@ -373,7 +373,7 @@ mod tests {
     #[test]
     fn a_policy_with_the_symmetry_of_the_cube_acts_alike_however_the_cube_is_turned_onto_itself() {
         for (symmetry, alike) in [(Symmetry::Cube, true), (Symmetry::Object, true), (Symmetry::None, false)] {
-            let mut config = Config::resolve(None, &[]).unwrap();
+            let mut config = Config::default();
             config.ppo.symmetry = symmetry;
             let task = Task::new(&config.env, &config.hand).unwrap();
             let ppo = Ppo::new(&config.ppo, task.spaces(), 0, Exchange::alone(1)).unwrap();

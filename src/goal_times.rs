@@ -104,7 +104,7 @@ mod tests {
     use crate::config::Config;
 
     fn goal_times(reached: &[(u32, f64)]) -> GoalTimes {
-        let mut goal_times = GoalTimes::new(&Config::resolve(None, &[]).unwrap().env);
+        let mut goal_times = GoalTimes::new(&Config::default().env);
         goal_times.reached = reached.iter().map(|&(steps, angle)| Goal { steps, angle }).collect();
         goal_times
     }

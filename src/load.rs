@@ -7,16 +7,13 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, Error, Result, bail};
+use anyhow::{Context, Error, Result};
 
-use crate::config::{BUILTIN_MODEL, Config, EnvConfig, NetConfig, Override, PolicyConfig, Source};
+use crate::config::{BUILTIN_MODEL, Config, MODEL, NetConfig, Override, Reader, Settings, Source};
 use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
 use crate::repose::{Record, Task};
 use crate::run;
-
-/// The key of the only setting that is a path.
-pub const MODEL: &str = "env.model";
 
 /// A policy that is built into the program.
 #[derive(Debug, PartialEq, Eq)]
@@ -89,21 +86,21 @@ impl PolicySource {
     ///
     /// # Errors
     /// Fails as [`PolicySource::load`] does.
-    pub fn load_for_any_scene(&self) -> Result<(Checkpoint, PolicyConfig)> {
+    pub fn load_for_any_scene(&self) -> Result<(Checkpoint, Config)> {
         self.load(&[Override { key: MODEL.into(), value: BUILTIN_MODEL.into() }])
     }
 
     /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.
     ///
     /// # Errors
-    /// Fails as [`read`] and [`for_playing`] do.
-    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, PolicyConfig)> {
+    /// Fails as [`read`] and [`settings`] do.
+    pub fn load(&self, overrides: &[Override]) -> Result<(Checkpoint, Config)> {
         let path = self.path();
         let checkpoint = match self {
             Self::BuiltIn(policy) => Checkpoint::parse(policy.bytes)?,
             Self::File(path) => read(path)?,
         };
-        let config = for_playing(&checkpoint, path, overrides);
+        let config = settings(&checkpoint, path, player(&checkpoint), overrides);
         let config = match self {
             Self::BuiltIn(_) => config?,
             Self::File(_) => config.with_context(|| cannot_use(path))?,
@@ -149,7 +146,8 @@ impl Loaded {
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
-        let (checkpoint, PolicyConfig { net, .. }) = origin.load(overrides)?;
+        let (checkpoint, config) = origin.load(overrides)?;
+        let net = config.ppo.net();
         let record = record(&checkpoint, &net)?;
         let policy = Policy::load(&net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
@@ -161,12 +159,20 @@ impl Loaded {
         Ok(Self { origin, name, record, policy, checkpoint })
     }
 
+    /// The settings for playing it, overlaid with `overrides`.
+    ///
+    /// # Errors
+    /// Fails as [`settings`] does.
+    pub fn settings(&self, overrides: &[Override]) -> Result<Config> {
+        settings(&self.checkpoint, self.origin.path(), player(&self.checkpoint), overrides)
+    }
+
     /// Loads its task, with settings overlaid with `overrides`.
     ///
     /// # Errors
-    /// Fails as [`for_playing`] does, or if the scene cannot be used, or has another hand.
+    /// Fails as [`settings`] does, or if the scene cannot be used, or has another hand.
     pub fn task(&self, overrides: &[Override]) -> Result<Arc<Task>> {
-        let config = for_playing(&self.checkpoint, self.origin.path(), overrides)?;
+        let config = self.settings(overrides)?;
         Task::new(&config.env, &config.hand)?.for_policy(&self.record)
     }
 }
@@ -221,80 +227,50 @@ pub fn is_damage(error: &Error) -> bool {
     error.is::<Damaged>()
 }
 
-/// Returns the configuration for resuming the training from a checkpoint in the file `path`, overlaid with `overrides`.
+/// The settings in a checkpoint in the file `path`, as the `reader` takes them, overlaid with `sets`.
 ///
 /// # Errors
-/// Fails if its configuration is invalid, belongs to another policy, or names a scene
-/// that no override names.
-pub fn for_training(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<Config> {
-    let config = Config::from_text(path, &checkpoint.config, overrides)?;
-    expect_usable(checkpoint, &config.ppo.net(), &config.env, overrides)?;
+/// Fails if they are invalid, belong to another policy, or name a scene that no setting in `sets` names.
+pub fn settings(checkpoint: &Checkpoint, path: &Path, reader: Reader, sets: &[Override]) -> Result<Config> {
+    let config = Settings::new().stored(source(checkpoint, path), reader).sets(sets).resolve()?;
+    expect_policy(checkpoint, &config.ppo.net())?;
     Ok(config)
 }
 
-/// Returns two configurations: of the training that wrote a checkpoint in the file `path`, and of a fork of it. The latter is
-/// overlaid with the `user`'s file and `overrides`. If the critic has learnt alone, this is not repeated.
+/// What plays the policy of a checkpoint.
+fn player(checkpoint: &Checkpoint) -> Reader {
+    Reader::Player { env_steps: checkpoint.progress.env_steps }
+}
+
+/// The settings in a checkpoint in the file `path`, as text.
+pub fn source(checkpoint: &Checkpoint, path: &Path) -> Source {
+    Source::new(path, &*checkpoint.config)
+}
+
+/// The configurations of the training run that wrote a checkpoint in the file `path`, and of a fork of it, which is overlaid with
+/// the user's `settings`. If the critic has learnt alone, this is not repeated.
 ///
 /// # Errors
-/// Fails as [`for_training`] does.
-pub fn for_fork(
-    checkpoint: &Checkpoint,
-    path: &Path,
-    user: Option<&Source>,
-    overrides: &[Override],
-) -> Result<(Config, Config)> {
-    let parent = Config::from_text(path, &checkpoint.config, &[])?;
+/// Fails as [`settings`] does.
+pub fn for_fork(checkpoint: &Checkpoint, path: &Path, settings: Settings) -> Result<(Config, Config)> {
+    let parent = Settings::new().file(source(checkpoint, path)).resolve()?;
     expect_policy(checkpoint, &parent.ppo.net())?;
     let Progress { iteration, ref fork, .. } = checkpoint.progress;
     let made = iteration - fork.as_ref().map_or(0, |fork| fork.iteration).min(iteration);
-    let mut own = parent.clone();
-    if made > own.ppo.critic_first {
-        own.ppo.critic_first = 0;
+    let mut after = parent.clone();
+    if made > parent.ppo.critic_first {
+        after.ppo.critic_first = 0;
     }
-    let config = own.changed(user, overrides)?;
-    expect_named_scene(&parent.env, config.env.model_file().is_some())?;
+    let config = settings.stored(Source::new(path, after.to_text()), Reader::Run).resolve()?;
     Ok((parent, config))
-}
-
-/// Returns the settings for playing the policy of a checkpoint in the file `path`, overlaid with `overrides`.
-///
-/// # Errors
-/// Fails if the settings of the task or the net are invalid, belong to another policy, or name a scene that no override names.
-pub fn for_playing(checkpoint: &Checkpoint, path: &Path, overrides: &[Override]) -> Result<PolicyConfig> {
-    let config = PolicyConfig::from_text(path, &checkpoint.config, checkpoint.progress.env_steps, overrides)?;
-    expect_usable(checkpoint, &config.net, &config.env, overrides)?;
-    Ok(config)
 }
 
 fn cannot_use(path: &Path) -> String {
     format!("cannot use {}", path.display())
 }
 
-/// Checks that a checkpoint holds this policy, and that a custom scene was named by the user and not only by the file.
-fn expect_usable(checkpoint: &Checkpoint, net: &NetConfig, env: &EnvConfig, overrides: &[Override]) -> Result<()> {
-    expect_policy(checkpoint, net)?;
-    expect_named_scene(env, overrides.iter().any(|set| set.key == MODEL))
-}
-
 fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
     checkpoint.expect_policy(net, &record(checkpoint, net)?.spaces())
-}
-
-/// Checks that a scene other than the built-in one was named by the user.
-///
-/// # Errors
-/// Fails if it was not. The message says how to name it.
-pub fn expect_named_scene(env: &EnvConfig, named: bool) -> Result<()> {
-    if env.model_file().is_some() && !named {
-        bail!("it uses a custom scene, and no path in a file is followed: add{} to use that scene", scene_option(env));
-    }
-    Ok(())
-}
-
-/// Returns the option that names the scene, with a space before it, or nothing for the built-in scene.
-pub fn scene_option(env: &EnvConfig) -> String {
-    let set = env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
-    set.map_or(String::new(), |set| format!(" --set {set}"))
 }
 
 #[cfg(test)]

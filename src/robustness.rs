@@ -203,11 +203,11 @@ fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use crate::config::{Config, Settings};
     use crate::repose::EpisodeStats;
 
     fn row(condition: Condition, goals: u32, kept: f64) -> Row {
-        let config = Config::resolve(None, &condition.sets).unwrap().env;
+        let config = Settings::new().sets(&condition.sets).resolve().unwrap().env;
         let episode = EpisodeStats { length: 10, goals, ..Default::default() };
         Row { condition, config, score: Score::of(&[episode, episode], 0.01), kept }
     }
@@ -221,9 +221,9 @@ mod tests {
                         delay 1, delay 2, delay 3, noise, twice the noise, sim_dt 0.005, sim_dt 0.002, cone elliptic";
         assert_eq!(names.join(", "), expected);
         assert_eq!(conditions.len(), 22 + 12);
-        let nominal = Config::resolve(None, &[]).unwrap();
+        let nominal = Config::default();
         for condition in &conditions[1..22] {
-            assert_ne!(Config::resolve(None, &condition.sets).unwrap(), nominal, "{}", condition.name);
+            assert_ne!(Settings::new().sets(&condition.sets).resolve().unwrap(), nominal, "{}", condition.name);
         }
     }
 

@@ -9,7 +9,7 @@ use anyhow::bail;
 use anyhow::{Context, Result};
 
 use crate::cli::{Motion, ViewArgs, usage_error};
-use crate::config::{Config, expect_used, user_file};
+use crate::config::{Config, Settings, expect_used};
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
 use crate::repose::Task;
@@ -40,7 +40,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         return Err(usage_error("view", "--quality applies only to a picture (--screenshot) or a window").into());
     }
     args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
-    let config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
+    let config = Settings::new().user_file(args.settings.config.as_deref())?.sets(&args.settings.set).resolve()?;
     if let Some(path) = &args.screenshot {
         run::expect_output(path, args.settings.config.as_deref(), config.env.model_file())?;
     }

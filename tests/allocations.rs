@@ -7,7 +7,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::Config;
+use shadow_repose::config::Settings;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::Task;
 
@@ -37,7 +37,7 @@ static ALLOCATOR: Watching = Watching;
 #[test]
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
-    let config = Config::resolve(None, &sets).unwrap();
+    let config = Settings::new().sets(&sets).resolve().unwrap();
     let task = Task::new(&config.env, &config.hand).unwrap();
     let size = task.spaces().observation_size;
     let mut agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();

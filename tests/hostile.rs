@@ -10,7 +10,7 @@ use std::sync::Mutex;
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use shadow_repose::agent::Agent;
-use shadow_repose::config::Config;
+use shadow_repose::config::{Config, Settings};
 use shadow_repose::os::{Status, StatusLine};
 use shadow_repose::ppo::Checkpoint;
 use shadow_repose::ranks::Exchange;
@@ -34,7 +34,7 @@ fn memory(name: &str) -> u64 {
 /// Returns a small but complete checkpoint.
 fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
-    let config = Config::resolve(None, &sets).unwrap();
+    let config = Settings::new().sets(&sets).resolve().unwrap();
     let task = Task::new(&config.env, &config.hand).unwrap();
     let agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
     let mut checkpoint = Checkpoint::default();
@@ -81,7 +81,7 @@ fn ten_thousand_mutations_of_a_checkpoint_and_of_a_config_do_no_harm() {
     let whole = a_checkpoint();
     let alone = whole.policy_alone().to_bytes().unwrap();
     let whole = whole.to_bytes().unwrap();
-    let config = Config::resolve(None, &[]).unwrap().to_text().into_bytes();
+    let config = Config::default().to_text().into_bytes();
     let header = |bytes: &[u8]| 8 + u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
     let mut rng = rng::stream(0, "test", 0);
     for (good, target) in [(&whole, targets::checkpoint as targets::Target), (&alone, targets::policy)] {
@@ -118,7 +118,7 @@ fn write_good_seeds(folder: &Path) {
     fs::write(folder.join("checkpoint/good-whole"), &bytes).unwrap();
     fs::write(folder.join("policy/good-whole"), &bytes).unwrap();
     fs::write(folder.join("policy/good-alone"), whole.policy_alone().to_bytes().unwrap()).unwrap();
-    fs::write(folder.join("config/good-whole"), Config::resolve(None, &[]).unwrap().to_text()).unwrap();
+    fs::write(folder.join("config/good-whole"), Config::default().to_text()).unwrap();
 }
 
 #[test]

@@ -10,7 +10,7 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use shadow_repose::config::{Config, Override};
+use shadow_repose::config::{Config, Override, Reader};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::goal_times::GoalTimes;
 use shadow_repose::load::{self, Loaded};
@@ -57,9 +57,9 @@ impl Policy {
         let whole = if training {
             let learnt = Override { key: "training.assist".into(), value: "0".into() };
             let overrides: Vec<Override> = [learnt].into_iter().chain(overrides).collect();
-            load::for_training(&self.loaded.checkpoint, self.loaded.origin.path(), &overrides)?
+            load::settings(&self.loaded.checkpoint, self.loaded.origin.path(), Reader::Run, &overrides)?
         } else {
-            Config::resolve(None, &[])?
+            Config::default()
         };
         Ok((Config { env: task.config().clone(), ..whole }, task))
     }

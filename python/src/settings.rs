@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 use serde_json::json;
-use shadow_repose::config::{Config, Override, user_file};
+use shadow_repose::config::{Config, Override, Settings};
 use shadow_repose::repose::Task;
 
 /// Settings as a user gives them: dotted keys, and values in TOML.
@@ -31,7 +31,7 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 /// # Errors
 /// Fails if the settings are invalid, or if the scene cannot be used.
 pub(crate) fn resolve(config: Option<&Path>, overrides: &[Override]) -> Result<(Config, Arc<Task>)> {
-    let config = Config::resolve_task(user_file(config)?.as_ref(), overrides)?;
+    let config = Settings::new().user_file(config)?.sets(overrides).resolve()?;
     ensure!(!config.env.mirror, "env.mirror: it mirrors for a policy, and here is none");
     let task = Task::new(&config.env, &config.hand)?;
     Ok((Config { env: task.config().clone(), ..config }, task))

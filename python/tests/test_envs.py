@@ -179,7 +179,7 @@ def test_a_state_with_hands_that_wait_is_not_one_of_hands_that_never_do():
 
 
 def test_hands_of_a_subclass_are_copied_with_what_they_know(tmp_path, monkeypatch):
-    (tmp_path / "task.toml").write_text("[env]\nfriction_scale = 0.5\nnum_envs = 3\n[ppo]\nminibatches = 7\n")
+    (tmp_path / "task.toml").write_text("[env]\nfriction_scale = 0.5\nnum_envs = 3\n[ppo]\nminibatches = 6\n")
     monkeypatch.chdir(tmp_path)
 
     class Mine(VectorEnv):

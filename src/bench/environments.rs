@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 
 use super::measure::{Found, NEVER, median};
 use crate::agent::Agent;
-use crate::config::Config;
+use crate::config::{Config, Settings, Source};
 use crate::ranks::Exchange;
 use crate::repose::{Repose, Task};
 
@@ -31,10 +31,11 @@ struct Candidate {
 /// Measures training runs with different numbers of environments and tells which learns most in the same time. A number that the
 /// settings do not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
 pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
+    let given = Source::new("the settings", config.to_text());
     let mut candidates = Vec::new();
     for (envs, key, worth) in COMPARED {
         let number = format!("env.num_envs={envs}").parse().expect("a setting");
-        let Ok(config) = config.changed(None, &[number]) else { continue };
+        let Ok(config) = Settings::new().file(given.clone()).sets(&[number]).resolve() else { continue };
         let agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
         candidates.push(Candidate { envs, key, worth, agent, rates: Vec::new() });
     }

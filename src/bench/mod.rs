@@ -13,7 +13,7 @@ use serde_json::json;
 
 use crate::agent::{Agent, step_block};
 use crate::cli::{BenchArgs, Part};
-use crate::config::{Config, expect_used, user_file};
+use crate::config::{Config, Settings, expect_used};
 use crate::env::EnvPool;
 use crate::os;
 use crate::ppo::{Rollout, flops_per_sample, matmul_gflops, time_gradient_steps};
@@ -50,7 +50,7 @@ const END_TO_END_ITERATIONS: usize = 4;
 /// Fails if a setting or the scene cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
     expect_used(&args.settings.set, "bench")?;
-    let mut config = Config::resolve(user_file(args.settings.config.as_deref())?.as_ref(), &args.settings.set)?;
+    let mut config = Settings::new().user_file(args.settings.config.as_deref())?.sets(&args.settings.set).resolve()?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env, &config.hand)?;

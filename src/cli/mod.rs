@@ -89,7 +89,7 @@ pub enum Command {
 
 /// Returns the command line with what is only known at run time: version, examples, defaults that are settings.
 pub fn command() -> clap::Command {
-    let run = Config::resolve(None, &[]).expect("the defaults are valid").run;
+    let run = Config::default().run;
     let defaults = [
         ("{seed}", run.seed.to_string()),
         ("{threads}", run.threads.to_string()),

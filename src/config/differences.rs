@@ -59,7 +59,7 @@ impl EnvConfig {
     /// # Panics
     /// Never panics: the defaults are valid.
     pub fn unlike_default(&self) -> Table {
-        self.unlike(&Config::resolve(None, &[]).expect("the defaults are valid").env.at(0))
+        self.unlike(&Config::default().env.at(0))
     }
 
     /// The settings of the task that differ from those of `other`, by dotted key.
@@ -67,7 +67,7 @@ impl EnvConfig {
     /// # Panics
     /// Never panics: the defaults are valid.
     pub fn unlike(&self, other: &Self) -> Table {
-        let default = Config::resolve(None, &[]).expect("the defaults are valid");
+        let default = Config::default();
         let num_envs = default.env.num_envs;
         let [own, other] = [self, other].map(|env| Config { env: Self { num_envs, ..env.clone() }, ..default.clone() });
         differing([other, own]).into_iter().map(|(key, [_, own])| (key, own)).collect()
@@ -102,6 +102,7 @@ fn inner(value: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Settings;
 
     #[test]
     fn what_makes_another_training_is_listed_in_the_form_of_an_option_that_sets_it() {
@@ -114,7 +115,7 @@ mod tests {
         ];
         let more = ["run.seed=7", "ppo.precision=bf16-rounded", "run.threads=3", "run.total_steps=7"];
         let sets: Vec<_> = sets.iter().chain(&more).map(|set| set.parse().unwrap()).collect();
-        let [default, own] = [&[], &sets[..]].map(|sets| Config::resolve(None, sets).unwrap());
+        let [default, own] = [&[], &sets[..]].map(|sets| Settings::new().sets(sets).resolve().unwrap());
         let found: Vec<String> =
             default.compared_with(&own).iter().map(|(key, [_, own])| format!("{key}={}", short(own))).collect();
         let expected = [
@@ -128,6 +129,6 @@ mod tests {
         ];
         assert_eq!(found, expected);
         let again: Vec<_> = found.iter().map(|set| set.parse().unwrap()).collect();
-        assert!(Config::resolve(None, &again).unwrap().compared_with(&own).is_empty());
+        assert!(Settings::new().sets(&again).resolve().unwrap().compared_with(&own).is_empty());
     }
 }

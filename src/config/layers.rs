@@ -9,13 +9,18 @@ use toml::{Table, Value};
 
 use super::overlay::{DEFAULTS, lookup, names_scene, overlay, settings, table_of};
 use super::rules::violations;
-use super::settings::{BUILTIN_MODEL, Config, EnvConfig, NetConfig};
+use super::settings::{BUILTIN_MODEL, Config, EnvConfig};
 use super::{BASE, Ramp, SHIPPED};
 use crate::os;
-use crate::sim::Parts;
+
+/// The key of the only setting that is a path.
+pub const MODEL: &str = "env.model";
 
 /// The keys of `[ppo]` that describe a policy.
 const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
+
+/// The keys of `[env]` that a player does not take: the sizes of its hand are part of the policy.
+const OF_ITS_SCENE: [&str; 3] = ["num_envs", "num_hand_dofs", "num_actuators"];
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +44,7 @@ impl std::str::FromStr for Override {
 }
 
 /// A configuration text and the path to name in messages about it.
+#[derive(Clone)]
 pub struct Source {
     /// The file it came from.
     pub path: PathBuf,
@@ -46,76 +52,218 @@ pub struct Source {
     pub text: String,
 }
 
-/// The settings for playing a policy: the only ones that are read from its file.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PolicyConfig {
-    /// The task that the policy was trained for.
-    pub env: EnvConfig,
-    /// The parts of its hand that are named.
-    pub hand: Parts,
-    /// The structure of the policy.
-    pub net: NetConfig,
+/// Who reads the settings that a run has written, which decides what is taken from them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reader {
+    /// The run itself, or a fork of it: everything. The number of shards is kept if it still fits.
+    Run,
+    /// A new run that begins with the policy: the structure of its net.
+    NewRun,
+    /// A player of the policy, after this many control steps of the run: the task, the hand and the net. Ramps have the values that
+    /// they had reached. Values that came from one scene do not apply to another scene.
+    Player {
+        /// Control steps over all environments.
+        env_steps: u64,
+    },
+}
+
+impl Reader {
+    /// The part of the settings of a run that it takes, if the user gives these single settings.
+    fn take(self, mut table: Table, sets: &[Override]) -> Table {
+        if self == Self::Run {
+            return table;
+        }
+        let stored = model(&table).to_owned();
+        let asked = sets.iter().rfind(|set| set.key == MODEL);
+        let is_kept = |place: &Value| match &*stored {
+            BUILTIN_MODEL => *place != DEFAULTS["env"]["goal_position"],
+            stored => asked.is_none_or(|asked| names_scene(&asked.value, stored)),
+        };
+        table.retain(|section, _| ["env", "hand", "ppo"].contains(&section));
+        for (section, keys) in &mut table {
+            let Value::Table(keys) = keys else { continue };
+            keys.retain(|key, value| match &**section {
+                "ppo" => OF_NETS.contains(&key),
+                _ if self == Self::NewRun => false,
+                "env" if key == "goal_position" => is_kept(value),
+                _ => !OF_ITS_SCENE.contains(&key),
+            });
+            let Self::Player { env_steps } = self else { continue };
+            for (_, value) in keys {
+                if let Some(ramp) = Ramp::read(value) {
+                    *value = ramp.at(env_steps).into();
+                }
+            }
+        }
+        table
+    }
+}
+
+/// The scene that the settings of a run name.
+fn model(table: &Table) -> &str {
+    lookup(table, MODEL).and_then(Value::as_str).unwrap_or(BUILTIN_MODEL)
+}
+
+/// The option that names the scene of these settings, with a space before it, or nothing for the built-in scene.
+pub fn scene_option(env: &EnvConfig) -> String {
+    let set = env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
+    set.map_or(String::new(), |set| format!(" --set {set}"))
+}
+
+/// Where settings come from: the base, over it what a run has written, then the user's file, then single settings.
+#[derive(Clone, Default)]
+pub struct Settings {
+    stored: Option<(Source, Reader)>,
+    file: Option<Source>,
+    sets: Vec<Override>,
+}
+
+impl Settings {
+    /// The base alone.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds what a run has written, as this reader takes it. Settings that did not exist then have their defaults.
+    #[must_use]
+    pub fn stored(self, stored: Source, reader: Reader) -> Self {
+        Self { stored: Some((stored, reader)), ..self }
+    }
+
+    /// Adds a file that the user trusts.
+    #[must_use]
+    pub fn file(self, file: Source) -> Self {
+        Self { file: Some(file), ..self }
+    }
+
+    /// Adds the user's file, if one is given. If it is called as one that comes with the program and is not there, it is taken from
+    /// the program. So the documented commands work in any folder.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read.
+    pub fn user_file(self, path: Option<&Path>) -> Result<Self> {
+        let Some(path) = path else { return Ok(self) };
+        let own = SHIPPED.into_iter().find(|(place, _)| path == Path::new(place) && !path.exists());
+        let text = match own {
+            Some((place, text)) => {
+                os::say(&format!("note: there is no {place} here: using the one in the program"));
+                text.to_owned()
+            }
+            None => os::read_text(path)?,
+        };
+        Ok(self.file(Source::new(path, text)))
+    }
+
+    /// Adds single settings.
+    #[must_use]
+    pub fn sets(self, sets: &[Override]) -> Self {
+        Self { sets: sets.to_vec(), ..self }
+    }
+
+    /// The configuration that they make together.
+    ///
+    /// # Errors
+    /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range. Fails if a run has
+    /// stored the path of a scene that the user does not name, because no path in a checkpoint is followed.
+    pub fn resolve(self) -> Result<Config> {
+        let mut layers = Layers { merged: DEFAULTS.clone(), named: BTreeSet::new(), problems: Vec::new() };
+        let mut kept = 0;
+        let mut scene = BUILTIN_MODEL.to_owned();
+        if let Some((source, reader)) = &self.stored {
+            let mut table = reader.take(source.table()?, &self.sets);
+            model(&table).clone_into(&mut scene);
+            if let Some(Value::Integer(shards)) = table.get_mut("run").and_then(|run| run.get_mut("shards")) {
+                kept = std::mem::take(shards) as usize;
+            }
+            layers.lay(&table);
+            layers.named.remove(MODEL);
+        }
+        if let Some(file) = &self.file {
+            layers.lay(&file.table()?);
+        }
+        for Override { key, value } in &self.sets {
+            layers.lay(&table_of(key, value, &layers.merged));
+        }
+        let is_named = layers.named.contains(MODEL);
+        let stored = self.stored.map(|(source, _)| source).filter(|_| self.sets.is_empty());
+        let mut config = layers.resolve(self.file.or(stored))?;
+        if scene != BUILTIN_MODEL && !is_named {
+            let option = scene_option(&config.env);
+            bail!("it uses a custom scene, and no path in a file is followed: add{option} to use that scene");
+        }
+        if config.run.shards == 0 && kept.is_power_of_two() && config.divides(kept) {
+            config.run.shards = kept;
+        }
+        Ok(config)
+    }
+}
+
+/// The settings of all layers so far.
+struct Layers {
+    merged: Table,
+    /// The settings that a layer has set.
+    named: BTreeSet<String>,
+    /// What does not fit.
+    problems: Vec<String>,
+}
+
+impl Layers {
+    fn lay(&mut self, table: &Table) {
+        self.named.extend(settings(table).map(|(key, _)| key));
+        overlay(&mut self.merged, table, &DEFAULTS, "", &mut self.problems);
+    }
+
+    /// Replaces each value that has no meaning by its default, so that the rules can be checked for the others.
+    ///
+    /// serde stops at the first error, so each key is tried alone among valid defaults to report all of them.
+    fn replace_nonsense(&mut self) {
+        for (name, default) in settings(&DEFAULTS) {
+            let (section, key) = name.split_once('.').expect("a key is in a section");
+            let mut alone = DEFAULTS.clone();
+            alone[section][key] = self.merged[section][key].clone();
+            if let Err(error) = Config::deserialize(Value::Table(alone)) {
+                let value = os::shortened(&self.merged[section][key].to_string());
+                let message = os::shortened(error.message().trim());
+                self.problems.push(format!("{name} = {value}: {message}"));
+                self.merged[section][key] = default.clone();
+            }
+        }
+    }
+
+    /// The configuration. An error names the file from which it came.
+    fn resolve(mut self, origin: Option<Source>) -> Result<Config> {
+        if Config::deserialize(Value::Table(self.merged.clone())).is_err() {
+            self.replace_nonsense();
+        }
+        let mut config = Config::deserialize(Value::Table(self.merged))?;
+        let env = &mut config.env;
+        if env.model_file().is_some() && !self.named.contains("randomization.cube_size") {
+            config.randomization.cube_size = [1.0; 2];
+        }
+        env.goal_position.named = self.named.contains("env.goal_position");
+        env.num_hand_dofs.named = self.named.contains("env.num_hand_dofs");
+        env.num_actuators.named = self.named.contains("env.num_actuators");
+        self.problems.extend(violations(&config));
+        if self.problems.is_empty() {
+            return Ok(config);
+        }
+        let origin = origin.map_or(String::new(), |source| format!(" ({})", source.path.display()));
+        bail!("invalid configuration{origin}:\n  {}", self.problems.join("\n  "))
+    }
+}
+
+impl Default for Config {
+    /// The base.
+    fn default() -> Self {
+        Settings::new().resolve().expect("the defaults are valid")
+    }
 }
 
 impl Config {
-    /// Returns the base, overlaid with the user's file and then with `overrides`.
+    /// The whole configuration as TOML.
     ///
-    /// # Errors
-    /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range.
-    pub fn resolve(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        layered(Table::new(), user.map(Source::table).transpose()?, overrides)
-    }
-
-    /// Returns the settings of a task and of its lesson, as [`Config::resolve`] does. Other settings in the user's file are
-    /// ignored.
-    ///
-    /// # Errors
-    /// Fails as [`Config::resolve`] does.
-    pub fn resolve_task(user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let mut user = user.map(Source::table).transpose()?;
-        if let Some((_, table)) = &mut user {
-            table.retain(|section, _| !matches!(section, "ppo" | "run"));
-            table.get_mut("env").and_then(Value::as_table_mut).map(|env| env.remove("num_envs"));
-        }
-        layered(Table::new(), user, overrides)
-    }
-
-    /// Returns the settings of a training that begins with a policy of this net. As [`Config::resolve`], but the base has this net.
-    ///
-    /// # Errors
-    /// Fails as [`Config::resolve`] does.
-    pub fn resolve_around(net: &NetConfig, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let ppo = Value::try_from(net).expect("the structure of a net is a table");
-        layered(Table::from_iter([("ppo".into(), ppo)]), user.map(Source::table).transpose()?, overrides)
-    }
-
-    /// Parses a complete configuration that a run has written, overlaid with `overrides`. Settings that did not exist then have
-    /// their defaults.
-    ///
-    /// # Errors
-    /// Fails as [`Config::resolve`] does.
-    pub fn from_text(path: &Path, text: &str, overrides: &[Override]) -> Result<Self> {
-        let source = Source { path: path.into(), text: text.into() };
-        layered(Table::new(), Some(source.table()?), overrides)
-    }
-
-    /// Returns these settings, overlaid with the user's file and then with `overrides`. The scene is not taken from these
-    /// settings, because no path in a checkpoint is followed. The number of shards is kept if it still fits.
-    ///
-    /// # Errors
-    /// Fails as [`Config::resolve`] does.
-    pub fn changed(&self, user: Option<&Source>, overrides: &[Override]) -> Result<Self> {
-        let mut own = self.clone();
-        (own.env.model, own.run.shards) = (BUILTIN_MODEL.into(), 0);
-        let own = Table::try_from(own).expect("a configuration is a tree of tables");
-        let mut changed = layered(own, user.map(Source::table).transpose()?, overrides)?;
-        if changed.run.shards == 0 && self.run.shards > 0 && changed.divides(self.run.shards) {
-            changed.run.shards = self.run.shards;
-        }
-        Ok(changed)
-    }
-
-    /// Returns the whole configuration as TOML.
+    /// # Panics
+    /// Never panics: a configuration is a tree of tables.
     pub fn to_text(&self) -> String {
         let sections = Table::try_from(self).expect("a configuration is a tree of tables");
         let mut text = String::new();
@@ -128,115 +276,22 @@ impl Config {
     }
 }
 
-impl PolicyConfig {
-    /// Reads the settings for playing from the configuration of a run that has made `env_steps` control steps: its ramps have the
-    /// values of that moment. All training settings are ignored. Values that came from one scene do not apply to another scene.
-    ///
-    /// # Errors
-    /// Fails as [`Config::resolve`] does.
-    pub fn from_text(path: &Path, text: &str, env_steps: u64, overrides: &[Override]) -> Result<Self> {
-        let source = Source { path: path.into(), text: text.into() };
-        let (path, mut table) = source.table()?;
-        table.retain(|section, _| matches!(section, "env" | "hand" | "ppo"));
-        let stored = lookup(&table, "env.model").and_then(Value::as_str).unwrap_or(BUILTIN_MODEL).to_owned();
-        let asked = overrides.iter().rfind(|set| set.key == "env.model");
-        let is_same = asked.is_none_or(|asked| names_scene(&asked.value, &stored));
-        for (section, keys) in &mut table {
-            let is_used = |key: &str, value: &Value| match section.as_str() {
-                // The sizes of its hand are part of the policy.
-                "env" if ["num_envs", "num_hand_dofs", "num_actuators"].contains(&key) => false,
-                "env" if key == "goal_position" && stored == BUILTIN_MODEL => *value != DEFAULTS["env"][key],
-                "env" if key == "goal_position" => is_same,
-                "env" | "hand" => true,
-                _ => OF_NETS.contains(&key),
-            };
-            let Some(keys) = keys.as_table_mut() else { continue };
-            keys.retain(|key, value| is_used(key, value));
-            for (_, value) in keys {
-                if let Some(ramp) = Ramp::read(value) {
-                    *value = ramp.at(env_steps).into();
-                }
-            }
-        }
-        let Config { env, hand, ppo, .. } = layered(Table::new(), Some((path, table)), overrides)?;
-        Ok(Self { env, hand, net: ppo.net() })
-    }
-}
-
-/// Reads the user's configuration file, if one was given. If it is called as one that comes with the program and is not there, it is
-/// taken from the program. So the documented commands work in any folder.
-///
-/// # Errors
-/// Fails if the file cannot be read.
-pub fn user_file(path: Option<&Path>) -> Result<Option<Source>> {
-    let Some(path) = path else { return Ok(None) };
-    let own = SHIPPED.into_iter().find(|(place, _)| path == Path::new(place) && !path.exists());
-    let text = match own {
-        Some((place, text)) => {
-            os::say(&format!("note: there is no {place} here: using the one in the program"));
-            text.to_owned()
-        }
-        None => os::read_text(path)?,
-    };
-    Ok(Some(Source { path: path.to_owned(), text }))
-}
-
 impl Source {
-    fn table(&self) -> Result<(&Path, Table)> {
-        // The base itself counts as setting nothing.
+    /// This text, from the file `path`.
+    pub fn new(path: impl Into<PathBuf>, text: impl Into<String>) -> Self {
+        Self { path: path.into(), text: text.into() }
+    }
+
+    /// Its settings. The base itself counts as setting nothing.
+    fn table(&self) -> Result<Table> {
         if self.text == BASE {
-            return Ok((&self.path, Table::new()));
+            return Ok(Table::new());
         }
-        let table = self.text.parse().map_err(|error: toml::de::Error| {
+        self.text.parse().map_err(|error: toml::de::Error| {
             let lines: Vec<String> = error.to_string().lines().map(os::shortened).collect();
             anyhow!("{}: not a TOML file: {}", self.path.display(), lines.join("\n"))
-        })?;
-        Ok((&self.path, table))
+        })
     }
-}
-
-/// Returns the base, overlaid with `under`, with the table of the user's file, and with `overrides`, in this order. An error
-/// names the file.
-fn layered(under: Table, user: Option<(&Path, Table)>, overrides: &[Override]) -> Result<Config> {
-    let (mut merged, mut problems) = (DEFAULTS.clone(), Vec::new());
-    let (file, given) = user.unzip();
-    let mut named = BTreeSet::new();
-    let mut lay = |table: &Table, merged: &mut Table| {
-        named.extend(settings(table).map(|(key, _)| key));
-        overlay(merged, table, &DEFAULTS, "", &mut problems);
-    };
-    [Some(under), given].iter().flatten().for_each(|table| lay(table, &mut merged));
-    for Override { key, value } in overrides {
-        let single = table_of(key, value, &merged);
-        lay(&single, &mut merged);
-    }
-    // serde stops at the first error, so each key is tried alone among valid defaults to report all of them. One that fails is
-    // replaced by its default, so that the other rules can be checked.
-    let is_whole = Config::deserialize(Value::Table(merged.clone())).is_ok();
-    for (name, default) in settings(&DEFAULTS).filter(|_| !is_whole) {
-        let (section, key) = name.split_once('.').expect("a key is in a section");
-        let mut alone = DEFAULTS.clone();
-        alone[section][key] = merged[section][key].clone();
-        if let Err(error) = Config::deserialize(Value::Table(alone)) {
-            let (value, message) = (merged[section][key].to_string(), error.message().trim());
-            problems.push(format!("{name} = {}: {}", os::shortened(&value), os::shortened(message)));
-            merged[section][key] = default.clone();
-        }
-    }
-    let mut config = Config::deserialize(Value::Table(merged))?;
-    let env = &mut config.env;
-    if env.model_file().is_some() && !named.contains("randomization.cube_size") {
-        config.randomization.cube_size = [1.0; 2];
-    }
-    env.goal_position.named = named.contains("env.goal_position");
-    env.num_hand_dofs.named = named.contains("env.num_hand_dofs");
-    env.num_actuators.named = named.contains("env.num_actuators");
-    problems.extend(violations(&config));
-    if problems.is_empty() {
-        return Ok(config);
-    }
-    let origin = file.map_or(String::new(), |file| format!(" ({})", file.display()));
-    bail!("invalid configuration{origin}:\n  {}", problems.join("\n  "))
 }
 
 #[cfg(test)]
@@ -250,26 +305,40 @@ mod tests {
 
     fn errors(overrides: &[&str]) -> String {
         let overrides: Vec<Override> = overrides.iter().map(|s| set(s)).collect();
-        Config::resolve(None, &overrides).unwrap_err().to_string()
+        Settings::new().sets(&overrides).resolve().unwrap_err().to_string()
     }
 
     #[test]
     fn the_base_is_valid_and_survives_being_written_and_read() {
-        let config = Config::resolve(None, &[]).unwrap();
+        let config = Config::default();
         assert_eq!(config.env.max_episode_steps(), 1000);
         assert_eq!(config.env.substeps(), 1);
-        let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]).unwrap();
-        assert_eq!(config, again);
+        assert_eq!(Settings::new().file(file(&config.to_text())).resolve().unwrap(), config);
     }
 
     fn file(text: &str) -> Source {
-        Source { path: "x.toml".into(), text: text.into() }
+        Source::new("x.toml", text)
+    }
+
+    #[test]
+    fn a_fork_keeps_its_shards_if_they_fit_and_takes_no_scene_from_its_parent() {
+        let stored = file("[env]\nmodel = \"/its own.xml\"\n[run]\nshards = 4");
+        let fork = |sets: &[&str]| {
+            let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
+            let config = Settings::new().stored(stored.clone(), Reader::Run).sets(&sets).resolve();
+            config.map(|config| (config.env.model, config.run.shards)).map_err(|error| error.to_string())
+        };
+        let refused = fork(&[]).unwrap_err();
+        assert!(refused.ends_with("add --set \'env.model=/its own.xml\' to use that scene"), "{refused}");
+        assert_eq!(fork(&["env.model=builtin"]), Ok(("builtin".into(), 4)));
+        assert_eq!(fork(&["env.model=x.xml", "ppo.minibatches=8192"]), Ok(("x.xml".into(), 0)));
+        assert_eq!(fork(&["env.model=x.xml", "run.shards=2"]), Ok(("x.xml".into(), 2)));
     }
 
     #[test]
     fn a_file_may_set_part_of_a_ramp() {
         let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
-        let config = Config::resolve(Some(&file(text)), &[]).unwrap();
+        let config = Settings::new().file(file(text)).resolve().unwrap();
         assert_eq!(config.training.tolerance.0, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
     }
 
@@ -277,7 +346,7 @@ mod tests {
     fn a_ramp_can_be_set_whole_in_part_or_as_a_constant() {
         let tolerance = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Config::resolve(None, &sets).unwrap().training.tolerance.0
+            Settings::new().sets(&sets).resolve().unwrap().training.tolerance.0
         };
         let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000, after: 0 };
         assert_eq!(tolerance(&[]), default);
@@ -294,7 +363,7 @@ mod tests {
         assert_eq!(tolerance(&["training.tolerance.after=1e6"]), Ramp { after: 1_000_000, ..default });
         let share = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Config::resolve(None, &sets).unwrap().randomization.share
+            Settings::new().sets(&sets).resolve().unwrap().randomization.share
         };
         let later = Ramp { from: 0.0, to: 0.5, steps: 20_000_000, after: 40_000_000 };
         assert_eq!(share(&[]), later);
@@ -306,7 +375,7 @@ mod tests {
     fn a_table_by_group_is_set_whole_or_one_group_at_a_time() {
         let noise = |text: &str, sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            let noise = Config::resolve(Some(&file(text)), &sets).unwrap().env.noise;
+            let noise = Settings::new().file(file(text)).sets(&sets).resolve().unwrap().env.noise;
             noise.into_iter().map(|(group, std)| format!("{group} {std}")).collect::<Vec<_>>().join(", ")
         };
         let both = "[env]\nnoise = { joint_pos = 1, cube_pos = 0.5 }";
@@ -318,8 +387,9 @@ mod tests {
             noise(both, &["env.noise.joint_pos=3", "env.noise.cube_quat=2"]),
             "cube_pos 0.5, cube_quat 2, joint_pos 3"
         );
-        let fork = Config::resolve(Some(&file(both)), &[]).unwrap();
-        assert!(fork.changed(Some(&file("[env]\nnoise = {}")), &[]).unwrap().env.noise.is_empty());
+        let none = file("[env]\nnoise = {}");
+        let fork = Settings::new().stored(file(both), Reader::Run).file(none).resolve().unwrap();
+        assert!(fork.env.noise.is_empty());
     }
 
     #[test]
@@ -344,14 +414,14 @@ mod tests {
     fn of_the_settings_in_a_policys_file_only_those_of_playing_are_read() {
         let trained = "[env]\nnum_envs = 0\nrot_eps = 0.2\n[ppo]\nhidden = [9]\ngamma = \"much\"\nnot_yet = 1\n\
                        [training]\ngoal_reward = 3\n[of_tomorrow]\nx = 1\n[run]\nseed = -1";
-        let policy = |text: &str, sets: &[Override]| PolicyConfig::from_text(Path::new("x"), text, 0, sets);
+        let policy = |text: &str, sets: &[Override]| {
+            Settings::new().stored(file(text), Reader::Player { env_steps: 0 }).sets(sets).resolve()
+        };
         let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
-        assert_eq!((found.env.rot_eps, found.env.sim_dt, found.net.hidden), (0.2, 0.005, vec![9]));
-        let whole = Config::resolve(None, &[]).unwrap();
-        assert_eq!(
-            policy(&whole.to_text(), &[]).unwrap(),
-            PolicyConfig { env: whole.env, hand: whole.hand, net: whole.ppo.net() }
-        );
+        assert_eq!((found.env.rot_eps, found.env.sim_dt, found.ppo.hidden), (0.2, 0.005, vec![9]));
+        let whole = Config::default();
+        let played = policy(&whole.to_text(), &[]).unwrap();
+        assert_eq!(played, Config { env: whole.env.at(0), ..whole });
         for (bad, part) in [
             ("[env]\nrot_eps = 0", "env.rot_eps = 0: must be above 0"),
             ("[env]\nnot_yet = 1", "env.not_yet: unknown key"),
@@ -364,10 +434,9 @@ mod tests {
 
     #[test]
     fn a_users_file_holds_only_what_differs_and_set_wins_over_it() {
-        let source =
-            Source { path: "my.toml".into(), text: "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8".into() };
+        let source = Source::new("my.toml", "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8");
         let sets = [set("ppo.gamma=0.97"), set("ppo.activation=tanh"), set("run.total_steps=1e6")];
-        let config = Config::resolve(Some(&source), &sets).unwrap();
+        let config = Settings::new().file(source).sets(&sets).resolve().unwrap();
         assert_eq!((config.ppo.gamma, config.env.num_envs), (0.97, 8));
         assert_eq!((config.ppo.hidden, config.ppo.activation), (vec![32], Activation::Tanh));
         assert_eq!((config.run.total_steps, config.ppo.lambda), (1_000_000, 0.95));
@@ -391,7 +460,7 @@ mod tests {
     fn the_control_step_must_be_a_whole_multiple_of_the_physics_step() {
         let text = errors(&["env.sim_dt=0.003"]);
         assert!(text.contains("env.ctrl_dt = 0.01: must be a whole multiple of env.sim_dt = 0.003"), "{text}");
-        let config = Config::resolve(None, &[set("env.sim_dt=0.002")]).unwrap();
+        let config = Settings::new().sets(&[set("env.sim_dt=0.002")]).resolve().unwrap();
         assert_eq!(config.env.substeps(), 5);
     }
 

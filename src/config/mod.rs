@@ -31,7 +31,7 @@ pub const SHIPPED: [(&str, &str); 8] = [
 
 pub use applicability::expect_used;
 pub use differences::{Difference, short};
-pub use layers::{Override, PolicyConfig, Source, user_file};
+pub use layers::{MODEL, Override, Reader, Settings, Source, scene_option};
 pub use ramp::{Geometric, Ramp};
 pub use rules::FARTHEST;
 pub use settings::{
@@ -49,7 +49,7 @@ mod tests {
 
     fn shipped(name: &str) -> Config {
         let (_, text) = SHIPPED.into_iter().find(|(place, _)| *place == format!("configs/{name}.toml")).unwrap();
-        Config::resolve(Some(&source(text)), &[]).unwrap()
+        Settings::new().file(source(text)).resolve().unwrap()
     }
 
     #[test]
@@ -63,8 +63,10 @@ mod tests {
         assert_eq!(names, places);
         let here = tempfile::tempdir().unwrap();
         for (place, text) in SHIPPED {
-            assert_eq!(user_file(Some(Path::new(place))).unwrap().unwrap().text, text);
-            assert!(user_file(Some(&here.path().join(place))).is_err(), "a path of another folder is not replaced");
+            let found = Settings::new().user_file(Some(Path::new(place))).unwrap().resolve().unwrap();
+            assert_eq!(found, Settings::new().file(source(text)).resolve().unwrap());
+            let other = Settings::new().user_file(Some(&here.path().join(place)));
+            assert!(other.is_err(), "a path of another folder is not replaced");
         }
     }
 
@@ -91,7 +93,7 @@ mod tests {
 
     #[test]
     fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise_or_a_ramp_to_it() {
-        let default = Config::resolve(None, &[]).unwrap();
+        let default = Config::default();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
         let (training, ppo) = (default.training, default.ppo);
         let smoothing = ended(default.env.act_moving_average);
@@ -131,7 +133,7 @@ mod tests {
     }
 
     fn source(text: &str) -> Source {
-        Source { path: "x.toml".into(), text: text.into() }
+        Source::new("x.toml", text)
     }
 
     fn set(text: &str) -> Override {
@@ -140,13 +142,13 @@ mod tests {
 
     #[test]
     fn a_ramp_of_the_task_is_stored_whole_and_is_played_with_the_value_that_training_had_reached() {
-        let config = Config::resolve(None, &[]).unwrap();
-        let path = Path::new("x.safetensors");
-        let text = config.to_text();
-        assert_eq!(Config::from_text(path, &text, &[]).unwrap(), config);
+        let config = Config::default();
+        let stored = source(&config.to_text());
+        assert_eq!(Settings::new().stored(stored.clone(), Reader::Run).resolve().unwrap(), config);
         let played = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            PolicyConfig::from_text(path, &text, 60_000_000, &sets).unwrap().env.act_moving_average
+            let player = Reader::Player { env_steps: 60_000_000 };
+            Settings::new().stored(stored.clone(), player).sets(&sets).resolve().unwrap().env.act_moving_average
         };
         assert_eq!(played(&[]), Ramp::constant(0.375));
         assert_eq!(played(&["env.act_moving_average=0.6"]), Ramp::constant(0.6));
@@ -157,7 +159,7 @@ mod tests {
     fn an_own_scene_keeps_the_size_of_its_object_unless_others_are_named() {
         let sizes = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Config::resolve(None, &sets).unwrap().randomization.cube_size
+            Settings::new().sets(&sets).resolve().unwrap().randomization.cube_size
         };
         assert_eq!(sizes(&[]), [0.8, 1.2]);
         assert_eq!(sizes(&["env.model=own.xml"]), [1.0, 1.0]);

@@ -199,13 +199,11 @@ fn unknown(name: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
-    use super::super::Config;
+    use crate::config::{Settings, Source};
 
     fn errors(sets: &[&str]) -> String {
         let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        Config::resolve(None, &sets).unwrap_err().to_string()
+        Settings::new().sets(&sets).resolve().unwrap_err().to_string()
     }
 
     #[test]
@@ -219,7 +217,8 @@ mod tests {
             let text = errors(&[bad]);
             assert!(text.contains(": must be a table of TOML: ") && text.contains(reason), "{bad}: {text}");
         }
-        let file = Config::from_text(Path::new("x.toml"), "[training]\ntolerance = {from=1,from=2}", &[]).unwrap_err();
+        let file = Source::new("x.toml", "[training]\ntolerance = {from=1,from=2}");
+        let file = Settings::new().file(file).resolve().unwrap_err();
         assert!(file.to_string().contains("duplicate key"), "{file}");
     }
 
@@ -228,7 +227,7 @@ mod tests {
         let sets = ["ppo.std=.27", "randomization.gains=[.7,1.6]", "training.tolerance={from=.4,to=.1,steps=9}"];
         let sets = sets.into_iter().chain(["env.noise.joint_pos=.01", "training.drop_reward=-.5", "env.model=.5x"]);
         let sets: Vec<_> = sets.map(|set| set.parse().unwrap()).collect();
-        let config = Config::resolve(None, &sets).unwrap();
+        let config = Settings::new().sets(&sets).resolve().unwrap();
         assert_eq!((config.ppo.std.0.to, config.training.drop_reward.to), (0.27, -0.5));
         assert_eq!((config.randomization.gains, config.training.tolerance.0.from), ([0.7, 1.6], 0.4));
         assert_eq!((config.env.noise["joint_pos"], config.env.model.as_str()), (0.01, ".5x"));

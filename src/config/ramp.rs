@@ -96,10 +96,8 @@ impl Geometric {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
-    use super::super::Config;
     use super::*;
+    use crate::config::{Reader, Settings, Source};
 
     #[test]
     fn a_ramp_begins_with_one_value_ends_with_the_other_and_stays_there() {
@@ -132,9 +130,12 @@ mod tests {
     #[test]
     fn a_ramp_without_a_later_beginning_survives_being_written_and_read_where_the_default_has_one() {
         for given in ["0", "0.7", "{from=0,to=0.5,steps=20_000_000}", "{from=0.2,to=0.5,steps=0,after=7}"] {
-            let config = Config::resolve(None, &[format!("randomization.share={given}").parse().unwrap()]).unwrap();
-            let again = Config::from_text(Path::new("config.toml"), &config.to_text(), &[]).unwrap();
-            let forked = config.changed(None, &["ppo.gamma=0.9".parse().unwrap()]).unwrap();
+            let config =
+                Settings::new().sets(&[format!("randomization.share={given}").parse().unwrap()]).resolve().unwrap();
+            let stored = Source::new("config.toml", config.to_text());
+            let again = Settings::new().file(stored.clone()).resolve().unwrap();
+            let sets = ["ppo.gamma=0.9".parse().unwrap()];
+            let forked = Settings::new().stored(stored, Reader::Run).sets(&sets).resolve().unwrap();
             let shares = [&config, &again, &forked].map(|config| config.randomization.share);
             assert_eq!(shares, [shares[0]; 3], "{given}");
             assert_eq!(again.randomization.happens(), given != "0");

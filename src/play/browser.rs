@@ -11,9 +11,9 @@ use toml::Table;
 use super::actors::{actor_of, baseline};
 use super::files::PageFile;
 use crate::cli::PlayArgs;
-use crate::config::{Config, Source, short};
+use crate::config::{MODEL, Reader, Settings, Source, short};
 use crate::evaluate::{Actor, Player};
-use crate::load::{Loaded, MODEL, expect_named_scene, for_playing};
+use crate::load::Loaded;
 use crate::os::{self, Stamp};
 use crate::ppo::FixedPolicy;
 use crate::repose::Task;
@@ -125,8 +125,7 @@ pub(super) fn live(
 
 /// The policy as an actor in this task, in which the actions of each checkpoint of a run are smoothed as it has learnt it.
 fn acting_of(loaded: &Loaded, args: &PlayArgs, task: &Task) -> Result<LiveActor> {
-    let config = for_playing(&loaded.checkpoint, loaded.origin.path(), &args.set)?;
-    let task = task.smoothed_as_in(&config.env);
+    let task = task.smoothed_as_in(&loaded.settings(&args.set)?.env);
     let (policy, stochastic) = (FixedPolicy::new(loaded.policy.clone()), args.stochastic);
     let step = move |player: &mut Player| {
         let frozen = policy.frozen();
@@ -153,8 +152,8 @@ pub(super) fn from_trace(path: &Path, html: &Path, args: &PlayArgs) -> Result<()
     if let Some(set) = args.set.iter().find(|set| set.key != MODEL && !set.key.starts_with("hand.")) {
         bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set", set.key);
     }
-    let config = Config::resolve(Some(&settings(path, &header).with_context(cannot)?), &args.set)?;
-    expect_named_scene(&config.env, args.set.iter().any(|set| set.key == MODEL)).with_context(cannot)?;
+    let stored = settings(path, &header).with_context(cannot)?;
+    let config = Settings::new().stored(stored, Reader::Run).sets(&args.set).resolve().with_context(cannot)?;
     let task = Task::new(&config.env, &config.hand)?;
     let joints = json!(task.hand().parts.joints);
     ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
@@ -181,5 +180,5 @@ fn settings(path: &Path, header: &Value) -> Result<Source> {
         env.insert(key.strip_prefix("env.").unwrap_or(key).to_owned(), value);
     }
     let text = Table::from_iter([("env".to_owned(), env.into())]).to_string();
-    Ok(Source { path: path.to_owned(), text })
+    Ok(Source::new(path, text))
 }

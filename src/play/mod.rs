@@ -22,7 +22,7 @@ use self::browser::Followed;
 use self::figures::table;
 use self::files::Files;
 use crate::cli::{PlayArgs, Shot, usage_error};
-use crate::config::{Config, expect_used};
+use crate::config::{Settings, expect_used};
 use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 use crate::load::Loaded;
@@ -54,7 +54,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     };
     let task = match &loaded {
         Some(loaded) => loaded.task(&args.set)?,
-        None => Config::resolve(None, &args.set).and_then(|config| Task::new(&config.env, &config.hand))?,
+        None => Settings::new().sets(&args.set).resolve().and_then(|config| Task::new(&config.env, &config.hand))?,
     };
     let config = task.config();
     for output in [&args.trace, &args.video, &args.out, &args.html].into_iter().flatten() {

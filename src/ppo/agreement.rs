@@ -24,7 +24,7 @@ mod tests {
 
     /// A learner with this backend, and a rollout that a slightly different policy could have collected.
     fn learner(backend: config::Backend, activation: Activation) -> (Ppo, Rollout) {
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        let mut config = Config::default().ppo;
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
         config.bounds_coef = 0.1;
         let mut ppo = Ppo::new(&config, SPACES, 3, Exchange::alone(1)).unwrap();
@@ -198,7 +198,7 @@ mod tests {
     fn the_smallest_nets_and_minibatches_agree_with_candle() {
         let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, ..SPACES };
         let [fused, candle] = BACKENDS.map(|backend| {
-            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            let mut config = Config::default().ppo;
             (config.backend, config.hidden, config.symmetry) = (backend, vec![1], config::Symmetry::None);
             let mut ppo = Ppo::new(&config, spaces, 3, Exchange::alone(1)).unwrap();
             let mut rollout = Rollout::new(1, &[1], &spaces);

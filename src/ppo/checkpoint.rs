@@ -289,7 +289,7 @@ mod tests {
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        let mut config = Config::default().ppo;
         (config.backend, config.hidden, config.symmetry) = (backend, hidden.to_vec(), Symmetry::None);
         config
     }

@@ -39,7 +39,7 @@ mod tests {
     const RANGE: [f64; 2] = [5e-4, 2e-3];
 
     fn config(learning_rate: f64, desired_kl: Ramp) -> PpoConfig {
-        let config = Config::resolve(None, &[]).unwrap().ppo;
+        let config = Config::default().ppo;
         let desired_kl = Geometric(desired_kl);
         PpoConfig { learning_rate, desired_kl, learning_rate_range: RANGE, ..config }
     }

@@ -170,7 +170,7 @@ mod tests {
             let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std);
             *log_prob = -0.5 * (z[0] * z[0] + z[1] * z[1]) - 2.0 * log_std - std::f32::consts::TAU.ln();
         }
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        let mut config = Config::default().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
         let net = NetConfig { hidden: vec![1], activation: Activation::Elu, symmetry: Symmetry::None };

@@ -242,8 +242,7 @@ mod tests {
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
         const SIZE: usize = 75;
         let spaces = Spaces { observation_size: SIZE, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
-        let net =
-            NetConfig { symmetry: crate::config::Symmetry::None, ..Config::resolve(None, &[]).unwrap().ppo.net() };
+        let net = NetConfig { symmetry: crate::config::Symmetry::None, ..Config::default().ppo.net() };
         let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7).unwrap()));
         let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
         let (actions, values) = (policy.mean_actions(&observations), policy.values(&observations));

@@ -102,11 +102,11 @@ impl Lesson {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Override};
+    use crate::config::{Config, Override, Settings};
 
     fn at(env_steps: u64, sets: &[&str]) -> Lesson {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        Lesson::at(env_steps, &Config::resolve(None, &sets).unwrap())
+        Lesson::at(env_steps, &Settings::new().sets(&sets).resolve().unwrap())
     }
 
     fn step(rot_dist_before: f64, rot_dist: f64, within: bool, dropped: bool) -> Step {
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn the_task_itself_pays_its_own_reward_alone() {
-        let task = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
+        let task = Lesson::task(&Config::default().env);
         assert_eq!(task.total(1.25, &task.reward(&step(3.0, 0.0, true, true))), 1.25);
         assert_eq!((task.tolerance, task.hold, task.goals_end), (0.1, 50, false));
     }

@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn the_physics_of_the_default_task_are_those_of_the_scene() {
-        let config = Config::resolve(None, &[]).unwrap();
+        let config = Config::default();
         for (quantity, values) in QUANTITIES.iter().zip(Physics::of_task(&config.env).0) {
             assert!(values.iter().all(|x| *x == quantity.neutral), "{}", quantity.name);
         }
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn every_quantity_has_its_two_settings() {
-        let config = Config::resolve(None, &[]).unwrap();
+        let config = Config::default();
         let [env, drawn] = [Table::try_from(&config.env).unwrap(), Table::try_from(&config.randomization).unwrap()];
         for Quantity { name, setting, unit, .. } in &QUANTITIES {
             assert!(env.contains_key(*setting) && drawn.contains_key(*name) && !unit.is_empty(), "{name}, {setting}");

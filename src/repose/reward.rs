@@ -216,7 +216,7 @@ mod tests {
     use crate::config::Config;
 
     fn terms(rot_dist: f64, goal_dist: f64, action: &[f32]) -> TaskReward {
-        let mut config = Config::resolve(None, &[]).unwrap().env;
+        let mut config = Config::default().env;
         config.fall_penalty = -7.0;
         task_reward(&config, &Step { rot_dist, goal_dist, action: action.to_vec(), ..Step::default() })
     }

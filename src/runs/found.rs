@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use crate::config::{Config, Difference, short};
+use crate::config::{Config, Difference, Settings, Source, short};
 use crate::os::{self, Hold, Stamp, clock, harmless, number, steps_of_all};
 use crate::run::{Glance, read_metrics};
 
@@ -69,10 +69,8 @@ impl Run {
         known: Option<&&Figures>,
         now: SystemTime,
     ) -> Self {
-        let config = glance.config.as_ref().map(|path| {
-            let text = os::read_text(path)?;
-            Config::from_text(path, &text, &[])
-        });
+        let config =
+            glance.config.as_ref().map(|path| Settings::new().file(Source::new(path, os::read_text(path)?)).resolve());
         let (config, problem) = match config.transpose() {
             Ok(config) => (config, None),
             Err(error) => (None, Some(format!("config.toml does not fit this version: {error:#}"))),

@@ -32,7 +32,7 @@ const WORDS: usize = 2;
 /// Fails if the folder cannot be read, if a folder that is named holds no run, or if stdout cannot be written to.
 pub fn runs(args: &RunsArgs) -> Result<()> {
     os::start_threads(0)?;
-    let default = Config::resolve(None, &[])?;
+    let default = Config::default();
     let (mut screen, mut before) = (Screen::default(), Vec::new());
     loop {
         let runs = read(args, &default, &before)?;

@@ -194,13 +194,13 @@ fn event(name: &str, data: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use crate::config::Settings;
 
     #[test]
     fn each_episode_is_played_in_the_task_of_the_policy_that_acts() {
         let task = |sets: &[&str]| {
             let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
-            let config = Config::resolve(None, &sets).unwrap();
+            let config = Settings::new().sets(&sets).resolve().unwrap();
             Task::new(&config.env, &config.hand).unwrap()
         };
         let acting = |task: &Arc<Task>| LiveActor { step: Rc::new(|_| None), policy: None, task: task.clone() };

@@ -71,15 +71,13 @@ fn of_ramps(config: &Config) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
-    use crate::config::{Override, SHIPPED};
+    use crate::config::{Override, SHIPPED, Settings, Source};
 
     fn hints_for(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        let default = Config::resolve(None, &[]).unwrap();
-        hints(&Config::resolve(None, &sets).unwrap(), &default, 1 << 20)
+        let default = Config::default();
+        hints(&Settings::new().sets(&sets).resolve().unwrap(), &default, 1 << 20)
     }
 
     #[test]
@@ -118,9 +116,10 @@ mod tests {
 
     #[test]
     fn no_settings_that_come_with_the_program_cause_a_line() {
-        let default = Config::resolve(None, &[]).unwrap();
+        let default = Config::default();
         for (_, text) in SHIPPED {
-            let config = Config::from_text(Path::new("x.toml"), text, &[]).unwrap();
+            let source = Source::new("x.toml", text);
+            let config = Settings::new().file(source).resolve().unwrap();
             assert_eq!(hints(&config, &default, 1 << 19), [""; 0]);
         }
     }

@@ -81,7 +81,7 @@ mod tests {
 
     use super::*;
     use crate::agent::{Agent, Iteration};
-    use crate::config::Config;
+    use crate::config::{Config, Settings};
     use crate::ppo::{Losses, UpdateStats};
     use crate::repose::{Lesson, StepSums, Task, TaskReward, TrainingReward};
 
@@ -95,7 +95,7 @@ mod tests {
     #[test]
     fn histograms_are_those_of_the_quantities_whose_names_they_have() {
         let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
-        let config = Config::resolve(None, &sets.map(|set| set.parse().unwrap())).unwrap();
+        let config = Settings::new().sets(&sets.map(|set| set.parse().unwrap())).resolve().unwrap();
         let mut agent =
             Agent::for_task(&Task::new(&config.env, &config.hand).unwrap(), &config, Exchange::alone(1)).unwrap();
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
@@ -121,7 +121,7 @@ mod tests {
     /// All logged values are different, so that swapped values are detected.
     #[test]
     fn each_value_of_a_row_stands_beside_its_own_name() {
-        let lesson = Lesson::task(&Config::resolve(None, &[]).unwrap().env);
+        let lesson = Lesson::task(&Config::default().env);
         let update = UpdateStats {
             losses: Losses { surrogate: -1.0, value_error: 2.0, excess: 3.0, kl: 5.0, clipped: 8.0, ratio_error: 0.0 },
             first: Losses { kl: 6.0, ratio_error: 7.0, ..Losses::default() },

@@ -69,7 +69,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     os::say(&format!("run folder: {place}"));
     session.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.quiet {
-        let default = Config::resolve(None, &[])?;
+        let default = Config::default();
         let hints = hints(&session.config, &default, session.task.scene().size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
         let mobility = own_scene.then(|| mobility(&session.task, &default.env));
@@ -262,7 +262,7 @@ fn evaluates(iteration: u64, every: u64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Override;
+    use crate::config::{Override, Settings};
     use crate::os::Locked;
     use crate::ppo::Checkpoint;
     use crate::run::RunFolder;
@@ -270,7 +270,7 @@ mod tests {
     use crate::train::start::Plan;
 
     fn from_scratch(sets: &[Override]) -> Session {
-        let mut plan = Plan::new(Config::resolve(None, sets).unwrap(), &TrainArgs::default()).unwrap();
+        let mut plan = Plan::new(Settings::new().sets(sets).resolve().unwrap(), &TrainArgs::default()).unwrap();
         let loaded = plan.load_task().unwrap();
         Session::new(plan, loaded, Exchange::alone(1)).unwrap()
     }

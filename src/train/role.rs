@@ -10,8 +10,8 @@ use super::log::{Ended, described, row, tags};
 use super::outcome::Outcome;
 use super::saver::Saver;
 use super::session::Session;
-use crate::config::EnvConfig;
-use crate::load::scene_option;
+use crate::config::{EnvConfig, scene_option};
+
 use crate::os::{self, Requests, Status, StatusLine};
 use crate::ppo::{Checkpoint, Rise};
 use crate::repose::{HEADLINE, Score, divergence, measure};

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Error, Result, anyhow};
 
 use crate::cli::TrainArgs;
-use crate::config::Config;
+use crate::config::{Config, scene_option};
 use crate::load;
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
@@ -58,7 +58,7 @@ impl Saver {
         from_newest: bool,
     ) -> Self {
         let options =
-            format!("{}{}", load::scene_option(&config.env), if args.dump_diverged { " --dump-diverged" } else { "" });
+            format!("{}{}", scene_option(&config.env), if args.dump_diverged { " --dump-diverged" } else { "" });
         // The newest, and one more in case that is damaged.
         let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
         let initial = Arc::new(initial);

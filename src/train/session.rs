@@ -1,6 +1,5 @@
 //! A training that is set up: its environments, learner and saver.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
@@ -9,7 +8,7 @@ use super::saver::Saver;
 use super::start::{Plan, Takes};
 use crate::agent::Agent;
 use crate::cli::TrainArgs;
-use crate::config::Config;
+use crate::config::{Config, Settings, Source};
 use crate::evaluate::{expect_finite_actions, expect_finite_values};
 use crate::os;
 use crate::ppo::{Checkpoint, Evaluation, Rise};
@@ -112,7 +111,7 @@ impl Session {
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {
-            let parent = Config::from_text(Path::new("the checkpoint"), &checkpoint.config, &[])?;
+            let parent = Settings::new().file(Source::new("the checkpoint", &*checkpoint.config)).resolve()?;
             agent.ppo.reconcile_learning_rate(&parent.ppo);
             return checkpoint.finish();
         }

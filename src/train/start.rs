@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, NetConfig, Override, PolicyConfig, Source, user_file};
-use crate::load::{self, MODEL, PolicySource};
+use crate::config::{Config, MODEL, NetConfig, Override, Reader, Settings, Source};
+use crate::load::{self, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
 use crate::ranks::Exchange;
@@ -80,12 +80,13 @@ impl Plan {
     /// # Errors
     /// Fails if the settings or the initial policy cannot be used.
     fn new_run(args: &TrainArgs) -> Result<Self> {
-        let (user, overrides) = (user_file(args.settings.config.as_deref())?, overrides(args));
-        let Some(place) = &args.init else { return Self::new(Config::resolve(user.as_ref(), &overrides)?, args) };
+        let settings = settings(args)?;
+        let Some(place) = &args.init else { return Self::new(settings.resolve()?, args) };
         let origin = PolicySource::find(place)?;
-        let (checkpoint, PolicyConfig { net, .. }) = origin.load_for_any_scene()?;
-        let plan = Self::new(Config::resolve_around(&net, user.as_ref(), &overrides)?, args)?;
-        expect_net(&checkpoint, &net, &plan.config)
+        let (checkpoint, played) = origin.load_for_any_scene()?;
+        let settings = settings.stored(load::source(&checkpoint, place), Reader::NewRun);
+        let plan = Self::new(settings.resolve()?, args)?;
+        expect_net(&checkpoint, &played.ppo.net(), &plan.config)
             .with_context(|| format!("cannot start from the policy {origin}"))?;
         let context = Some(format!("cannot start from the policy {}", place.display()));
         Ok(Self { from: Some((Takes::Policy, checkpoint)), context, ..plan })
@@ -110,7 +111,7 @@ impl Plan {
         let (path, checkpoint) = load::newest_sound(|| checkpoints_at(&place))
             .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
-        let config = load::for_training(&checkpoint, &path, &overrides(args));
+        let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args));
         let config = config.and_then(|config| expect_states(&checkpoint, &config).map(|()| config));
         expect_same(&checkpoint, &path, args)?;
         let config = config.with_context(|| context.clone())?;
@@ -142,8 +143,7 @@ impl Plan {
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
-        let user = user_file(args.settings.config.as_deref())?;
-        let (parent, config) = load::for_fork(&checkpoint, path, user.as_ref(), &overrides(args))?;
+        let (parent, config) = load::for_fork(&checkpoint, path, settings(args)?)?;
         expect_states(&checkpoint, &parent)?;
         expect_kept(&parent, &config)?;
         let plan = Self::new(config, args)?;
@@ -204,7 +204,7 @@ impl Plan {
     /// Fails if the sender runs another version of the program.
     pub(super) fn receive(exchange: &Exchange) -> Result<Self> {
         let (config, from, best, context, dumps) = exchange.broadcast::<Message>(None);
-        let config = Config::from_text(Path::new("the settings that were sent"), &config, &[])?;
+        let config = Settings::new().file(Source::new("the settings that were sent", config)).resolve()?;
         let from = from.map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
         Ok(Self { config, from: from.transpose()?, best, context, dumps })
     }
@@ -216,6 +216,11 @@ fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
         return Ok(vec![place.to_owned()]);
     }
     Ok(RunFolder::containing(place)?.checkpoints().newest_first())
+}
+
+/// What the user sets.
+fn settings(args: &TrainArgs) -> Result<Settings> {
+    Ok(Settings::new().user_file(args.settings.config.as_deref())?.sets(&overrides(args)))
 }
 
 /// Returns the single settings, including settings that have their own options.
@@ -233,8 +238,10 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
 /// Checks that each `--set` of a resumed run says what its checkpoint says already.
 fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result<()> {
     for set in args.settings.set.iter().filter(|set| set.key != MODEL) {
-        let own = Config::from_text(path, &checkpoint.config, &[])?;
-        let same = Config::from_text(path, &checkpoint.config, std::slice::from_ref(set)).is_ok_and(|with| with == own);
+        let stored = Settings::new().file(load::source(checkpoint, path));
+        let own = stored.clone().resolve()?;
+        let with = stored.sets(std::slice::from_ref(set)).resolve();
+        let same = with.is_ok_and(|with| with == own);
         ensure!(
             same,
             "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
@@ -248,7 +255,8 @@ fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result
 fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     let Some((path, text)) = folder.config()? else { return Ok(()) };
     let advice = format!("restore {} or delete it; to change settings, start a new run with --fork", path.display());
-    let found = Config::resolve(Some(&Source { path: path.clone(), text }), &[]).with_context(|| advice.clone())?;
+    let source = Source::new(path.clone(), text);
+    let found = Settings::new().file(source).resolve().with_context(|| advice.clone())?;
     let differing = config.differences(&found);
     ensure!(differing.is_empty(), "{} differs from the checkpoint: {}\n{advice}", path.display(), differing.join("; "));
     Ok(())

@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::sync::atomic::AtomicBool;
 
 use serde_json::Value;
-use shadow_repose::config::{Config, Ramp};
+use shadow_repose::config::{Config, Ramp, Settings, Source};
 use shadow_repose::env::{Env, EnvState, Resumable};
 use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::load::Loaded;
@@ -178,9 +178,9 @@ fn noise_and_bias_are_seen_but_the_hand_is_where_it_is() {
 
 /// Returns an environment in which all is randomised, and the draws of episodes.
 fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<EpisodePhysics>) {
-    let mut config = Config::from_text(Path::new("all.toml"), ALL, &[]).unwrap();
+    let all = Source::new("all.toml", ALL);
     let sets: Vec<_> = settings.iter().map(|set| set.parse().unwrap()).collect();
-    config = config.changed(None, &sets).unwrap();
+    let config = Settings::new().file(all).sets(&sets).resolve().unwrap();
     let task = task(&[]);
     let randomization = Randomization::new(&task, &config.randomization).unwrap();
     let mut env = Repose::randomized(&task, randomization.as_ref());
@@ -399,7 +399,8 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
 
 fn config_of(run: &Path) -> Config {
     let text = fs::read_to_string(run.join("config.toml")).unwrap();
-    Config::from_text(Path::new("config.toml"), &text, &[]).unwrap()
+    let source = Source::new("config.toml", text);
+    Settings::new().file(source).resolve().unwrap()
 }
 
 #[test]

@@ -248,7 +248,7 @@ fn the_number_of_shards_is_the_largest_power_of_two_that_fits_or_the_one_that_is
     assert_eq!(shards(1024, &["run.shards=64"]), 64);
     for wrong in ["run.shards=3", "run.shards=2048"] {
         let sets = [wrong.parse().unwrap()];
-        let refused = shadow_repose::config::Config::resolve(None, &sets).unwrap_err().to_string();
+        let refused = shadow_repose::config::Settings::new().sets(&sets).resolve().unwrap_err().to_string();
         assert!(refused.contains("run.shards") && refused.contains("a power of two that divides"), "{refused}");
     }
 }

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use std::sync::Arc;
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::{Config, EnvConfig, Override};
+use shadow_repose::config::{Config, EnvConfig, Override, Settings};
 use shadow_repose::env::Env;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Repose, Task};
@@ -34,7 +34,7 @@ pub(crate) const SMALL: &[&str] = &[
 /// Returns the default configuration with these settings applied over it.
 pub(crate) fn config(settings: &[&str]) -> Config {
     let settings: Vec<Override> = settings.iter().map(|s| s.parse().unwrap()).collect();
-    Config::resolve(None, &settings).unwrap()
+    Settings::new().sets(&settings).resolve().unwrap()
 }
 
 /// Returns the task with these settings.

@@ -153,7 +153,7 @@ mod tests {
     /// ```
     #[test]
     fn losses_and_gradients_match_pytorch() {
-        let mut config = Config::resolve(None, &[]).unwrap().ppo;
+        let mut config = Config::default().ppo;
         (config.clip, config.value_clip, config.value_coef) = (0.2, 0.3, 2.0);
         let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
         let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
@@ -195,7 +195,7 @@ mod tests {
         };
         let mean = Var::from_tensor(&tensor(&[1.5, -0.2], &[1, 2])).unwrap();
         let with = |bounds_coef: f64| {
-            let mut config = Config::resolve(None, &[]).unwrap().ppo;
+            let mut config = Config::default().ppo;
             config.bounds_coef = bounds_coef;
             let Gaussian { log_std, scales, .. } = gaussian(&[0.0; 2], &[1.0]);
             let new = Gaussian { means: mean.as_tensor().clone(), log_std, scales };

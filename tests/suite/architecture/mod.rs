@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shadow_repose::config::{Config, Source};
+use shadow_repose::config::{Settings, Source};
 
 use imports::Imports;
 
@@ -172,7 +172,7 @@ fn every_configuration_that_comes_with_the_program_is_valid() {
     assert!(files.len() > 1);
     for path in files {
         let text = fs::read_to_string(&path).unwrap();
-        Config::resolve(Some(&Source { path, text }), &[]).unwrap();
+        Settings::new().file(Source::new(path, text)).resolve().unwrap();
     }
 }
 
