@@ -77,7 +77,7 @@ pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
         let checkpoint = Checkpoint::parse(bytes)?;
         let config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Player { env_steps: 0 }, &[])?;
         let net = config.ppo.net();
-        let spaces = load::record(&checkpoint, &net)?.spaces();
+        let spaces = load::record(&checkpoint)?.spaces();
         let policy = Policy::load(&net, spaces, &checkpoint)?;
         let frozen = policy.freeze();
         let (mut action, mut work) = (vec![0.0; spaces.action_size], frozen.workspace(1));

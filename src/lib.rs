@@ -65,7 +65,7 @@
 //!                         → Adam); then the normaliser
 //! observations[T] --carry_over--> observations[0] of the next iteration
 //! ```
-//! Observations are stored raw everywhere: a policy applies its symmetry and normalises them as it reads them.
+//! Observations are stored raw everywhere: a policy turns the object onto itself and normalises them as it reads them.
 //! `ppo::fused` describes how a minibatch is computed. `ppo::candle` computes the same with candle's tensors.
 //!
 //! A training may be spread over several processes. [`ranks`] describes what they exchange.

@@ -148,7 +148,7 @@ impl Loaded {
         };
         let (checkpoint, config) = origin.load(overrides)?;
         let net = config.ppo.net();
-        let record = record(&checkpoint, &net)?;
+        let record = record(&checkpoint)?;
         let policy = Policy::load(&net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let policy = Arc::new(policy);
@@ -177,12 +177,12 @@ impl Loaded {
     }
 }
 
-/// Returns the hand and the object that a policy with this net was trained with.
+/// The hand and the object that a policy was trained with.
 ///
 /// # Errors
 /// Fails if the record in its file is damaged.
-pub fn record(checkpoint: &Checkpoint, net: &NetConfig) -> Result<Record> {
-    Ok(Record::parse(&checkpoint.hand)?.with(net.symmetry))
+pub fn record(checkpoint: &Checkpoint) -> Result<Record> {
+    Record::parse(&checkpoint.hand)
 }
 
 /// Reads a checkpoint or a policy.
@@ -270,7 +270,7 @@ fn cannot_use(path: &Path) -> String {
 }
 
 fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
-    checkpoint.expect_policy(net, &record(checkpoint, net)?.spaces())
+    checkpoint.expect_policy(net, &record(checkpoint)?.spaces())
 }
 
 #[cfg(test)]

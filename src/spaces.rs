@@ -9,7 +9,7 @@ pub struct Spaces {
     pub observation_size: usize,
     /// The number of values in an action.
     pub action_size: usize,
-    /// The location of a cube and its goal, if there is one (for `ppo.symmetry`).
+    /// The location of an object and its goal, if there is one.
     pub object_and_goal: Option<ObjectAndGoal>,
     /// The distance of an observation from its goal, in the unit of `ppo.away_range`.
     pub distance: fn(&Self, &[f32]) -> f32,
@@ -25,5 +25,5 @@ pub struct ObjectAndGoal {
     /// The offset of the orientation of the object relative to its goal.
     pub relative: usize,
     /// The rotations that a policy treats as the same: bit i is set if it is number i of [`crate::quat::CUBE_ROTATIONS`].
-    pub symmetry: u32,
+    pub rotations: u32,
 }

@@ -91,7 +91,7 @@ impl<E: Env> Agent<E> {
     /// randomness follows from `seed`.
     ///
     /// # Errors
-    /// Fails if this machine does not support the precision, or if the observations do not have the symmetry.
+    /// Fails if this machine does not support the precision.
     pub fn new(
         envs: Vec<E>,
         config: &PpoConfig,

@@ -54,6 +54,8 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config.env, &config.hand)?;
+    let record = task.record().with(config.ppo.symmetry);
+    let task = task.for_policy(&record)?;
     config.env = task.config().clone();
     let threads = rayon::current_num_threads();
     let num_envs = config.env.num_envs;

@@ -238,8 +238,6 @@ pub struct NetConfig {
     pub hidden: Vec<usize>,
     /// The activation function after each of them.
     pub activation: Activation,
-    /// The states that it treats as the same.
-    pub symmetry: Symmetry,
 }
 
 impl Config {
@@ -268,7 +266,7 @@ impl Config {
 impl PpoConfig {
     /// Returns the structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
-        NetConfig { hidden: self.hidden.clone(), activation: self.activation, symmetry: self.symmetry }
+        NetConfig { hidden: self.hidden.clone(), activation: self.activation }
     }
 
     /// Returns the number of control steps of each environment in the first iteration.

@@ -54,7 +54,7 @@ fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
     graph.node("Clip", &[row, &low, &high], output, &[])
 }
 
-/// Turns cube and goal by the rotation of the cube's symmetry that brings the cube closest to its unrotated orientation.
+/// Turns cube and goal by the rotation, of those that the policy treats as the same, that brings the cube closest to its unrotated orientation.
 fn canonicalize(
     graph: &mut Graph,
     size: usize,

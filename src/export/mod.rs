@@ -1,4 +1,4 @@
-//! Exports a policy as an ONNX file, which programs in other languages run. One graph holds symmetry, normaliser and actor. The
+//! Exports a policy as an ONNX file, which programs in other languages run. One graph holds perception, normaliser and actor. The
 //! metadata holds what a program must know to use it.
 
 mod graph;

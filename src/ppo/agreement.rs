@@ -18,7 +18,7 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 75,
         action_size: 20,
-        object_and_goal: Some(ObjectAndGoal { object: 51, goal: 64, relative: 0, symmetry: 1 }),
+        object_and_goal: Some(ObjectAndGoal { object: 51, goal: 64, relative: 0, rotations: 1 }),
         distance: |_, _| 0.0,
     };
 
@@ -199,7 +199,7 @@ mod tests {
         let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, ..SPACES };
         let [fused, candle] = BACKENDS.map(|backend| {
             let mut config = Config::default().ppo;
-            (config.backend, config.hidden, config.symmetry) = (backend, vec![1], config::Symmetry::None);
+            (config.backend, config.hidden) = (backend, vec![1]);
             let mut ppo = Ppo::new(&config, spaces, 3, Exchange::alone(1)).unwrap();
             let mut rollout = Rollout::new(1, &[1], &spaces);
             rollout.blocks[0].observations.fill(0.7);

@@ -179,7 +179,7 @@ impl Checkpoint {
 
     fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
         self.expect_policy(net, &spaces)?;
-        let mut policy = Policy::new(net, spaces)?;
+        let mut policy = Policy::new(net, spaces);
         policy.parameters = self.take_floats("", &policy.layout.views())?;
         policy.log_std = match self.take(LOG_STD)? {
             Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
@@ -281,7 +281,7 @@ impl Ppo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Backend, Config, PpoConfig, Symmetry};
+    use crate::config::{Backend, Config, PpoConfig};
     use crate::ppo::update::Stage;
     use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Exchange;
@@ -290,7 +290,7 @@ mod tests {
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::default().ppo;
-        (config.backend, config.hidden, config.symmetry) = (backend, hidden.to_vec(), Symmetry::None);
+        (config.backend, config.hidden) = (backend, hidden.to_vec());
         config
     }
 

@@ -29,7 +29,7 @@ pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Geometric, Ramp, Symmetry};
+    use crate::config::{Config, Geometric, Ramp};
     use crate::ppo::Ppo;
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
@@ -58,7 +58,7 @@ mod tests {
     #[test]
     fn the_desired_divergence_follows_its_ramp_by_equal_factors() {
         let ramp = Ramp { from: 0.016, to: 0.004, steps: 1000, after: 0 };
-        let config = PpoConfig { symmetry: Symmetry::None, ..config(1e-3, ramp) };
+        let config = config(1e-3, ramp);
         let mut ppo = Ppo::new(&config, SPACES, 0, Exchange::alone(1)).unwrap();
         let mut rollout = ppo.rollout(&[1]);
         // Control steps of the run, and the divergence there above which the rate falls.

@@ -143,7 +143,7 @@ impl<'a> Loss<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Activation, Config, NetConfig, Symmetry};
+    use crate::config::{Activation, Config, NetConfig};
     use crate::spaces::Spaces;
 
     fn assert_close(found: &[f32], expected: &[f32]) {
@@ -173,8 +173,8 @@ mod tests {
         let mut config = Config::default().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
-        let net = NetConfig { hidden: vec![1], activation: Activation::Elu, symmetry: Symmetry::None };
-        let mut policy = Policy::new(&net, spaces).unwrap();
+        let net = NetConfig { hidden: vec![1], activation: Activation::Elu };
+        let mut policy = Policy::new(&net, spaces);
         policy.log_std = log_std;
         let loss = Loss::new(&policy, &rollout, 3, &config);
         let (mut actor, mut critic) = (loss.of_none(), loss.of_none());

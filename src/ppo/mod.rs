@@ -78,10 +78,9 @@ impl Ppo {
     /// rank, and adds up results with the other ranks. All its randomness is derived from `seed`.
     ///
     /// # Errors
-    /// Fails if this machine does not support the configured precision, or if the observations lack the configured
-    /// symmetry.
+    /// Fails if this machine does not support the configured precision.
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
-        let policy = Policy::random(&config.net(), spaces, config.std.at(0), seed)?;
+        let policy = Policy::random(&config.net(), spaces, config.std.at(0), seed);
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Fused::new(config, arithmetic)),

@@ -1,15 +1,12 @@
-//! How a policy reads observations: it exploits the symmetry of the cube, then normalises.
+//! How a policy reads observations: it turns an object onto itself so that equal states look the same, then normalises.
 //!
 //! The faces of the cube look different, but make no difference to the hand. There are 24 rotations that map a cube
 //! onto itself. If one of them rotates cube and goal about the cube's own axes, the cube moves in the same way under
 //! the same actions. The remaining rotation to the goal is the same. So each observation is first mapped to one of the
 //! 24 equivalent ones, and a policy has to learn only that one.
 
-use anyhow::{Result, ensure};
-
 use super::kernels::widest;
 use super::normalizer::Normalizer;
-use crate::config::Symmetry;
 use crate::quat::{self, CUBE_ROTATIONS};
 use crate::spaces::{ObjectAndGoal, Spaces};
 
@@ -19,7 +16,7 @@ pub const CLIP: f32 = 5.0;
 /// Added to the variance, so that a constant input does not cause a division by zero.
 const EPSILON: f64 = 1e-5;
 
-/// The symmetry that a policy exploits in raw observations.
+/// What a policy treats as the same in raw observations.
 #[derive(Clone, Copy, Debug)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
@@ -29,21 +26,14 @@ pub struct Perception {
 }
 
 impl Perception {
-    /// Creates the perception for this setting and the observations that `spaces` describes.
-    ///
-    /// # Errors
-    /// Fails if the setting is the symmetry of a cube but the observations contain no cube.
-    pub fn new(symmetry: Symmetry, spaces: &Spaces) -> Result<Self> {
-        let object_and_goal = spaces.object_and_goal.filter(|_| symmetry != Symmetry::None);
-        ensure!(
-            symmetry != Symmetry::Cube || object_and_goal.is_some(),
-            "ppo.symmetry = \"cube\": this task has no cube"
-        );
-        let mask = object_and_goal.map_or(1, |places| places.symmetry);
+    /// Creates the perception of the observations that `spaces` describes.
+    pub fn new(spaces: &Spaces) -> Self {
+        let object_and_goal = spaces.object_and_goal.filter(|places| places.rotations != 1);
+        let mask = object_and_goal.map_or(1, |places| places.rotations);
         let mut rotations = [CUBE_ROTATIONS[0]; CUBE_ROTATIONS.len()];
         let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
         rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
-        Ok(Self { object_and_goal, rotations })
+        Self { object_and_goal, rotations }
     }
 
     /// The rotations that map the object onto itself. The first one may be repeated at the end.
@@ -75,7 +65,7 @@ impl Perception {
 /// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
 #[derive(Clone, Debug)]
 pub struct InputTransform {
-    /// The symmetry that it exploits.
+    /// What it treats as the same.
     pub perception: Perception,
     /// `[O]`
     pub mean: Vec<f32>,
@@ -117,12 +107,14 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 20,
         action_size: 1,
-        object_and_goal: Some(ObjectAndGoal { object: 5, goal: 11, relative: 0, symmetry: u32::MAX }),
+        object_and_goal: Some(ObjectAndGoal { object: 5, goal: 11, relative: 0, rotations: u32::MAX }),
         distance: |_, _| 0.0,
     };
 
-    fn perceive(symmetry: Symmetry, row: &mut [f32]) {
-        Perception::new(symmetry, &SPACES).unwrap().canonicalize(row);
+    const UNTURNED: Spaces = Spaces { object_and_goal: None, ..SPACES };
+
+    fn perceive(row: &mut [f32]) {
+        Perception::new(&SPACES).canonicalize(row);
     }
 
     fn observation(object: Quat, goal: Quat) -> Vec<f32> {
@@ -160,11 +152,11 @@ mod tests {
         for case in 0..200 {
             let (object, goal) = (random(2 * case), random(2 * case + 1));
             let mut seen = observation(object, goal);
-            perceive(Symmetry::Cube, &mut seen);
+            perceive(&mut seen);
             for rotation in CUBE_ROTATIONS {
                 let turn = |q| quat::mul(q, rotation.map(f64::from));
                 let mut other = observation(turn(object), turn(goal));
-                perceive(Symmetry::Cube, &mut other);
+                perceive(&mut other);
                 let close = seen.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-5);
                 assert!(close, "{rotation:?}: {:?} and {:?}", &seen[5..9], &other[5..9]);
             }
@@ -177,7 +169,7 @@ mod tests {
             let (object, goal) = (random(2 * case), random(2 * case + 1));
             let raw = observation(object, goal);
             let mut seen = raw.clone();
-            perceive(Symmetry::Cube, &mut seen);
+            perceive(&mut seen);
             let [new_object, new_goal] = [5, 11].map(|at| quaternion(&seen, at));
             let between = |a: [f32; 4], b: [f32; 4]| quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)));
             let left = quat::mul(object, quat::conj(goal));
@@ -188,7 +180,7 @@ mod tests {
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));
             let before = seen.clone();
-            perceive(Symmetry::None, &mut seen);
+            Perception::new(&UNTURNED).canonicalize(&mut seen);
             assert_eq!(seen, before);
         }
     }
@@ -196,13 +188,13 @@ mod tests {
     #[test]
     fn what_is_read_is_perceived_and_then_normalised() {
         let normalizer = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 };
-        let transform = InputTransform::new(Perception::new(Symmetry::Cube, &SPACES).unwrap(), &normalizer);
+        let transform = InputTransform::new(Perception::new(&SPACES), &normalizer);
         let raw = [observation(random(0), random(1)), observation(random(2), random(3))].concat();
         let mut found = vec![0.0; 40];
         transform.apply(&raw, &mut found);
         for (found, raw) in found.chunks_exact(20).zip(raw.chunks_exact(20)) {
             let mut expected = raw.to_vec();
-            perceive(Symmetry::Cube, &mut expected);
+            perceive(&mut expected);
             assert!(expected != raw);
             let normalised = expected.iter().map(|x| ((x - 1.0) / 2.0).clamp(-5.0, 5.0));
             assert!(normalised.zip(found).all(|(a, b)| (a - b).abs() < 1e-4));
@@ -213,16 +205,9 @@ mod tests {
     fn normalised_values_are_in_standard_deviations_and_clipped() {
         let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
         let mut normalised = [0.0; 3];
-        let transform = InputTransform::new(Perception::new(Symmetry::None, &SPACES).unwrap(), &normalizer);
+        let transform = InputTransform::new(Perception::new(&UNTURNED), &normalizer);
         transform.apply(&[4.0, 2.0, 400.0], &mut normalised);
         assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
         assert_eq!(normalised[1..], [0.0, CLIP]);
-    }
-
-    #[test]
-    fn the_symmetry_of_a_cube_is_refused_where_there_is_none() {
-        let none = Spaces { object_and_goal: None, ..SPACES };
-        assert!(Perception::new(Symmetry::Cube, &none).unwrap_err().to_string().contains("ppo.symmetry"));
-        assert!(Perception::new(Symmetry::None, &none).is_ok());
     }
 }

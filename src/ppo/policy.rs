@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
 use rand::RngExt;
 use rayon::prelude::*;
 
@@ -56,25 +55,19 @@ pub struct FixedPolicy {
 
 impl Policy {
     /// Creates a policy whose parameters are all zero, for environments with these spaces.
-    ///
-    /// # Errors
-    /// Fails if the observations do not have the symmetry of `net`.
-    pub fn new(net: &NetConfig, spaces: Spaces) -> Result<Self> {
+    pub fn new(net: &NetConfig, spaces: Spaces) -> Self {
         let layout = ParameterLayout::new(&net.hidden, &spaces);
         let parameters = vec![0.0; layout.count()];
         let normalizer = Normalizer::new(spaces.observation_size);
-        let perception = Perception::new(net.symmetry, &spaces)?;
-        Ok(Self { layout, parameters, log_std: 0.0, normalizer, activation: net.activation, spaces, perception })
+        let perception = Perception::new(&spaces);
+        Self { layout, parameters, log_std: 0.0, normalizer, activation: net.activation, spaces, perception }
     }
 
     /// Creates an untrained policy with weights drawn from `seed` and this standard deviation.
     ///
     /// Weights and biases are uniform in ± 1/√inputs, as in PyTorch's `Linear`.
-    ///
-    /// # Errors
-    /// Fails if the observations do not have the symmetry of `net`.
-    pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Result<Self> {
-        let mut policy = Self { log_std: std.ln() as f32, ..Self::new(net, spaces)? };
+    pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Self {
+        let mut policy = Self { log_std: std.ln() as f32, ..Self::new(net, spaces) };
         let mut rng = rng::stream(seed, "weights", 0);
         for (i, layer) in policy.layout.layers().enumerate() {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
@@ -84,7 +77,7 @@ impl Policy {
                 policy.parameters[range.clone()].fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
             }
         }
-        Ok(policy)
+        policy
     }
 
     /// The standard deviation of each action at noise scale 1. Training may scale the noise (see `Acting`).
@@ -242,8 +235,8 @@ mod tests {
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
         const SIZE: usize = 75;
         let spaces = Spaces { observation_size: SIZE, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
-        let net = NetConfig { symmetry: crate::config::Symmetry::None, ..Config::default().ppo.net() };
-        let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7).unwrap()));
+        let net = Config::default().ppo.net();
+        let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7)));
         let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
         let (actions, values) = (policy.mean_actions(&observations), policy.values(&observations));
         assert_eq!([actions.len(), values.len()], [150 * 20, 150]);

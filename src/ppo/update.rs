@@ -215,7 +215,7 @@ impl Ppo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Settings;
+    use crate::config::Config;
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
 
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn the_entropy_is_the_one_of_a_gaussian_with_this_standard_deviation() {
-        let config = Settings::new().sets(&["ppo.symmetry=none".parse().unwrap()]).resolve().unwrap().ppo;
+        let config = Config::default().ppo;
         let ppo = Ppo::new(&config, SPACES, 0, Exchange::alone(1)).unwrap();
         // With a standard deviation of 0.6: ln 0.6 + ln(2πe) / 2 = 0.908 113 for each of the two actions.
         let entropy = ppo.stats(&[(Losses::default(), 0.0)], 0.0).entropy;

@@ -110,12 +110,12 @@ impl Layout {
     }
 
     /// Returns the description of observations and actions for a learner, for an object with these rotations.
-    pub fn spaces(&self, symmetry: &[usize]) -> Spaces {
+    pub fn spaces(&self, rotations: &[usize]) -> Spaces {
         let [object, goal, relative] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
         Spaces {
             observation_size: self.size,
             action_size: self.actions,
-            object_and_goal: Some(ObjectAndGoal { object, goal, relative, symmetry: quat::mask(symmetry) }),
+            object_and_goal: Some(ObjectAndGoal { object, goal, relative, rotations: quat::mask(rotations) }),
             distance: rotation_error,
         }
     }

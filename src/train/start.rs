@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, MODEL, NetConfig, Override, Reader, Settings, Source};
+use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
 use crate::load::{self, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
@@ -86,7 +86,7 @@ impl Plan {
         let (checkpoint, played) = origin.load_for_any_scene()?;
         let settings = settings.stored(load::source(&checkpoint, place), Reader::NewRun);
         let plan = Self::new(settings.resolve()?, args)?;
-        expect_net(&checkpoint, &played.ppo.net(), &plan.config)
+        expect_net(&checkpoint, &played.ppo, &plan.config.ppo)
             .with_context(|| format!("cannot start from the policy {origin}"))?;
         let context = Some(format!("cannot start from the policy {}", place.display()));
         Ok(Self { from: Some((Takes::Policy, checkpoint)), context, ..plan })
@@ -169,11 +169,11 @@ impl Plan {
     /// Fails if the scene cannot be used, or if the policy is for another hand.
     pub(super) fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
         let load = || {
-            let (config, net) = (&self.config, self.config.ppo.net());
+            let config = &self.config;
             let task = Task::new(&config.env, &config.hand)?;
             let record = match &self.from {
-                Some((_, checkpoint)) => load::record(checkpoint, &net)?,
-                None => task.record().with(net.symmetry),
+                Some((_, checkpoint)) => load::record(checkpoint)?,
+                None => task.record().with(config.ppo.symmetry),
             };
             // What is written must be readable.
             Record::parse(&record.to_text())?;
@@ -262,11 +262,10 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Checks that a policy with this net can begin a training with these settings.
-fn expect_net(checkpoint: &Checkpoint, policy: &NetConfig, config: &Config) -> Result<()> {
-    let net = config.ppo.net();
-    checkpoint.expect_policy(&net, &load::record(checkpoint, policy)?.spaces())?;
-    let (found, expected) = ((policy.activation, policy.symmetry), (net.activation, net.symmetry));
+/// Checks that a policy with the `stored` settings can begin a training run with these.
+fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig) -> Result<()> {
+    checkpoint.expect_policy(&settings.net(), &load::record(checkpoint)?.spaces())?;
+    let [found, expected] = [stored, settings].map(|settings| (settings.activation, settings.symmetry));
     ensure!(
         found == expected,
         "its activation and symmetry are {found:?}, but those of this training are {expected:?}"
@@ -277,12 +276,12 @@ fn expect_net(checkpoint: &Checkpoint, policy: &NetConfig, config: &Config) -> R
 /// Checks that the settings that determine the size of the state or the kind of policy are unchanged.
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
     let of = |config: &Config| {
-        let net = config.ppo.net();
+        let PpoConfig { hidden, symmetry, activation, .. } = &config.ppo;
         [
             ("env.num_envs", config.env.num_envs.to_string()),
-            ("ppo.hidden", format!("{:?}", net.hidden)),
-            ("ppo.symmetry", format!("{:?}", net.symmetry).to_lowercase()),
-            ("ppo.activation", format!("{:?}", net.activation).to_lowercase()),
+            ("ppo.hidden", format!("{hidden:?}")),
+            ("ppo.symmetry", format!("{symmetry:?}").to_lowercase()),
+            ("ppo.activation", format!("{activation:?}").to_lowercase()),
         ]
     };
     for ((key, before), (_, now)) in of(parent).into_iter().zip(of(config)) {

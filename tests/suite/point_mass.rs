@@ -104,7 +104,7 @@ pub(crate) fn of_ranks(envs: usize, settings: &PpoConfig, seed: u64, exchange: E
 pub(crate) fn settings() -> PpoConfig {
     let settings =
         ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.std={from=0.5,to=0.2,steps=25_000_000}", "ppo.gamma=0.9"];
-    config(&[&settings[..], &["ppo.symmetry=none"]].concat()).ppo
+    config(&settings).ppo
 }
 
 /// Trains for 60 iterations. Returns the mean distance at the end of episodes, for the first and the last iteration with any.

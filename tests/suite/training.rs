@@ -4,7 +4,7 @@ use std::fs;
 use std::sync::atomic::AtomicBool;
 
 use shadow_repose::agent::Agent;
-use shadow_repose::config::{Override, Ramp, Symmetry};
+use shadow_repose::config::{Override, Ramp};
 use shadow_repose::env::{End, Env, EnvPool};
 use shadow_repose::load::Loaded;
 use shadow_repose::ppo::{Checkpoint, Perception};
@@ -62,7 +62,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "their orientations differ");
         for row in [&mut seen, &mut other_seen] {
-            Perception::new(Symmetry::Cube, &task.spaces()).unwrap().canonicalize(row);
+            Perception::new(&task.spaces()).canonicalize(row);
         }
         // All but the goals: both environments drew the same one, for cubes of different orientation.
         for same in [0..64, 72..OBSERVATION_SIZE] {
@@ -170,7 +170,9 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
     let sets = ["env.num_envs=8", "ppo.hidden=[16]", "ppo.horizon=4", "ppo.minibatches=4"];
     for (symmetry, perceives) in [("cube", true), ("none", false)] {
         let config = config(&[&sets[..], &[&format!("ppo.symmetry={symmetry}")]].concat());
-        let mut agent = started_agent(&task(&[]), &config);
+        let task = task(&[]);
+        let record = task.record().with(config.ppo.symmetry);
+        let mut agent = started_agent(&task.for_policy(&record).unwrap(), &config);
         agent.collect(&AtomicBool::new(false)).unwrap().expect("nothing stops it");
         let (policy, mut shown) = (agent.ppo.policy().freeze(), vec![0.0; OBSERVATION_SIZE]);
         let block = &agent.rollout.blocks[0];
