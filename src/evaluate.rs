@@ -150,7 +150,10 @@ pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
 /// # Errors
 /// Fails if the value is not finite.
 pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
-    let (player, policy, mut value) = (Player::new(task, Episodes::scored(0, 1)), policy.freeze(), [0.0_f32]);
+    let player = Player::new(task, Episodes::scored(0, 1));
+    let policy = policy.freeze();
+    let mut value = [0.0_f32];
+
     policy.values(&player.observation, &mut value, &mut policy.workspace(1));
     ensure!((value[0] * value[0]).is_finite(), "the values of the policy are not finite");
     Ok(())
@@ -206,50 +209,104 @@ impl Trial<'_> {
         own: Range<usize>,
         observer: &mut dyn FnMut(Moment) -> Result<()>,
     ) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
-        let Self { task, actor, episodes, stop } = *self;
-        let end = episodes.first + episodes.count;
-        let mut lanes: Vec<Lane> = (own.start..own.end.min(episodes.count)).map(|_| Lane::new(task)).collect();
-        let Spaces { observation_size, action_size, .. } = task.spaces();
-        let mut observations = vec![0.0; LANES * observation_size];
-        let mut actions = vec![0.0; LANES * action_size];
-        let mut work = actor.policy().map(|policy| policy.workspace(LANES));
-        let mut results = Vec::with_capacity(episodes.count);
-        for first in (episodes.first + own.start..end).step_by(LANES) {
-            let started = lanes.len().min(end - first);
-            let rows = observations.par_chunks_exact_mut(observation_size);
-            lanes[..started].par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| {
-                stepping("episode", first + i, || lane.start(episodes, first + i, row));
-            });
-            let rows = observations.chunks_exact(observation_size);
-            for (i, (lane, observation)) in lanes[..started].iter().zip(rows).enumerate() {
-                observer(Moment { episode: first + i, env: &lane.env, observation, step: None })?;
-            }
-            while lanes.iter().any(|lane| lane.running) {
-                if stop.load(Ordering::Relaxed) {
+        let Episodes { first, count, .. } = self.episodes;
+        let mut group = Lanes::new(self, own.start..own.end.min(count));
+        let mut results = Vec::with_capacity(count);
+        for first in (first + own.start..first + count).step_by(LANES) {
+            group.start(first, observer)?;
+            while group.is_running() {
+                if self.stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
-                actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
-                let mut running = lanes.iter().zip(actions.chunks_exact(action_size)).filter(|(lane, _)| lane.running);
-                ensure!(running.all(|(_, action)| action.iter().all(|x| x.is_finite())), NOT_FINITE);
-                let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(action_size));
-                let rows = acted.zip(observations.par_chunks_exact_mut(observation_size)).enumerate();
-                rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
-                    // Unwind safe: a state that a panic left inconsistent is not used again.
-                    let step = || catch_unwind(AssertUnwindSafe(|| lane.step(action, row)));
-                    let stepped = stepping("episode", first + i, step).map(drop);
-                    stepped.map_err(|panic| anyhow!("episode {} panicked: {}", first + i, panic_message(&*panic)))
-                })?;
-                let rows = observations.chunks_exact(observation_size).zip(actions.chunks_exact(action_size));
-                let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
-                for (i, (lane, (observation, action))) in running {
-                    let step = Some((action, lane.end));
-                    observer(Moment { episode: first + i, env: &lane.env, observation, step })?;
-                    lane.running = lane.end.is_none();
-                }
+                group.step(observer)?;
             }
-            results.extend((first..).zip(lanes[..started].iter_mut().map(Lane::episode)));
+            results.extend(group.episodes());
         }
         Ok(Some(results))
+    }
+}
+
+/// Episodes that run together, one in each lane.
+struct Lanes<'a> {
+    trial: Trial<'a>,
+    lanes: Vec<Lane>,
+    /// `[LANES, O]`
+    observations: Vec<f32>,
+    /// `[LANES, A]`
+    actions: Vec<f32>,
+    work: Option<Workspace>,
+    spaces: Spaces,
+    /// The number of the first episode.
+    first: usize,
+    /// The number of episodes, which the last group may have fewer of than lanes.
+    count: usize,
+}
+
+impl<'a> Lanes<'a> {
+    fn new(trial: &Trial<'a>, lanes: Range<usize>) -> Self {
+        let spaces = trial.task.spaces();
+        Self {
+            trial: *trial,
+            lanes: lanes.map(|_| Lane::new(trial.task)).collect(),
+            observations: vec![0.0; LANES * spaces.observation_size],
+            actions: vec![0.0; LANES * spaces.action_size],
+            work: trial.actor.policy().map(|policy| policy.workspace(LANES)),
+            spaces,
+            first: 0,
+            count: 0,
+        }
+    }
+
+    fn is_running(&self) -> bool {
+        self.lanes.iter().any(|lane| lane.running)
+    }
+
+    /// Starts the episodes from number `first` on.
+    fn start(&mut self, first: usize, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<()> {
+        let episodes = self.trial.episodes;
+        self.first = first;
+        self.count = self.lanes.len().min(episodes.first + episodes.count - first);
+        let size = self.spaces.observation_size;
+        let rows = self.observations.par_chunks_exact_mut(size);
+        self.lanes[..self.count].par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| {
+            stepping("episode", first + i, || lane.start(episodes, first + i, row));
+        });
+        let rows = self.observations.chunks_exact(size);
+        for (i, (lane, observation)) in self.lanes[..self.count].iter().zip(rows).enumerate() {
+            observer(Moment { episode: first + i, env: &lane.env, observation, step: None })?;
+        }
+        Ok(())
+    }
+
+    /// Takes one step in each lane whose episode has not ended.
+    fn step(&mut self, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<()> {
+        let Self { trial, lanes, observations, actions, work, first, .. } = self;
+        let Spaces { observation_size, action_size, .. } = self.spaces;
+        trial.actor.choose(observations, lanes, actions, work.as_mut());
+        let mut running = lanes.iter().zip(actions.chunks_exact(action_size)).filter(|(lane, _)| lane.running);
+        ensure!(running.all(|(_, action)| action.iter().all(|x| x.is_finite())), NOT_FINITE);
+        let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(action_size));
+        let rows = acted.zip(observations.par_chunks_exact_mut(observation_size)).enumerate();
+        rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
+            let episode = *first + i;
+            // Unwind safe: a state that a panic left inconsistent is not used again.
+            let step = || catch_unwind(AssertUnwindSafe(|| lane.step(action, row)));
+            let stepped = stepping("episode", episode, step).map(drop);
+            stepped.map_err(|panic| anyhow!("episode {episode} panicked: {}", panic_message(&*panic)))
+        })?;
+        let rows = observations.chunks_exact(observation_size).zip(actions.chunks_exact(action_size));
+        let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
+        for (i, (lane, (observation, action))) in running {
+            let step = Some((action, lane.end));
+            observer(Moment { episode: *first + i, env: &lane.env, observation, step })?;
+            lane.running = lane.end.is_none();
+        }
+        Ok(())
+    }
+
+    /// The episodes, once they have ended, with their numbers.
+    fn episodes(&mut self) -> impl Iterator<Item = (usize, EpisodeStats)> {
+        (self.first..).zip(self.lanes[..self.count].iter_mut().map(Lane::episode))
     }
 }
 
@@ -320,7 +377,8 @@ impl Player {
     /// Creates a player at the start of the first of `episodes`. The caller counts the episodes.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
         let Spaces { observation_size, action_size, .. } = task.spaces();
-        let (observation, action) = (vec![0.0; observation_size], vec![0.0; action_size]);
+        let observation = vec![0.0; observation_size];
+        let action = vec![0.0; action_size];
         let mut player = Self { lane: Lane::new(task), observation, action, work: None };
         player.start(episodes, episodes.first);
         player

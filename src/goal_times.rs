@@ -34,13 +34,15 @@ struct Goal {
 impl GoalTimes {
     /// Creates an empty `GoalTimes` for episodes with these settings.
     pub fn new(config: &EnvConfig) -> Self {
-        let (hold, second) = (config.max_consecutive_successes, (1.0 / config.ctrl_dt).round() as u32);
+        let hold = config.max_consecutive_successes;
+        let second = (1.0 / config.ctrl_dt).round() as u32;
         Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
     }
 
     /// Adds a reset or step. The steps of one episode must come in order.
     pub fn observe(&mut self, moment: &Moment) {
-        let (stats, angle) = (moment.env.episode(), moment.env.rot_dist());
+        let stats = moment.env.episode();
+        let angle = moment.env.rot_dist();
         let next = Goal { steps: stats.length, angle };
         let Some((_, end)) = moment.step else {
             self.under_way.insert(moment.episode, (0, next));
@@ -49,7 +51,8 @@ impl GoalTimes {
         let (goals, goal) = self.under_way.entry(moment.episode).or_insert((0, next));
         if stats.goals > *goals {
             self.reached.push(Goal { steps: stats.length - goal.steps, angle: goal.angle });
-            (*goals, *goal) = (stats.goals, next);
+            *goals = stats.goals;
+            *goal = next;
         }
         if end.is_some() {
             self.under_way.remove(&moment.episode);
@@ -83,7 +86,9 @@ impl GoalTimes {
 /// Returns the value below which the `fraction` of the `sorted` values lies, interpolated linearly.
 fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     let place = fraction * sorted.len().saturating_sub(1) as f64;
-    let (below, part) = (place as usize, place.fract());
+    let below = place as usize;
+    let part = place.fract();
+
     let [low, high] = [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
     low + part * (high - low)
 }

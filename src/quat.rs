@@ -81,7 +81,9 @@ pub fn rotation_vector(q: Quat) -> [f64; 3] {
 ///
 /// K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {
-    let (inner, outer) = ((1.0 - u).sqrt(), u.sqrt());
+    let inner = (1.0 - u).sqrt();
+    let outer = u.sqrt();
+
     let (sin_v, cos_v) = (std::f64::consts::TAU * v).sin_cos();
     let (sin_w, cos_w) = (std::f64::consts::TAU * w).sin_cos();
     [outer * cos_w, inner * sin_v, inner * cos_v, outer * sin_w]

@@ -22,7 +22,8 @@ impl Trace {
     /// Creates an empty trace of a task, played by the `actor` of this name, with the policy in `checkpoint`, in episodes drawn from
     /// `seed`.
     pub fn new(task: &Task, actor: &str, checkpoint: Option<&str>, seed: u64) -> Self {
-        let (config, hand) = (task.config(), task.hand());
+        let config = task.config();
+        let hand = task.hand();
         let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,

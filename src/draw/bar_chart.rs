@@ -6,6 +6,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 
 use super::chart::{COLOURS, GRID, Picture, draw_text};
+use crate::os::number;
 
 /// A value with its name, its interval and a note.
 pub struct NamedBar {
@@ -65,41 +66,58 @@ impl Picture for BarChart {
 
     fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
         area.fill(&WHITE)?;
-        let text = |content: &str, at, across, size, colour| draw_text(&area, content, at, (across, size, colour));
-        let x = |value: f64| NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32;
+        draw_text(&area, &self.title, (WIDTH / 2, TITLE / 2), (HPos::Center, 16, BLACK))?;
         let bottom = TITLE + ROW * self.bars.len() as i32;
-        text(&self.title, (WIDTH / 2, TITLE / 2), HPos::Center, 16, BLACK)?;
+        self.draw_bars(&area, bottom)?;
+        self.map.draw(&area, bottom + ROW + GAP)?;
+        Ok(area.present()?)
+    }
+}
+
+impl BarChart {
+    fn draw_bars<B: DrawingBackend<ErrorType: 'static>>(
+        &self,
+        area: &DrawingArea<B, Shift>,
+        bottom: i32,
+    ) -> Result<()> {
+        let text = |content: &str, at, across, size| draw_text(area, content, at, (across, size, BLACK));
+        let x = |value: f64| NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32;
         for value in LINES {
             area.draw(&PathElement::new([(x(value), TITLE), (x(value), bottom)], GRID))?;
-            text(&format!("{value}"), (x(value), bottom + ROW / 2), HPos::Center, 12, BLACK)?;
+            text(&format!("{value}"), (x(value), bottom + ROW / 2), HPos::Center, 12)?;
         }
         for (i, bar) in self.bars.iter().enumerate() {
             let middle = TITLE + ROW * i as i32 + ROW / 2;
-            text(&bar.name, (NAMES - 8, middle), HPos::Right, 13, BLACK)?;
-            text(&bar.note, (WIDTH - NOTES + 8, middle), HPos::Left, 12, BLACK)?;
+            text(&bar.name, (NAMES - 8, middle), HPos::Right, 13)?;
+            text(&bar.note, (WIDTH - NOTES + 8, middle), HPos::Left, 12)?;
             let corners = [(x(0.0), middle - 7), (x(bar.value), middle + 7)];
             area.draw(&Rectangle::new(corners, BAR.filled()))?;
             area.draw(&PathElement::new(bar.interval.map(|value| (x(value), middle)), BLACK))?;
         }
-        let top = bottom + ROW + GAP;
-        let width = (WIDTH - NAMES - NOTES) / self.map.columns.len() as i32;
-        for (i, name) in self.map.columns.iter().enumerate() {
-            text(name, (NAMES + width * i as i32 + width / 2, top + CELL / 2), HPos::Center, 13, BLACK)?;
+        Ok(())
+    }
+}
+
+impl HeatMap {
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: &DrawingArea<B, Shift>, top: i32) -> Result<()> {
+        let text = |content: &str, at, across, colour| draw_text(area, content, at, (across, 13, colour));
+        let width = (WIDTH - NAMES - NOTES) / self.columns.len() as i32;
+        for (i, name) in self.columns.iter().enumerate() {
+            text(name, (NAMES + width * i as i32 + width / 2, top + CELL / 2), HPos::Center, BLACK)?;
         }
-        for (i, (name, cells)) in self.map.rows.iter().zip(&self.map.cells).enumerate() {
+        for (i, (name, cells)) in self.rows.iter().zip(&self.cells).enumerate() {
             let upper = top + CELL * (1 + i as i32);
-            text(name, (NAMES - 8, upper + CELL / 2), HPos::Right, 13, BLACK)?;
+            text(name, (NAMES - 8, upper + CELL / 2), HPos::Right, BLACK)?;
             for (j, &value) in cells.iter().enumerate() {
                 let left = NAMES + width * j as i32;
                 let share = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
                 let corners = [(left, upper), (left + width - 2, upper + CELL - 2)];
                 area.draw(&Rectangle::new(corners, blended(share).filled()))?;
                 let colour = if share > 0.6 { WHITE } else { BLACK };
-                let known = if value.is_nan() { "-".to_owned() } else { format!("{value:.2}") };
-                text(&known, (left + width / 2, upper + CELL / 2), HPos::Center, 13, colour)?;
+                text(&number(value, 2), (left + width / 2, upper + CELL / 2), HPos::Center, colour)?;
             }
         }
-        Ok(area.present()?)
+        Ok(())
     }
 }
 

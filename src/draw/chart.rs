@@ -201,7 +201,8 @@ impl Chart {
     /// Arranges the names in rows of a chart of this width.
     fn legend_rows(&self, width: u32) -> Vec<LegendRow<'_>> {
         let margin = 2 * MARGIN as i32;
-        let (mut rows, mut left) = (vec![Vec::new()], margin);
+        let mut rows = vec![Vec::new()];
+        let mut left = margin;
         for (name, style) in self.legend.iter().zip(styles()) {
             // Without a font, the width of a letter is a guess.
             let text =

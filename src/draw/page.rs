@@ -63,7 +63,8 @@ impl Page {
         let (lists, meshes): (Vec<Value>, Vec<Vec<u8>>) = self.meshes.iter().map(packed_mesh).unzip();
         self.scene["meshes"] = lists.into();
         let (scale, rows) = packed_rows(&self.rows, &self.counts);
-        (self.meta["rows"], self.meta["scale"]) = (self.rows.len().into(), scale.into());
+        self.meta["rows"] = self.rows.len().into();
+        self.meta["scale"] = scale.into();
         let (code, style) = (format!("\"use strict\";\n{}", CODE.map(lean).concat()), lean(STYLE));
         let policy = format!(
             "default-src 'none'; script-src {}; style-src {}; img-src data:; connect-src '{}'; base-uri 'none'; form-action 'none'",
@@ -141,7 +142,9 @@ fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     let bounds = |pick: fn(f32, f32) -> f32, start: f32| {
         [0, 1, 2].map(|axis| corners.iter().fold(start, |bound, (point, _)| pick(bound, point[axis])))
     };
-    let (low, high) = (bounds(f32::min, f32::INFINITY), bounds(f32::max, f32::NEG_INFINITY));
+    let low = bounds(f32::min, f32::INFINITY);
+    let high = bounds(f32::max, f32::NEG_INFINITY);
+
     let step = [0, 1, 2].map(|axis| f64::from(high[axis] - low[axis]).max(1e-9) / 65535.0);
     let point = |corner: usize, axis: usize| {
         (f64::from(corners[corner].0[axis] - low[axis]) / step[axis]).round() as i64 - 32768

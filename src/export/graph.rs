@@ -30,7 +30,8 @@ pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     let scaled = graph.node("Mul", &[&centred, "factor"], "scaled", &[]);
     let mut row = clip(&mut graph, &scaled, CLIP, "normalised");
     for (i, layer) in policy.layout.actor.iter().enumerate() {
-        let (weight, bias) = (format!("actor.{i}.weight"), format!("actor.{i}.bias"));
+        let weight = format!("actor.{i}.weight");
+        let bias = format!("actor.{i}.bias");
         graph.floats(&weight, &[layer.outputs, layer.inputs], &policy.parameters[layer.weight.clone()]);
         graph.floats(&bias, &[layer.outputs], &policy.parameters[layer.bias.clone()]);
         row = graph.node("Gemm", &[&row, &weight, &bias], &format!("layer{i}"), &[("transB", Int(1))]);

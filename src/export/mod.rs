@@ -44,10 +44,15 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 /// The names follow mjlab's runners where they define one. `joint_names` are what an action drives, here the actuators. Their
 /// target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
 fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
-    let (config, hand) = (task.config(), task.hand());
+    let config = task.config();
+    let hand = task.hand();
+
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
     let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
-    let (parts, groups, progress) = (&hand.parts, &hand.layout.groups, &loaded.checkpoint.progress);
+    let parts = &hand.parts;
+    let groups = &hand.layout.groups;
+    let progress = &loaded.checkpoint.progress;
+
     let kind = match hand.side() {
         Some("rh_") => "right Shadow Hand",
         Some("lh_") => "left Shadow Hand",

@@ -87,7 +87,8 @@ pub(super) struct Recorder {
 impl Recorder {
     /// Forgets the episode.
     pub(super) fn clear(&mut self) {
-        (self.before, self.now) = (None, None);
+        self.before = None;
+        self.now = None;
     }
 
     /// Records a step that is about to be taken, after its controls have been set.
@@ -100,7 +101,8 @@ impl Recorder {
     ) {
         let width = action.len();
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
-            let (controls, actions) = (Vec::with_capacity(STEPS * width), Vec::with_capacity(STEPS * width));
+            let controls = Vec::with_capacity(STEPS * width);
+            let actions = Vec::with_capacity(STEPS * width);
             self.before = self.now.replace(Tail {
                 start: sim.state(),
                 controls,

@@ -187,6 +187,39 @@ impl Repose {
         }
     }
 
+    /// Takes one step of the physics under an action, and records what its rewards depend on.
+    fn advance(&mut self, action: &[f32]) {
+        let rot_dist_before = self.rot_dist();
+        self.actuate(action);
+        self.last.push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
+        let left = quat::mul(self.goal, quat::conj(self.object().orientation));
+        let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
+        self.recorder.record(&self.sim, action, self.last.push, torque);
+        self.last.diverged = self.sim.step(self.task.config.substeps()) == Validity::Diverged;
+        if self.last.diverged {
+            // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
+            self.send();
+        }
+        self.measure(rot_dist_before);
+        self.last.reward = TaskReward::default();
+        self.last.training = TrainingReward::default();
+    }
+
+    /// Rewards a step that did not diverge, and adds it to the sums.
+    fn pay(&mut self) {
+        let reward = task_reward(&self.task.config, &self.last);
+        let training = self.lesson.reward(&self.last);
+        let rot_dist = self.last.rot_dist;
+        self.episode.reward += reward;
+        self.episode.rot_dist_sum += rot_dist;
+        self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
+        self.sums.task += reward;
+        self.sums.training += training;
+        self.sums.turned += self.last.rot_dist_before - rot_dist;
+        self.last.reward = reward;
+        self.last.training = training;
+    }
+
     /// Updates the hold counter after a step, and returns whether the goal has now been held long enough.
     fn hold(&mut self, within: bool) -> bool {
         if within {
@@ -228,7 +261,8 @@ impl Repose {
 
     /// Writes the observation of the current state, in the order of the hand's layout.
     pub fn observe(&self, observation: &mut [f32]) {
-        let (hand, config) = (&self.task.hand, &self.task.config);
+        let hand = &self.task.hand;
+        let config = &self.task.config;
         let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
         let mut cells = Writer::new(&hand.layout, observation);
         cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
@@ -271,7 +305,8 @@ impl Env for Repose {
 
     fn reset(&mut self, rng: Rng, observation: &mut [f32]) {
         let task = self.task.clone();
-        let (hand, config) = (&task.hand, &task.config);
+        let hand = &task.hand;
+        let config = &task.config;
         self.rng = rng;
         self.conditions.begin(&self.rng, self.lesson.randomized, &mut self.sim, &task);
         self.sim.reset();
@@ -307,48 +342,23 @@ impl Env for Repose {
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
-        let rot_dist_before = self.rot_dist();
-        self.actuate(action);
-        let push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
-        let left = quat::mul(self.goal, quat::conj(self.object().orientation));
-        let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
-        self.recorder.record(&self.sim, action, push, torque);
-        let diverged = self.sim.step(self.task.config.substeps()) == Validity::Diverged;
-        if diverged {
-            // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
-            self.send();
-        }
-
-        self.measure(rot_dist_before);
-        self.last.push = push;
-        self.last.diverged = diverged;
-        self.last.reward = TaskReward::default();
-        self.last.training = TrainingReward::default();
-        let mut reached = false;
+        self.advance(action);
         self.age += 1;
         self.episode.length += 1;
-        self.episode.diverged = diverged;
-        self.episode.dropped = !diverged && self.last.dropped;
+        self.episode.diverged = self.last.diverged;
+        self.episode.dropped = !self.last.diverged && self.last.dropped;
         self.sums.steps += 1;
-        self.sums.diverged += u64::from(diverged);
-        if diverged {
-            let (length, draw) = (self.episode.length, self.conditions.draw().cloned());
+        self.sums.diverged += u64::from(self.last.diverged);
+        let reached = if self.last.diverged {
+            let draw = self.conditions.draw().cloned();
+            let length = self.episode.length;
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
+            false
         } else {
-            let reward = task_reward(&self.task.config, &self.last);
-            let added = self.lesson.reward(&self.last);
-            self.last.reward = reward;
-            self.last.training = added;
-            self.episode.reward += reward;
-            self.episode.rot_dist_sum += self.last.rot_dist;
-            self.episode.in_tolerance += u32::from(self.last.rot_dist <= self.task.config.success_tolerance);
-            self.sums.task += reward;
-            self.sums.training += added;
-            self.sums.turned += rot_dist_before - self.last.rot_dist;
-            reached = self.hold(self.last.within);
-        }
-
-        let end = if diverged || self.episode.dropped {
+            self.pay();
+            self.hold(self.last.within)
+        };
+        let end = if self.last.diverged || self.episode.dropped {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
@@ -395,7 +405,8 @@ impl Resumable for Repose {
         // `age` has no tighter limit: a fork may have shorter episodes.
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
         ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
-        (self.age, self.held) = (age as u32, held as u32);
+        self.age = age as u32;
+        self.held = held as u32;
         let [randomized] = state.counters()?;
         ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);

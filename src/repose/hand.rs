@@ -135,7 +135,9 @@ impl Hand {
 
 /// Returns the parts of a Shadow Hand, if all of its names are there with one prefix.
 fn shadow_hand(scene: &Scene) -> Option<Parts> {
-    let (joints, actuators) = (scene.joints(), scene.actuators());
+    let joints = scene.joints();
+    let actuators = scene.actuators();
+
     let with = |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
     let mut hands = joints.iter().filter_map(|name| name.strip_suffix(JOINTS[0])).map(|prefix| Parts {
         joints: with(&JOINTS, prefix),

@@ -35,7 +35,8 @@ impl Mirror {
         // Returns how far a fingertip is from its counterpart on the other hand in a recorded pose, and the rotation
         // between the two.
         let compare = |at: usize| {
-            let ([x, y, z, own @ ..], [a, b, c, other @ ..]) = (here.tips[at], policy.tips[at]);
+            let [x, y, z, own @ ..] = here.tips[at];
+            let [a, b, c, other @ ..] = policy.tips[at];
             let apart = [x - a, -y - b, z - c].into_iter().map(f64::abs).fold(0.0, f64::max);
             (apart, quat::mul(quat::conj(mirrored(own)), other))
         };

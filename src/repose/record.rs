@@ -53,7 +53,8 @@ impl Record {
         ensure!(text.len() <= LONGEST, "its metadata `hand` has {} bytes; at most {LONGEST} are read", text.len());
         let record = serde_json::from_str::<Self>(text);
         let record = record.map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
-        let (actuators, tips) = (record.actuators.len(), POSES.len() * record.fingertips.len());
+        let actuators = record.actuators.len();
+        let tips = POSES.len() * record.fingertips.len();
         let sizes = [record.ranges.len(), record.driven.len(), record.tips.len()];
         let fits = sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
         let symmetry = record.symmetry.first() == Some(&0) && record.symmetry.iter().all(|&rotation| rotation < 24);
@@ -91,7 +92,8 @@ impl Record {
     /// # Errors
     /// Fails with the names that differ.
     pub(super) fn expect_fits(&self, there: &Self, mirrors: bool, scene: &str) -> Result<Option<String>> {
-        let (mut differ, mut is_other_hand) = (Vec::new(), true);
+        let mut differ = Vec::new();
+        let mut is_other_hand = true;
         for (what, own, found) in [
             ("joint", &self.joints, &there.joints),
             ("actuator", &self.actuators, &there.actuators),

@@ -1,5 +1,6 @@
 //! The task that all environments of a run share.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
@@ -42,7 +43,8 @@ impl Task {
     /// # Errors
     /// Fails with the scene's file if the scene cannot be loaded or lacks something, or if a setting does not fit the hand.
     pub fn new(config: &EnvConfig, named: &Parts) -> Result<Arc<Self>> {
-        let (file, mut config) = (config.model_file(), config.clone());
+        let file = config.model_file();
+        let mut config = config.clone();
         let as_it_is = Scene::load(file, &Compilation::plain(config.sim_dt, config.cone))?;
         let mut parts = Hand::find(&as_it_is, named).with_context(|| origin(file))?;
         let compilation = Compilation {
@@ -62,14 +64,7 @@ impl Task {
         config.goal_position.settle(hand.place());
         let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
         ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);
-        for (setting, key, what, found) in [
-            (&mut config.num_hand_dofs, "num_hand_dofs", "joints", hand.joints.len()),
-            (&mut config.num_actuators, "num_actuators", "actuators", hand.actuators.len()),
-        ] {
-            setting.settle(found);
-            let named = setting.value;
-            ensure!(named == found, "env.{key} = {named}: the hand of {} has {found} {what}", origin(file));
-        }
+        settle_sizes(&mut config, &hand, file)?;
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
         let symmetry = scene.symmetry(hand.object.body);
@@ -124,8 +119,11 @@ impl Task {
     /// from it.
     pub fn notes(&self) -> Vec<String> {
         let Some(file) = self.config.model_file() else { return Vec::new() };
-        let (scene, place, own) = (file.display(), self.config.goal_position.value, self.hand.place());
-        let (timestep, sim_dt) = (self.scene.own_timestep(), self.config.sim_dt);
+        let place = self.config.goal_position.value;
+        let own = self.hand.place();
+        let scene = file.display();
+        let timestep = self.scene.own_timestep();
+        let sim_dt = self.config.sim_dt;
         let mut notes = Vec::new();
         if timestep != sim_dt {
             notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
@@ -137,7 +135,8 @@ impl Task {
                 notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
             }
         }
-        let (object, alike) = (&self.hand.parts.object, self.scene.symmetry(self.hand.object.body).len());
+        let alike = self.scene.symmetry(self.hand.object.body).len();
+        let object = &self.hand.parts.object;
         if alike < CUBE_ROTATIONS.len() {
             notes.push(format!(
                 "{alike} of the 24 rotations of a cube map `{object}` onto itself (ppo.symmetry = \"object\")"
@@ -182,7 +181,8 @@ impl Task {
     /// # Errors
     /// Fails if the policy is for another hand.
     pub fn for_policy(mut self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
-        let (here, place) = (self.record(), origin(self.config.model_file()));
+        let here = self.record();
+        let place = origin(self.config.model_file());
         let mut warnings = Vec::from_iter(policy.expect_fits(&here, self.config.mirror, &place)?);
         if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
             warnings.push(format!(
@@ -240,4 +240,20 @@ impl Task {
         let scene = Scene::load(config.model_file(), &compilation)?;
         Ok(scene.varied(&Physics::of_task(config).changes(&self.hand)))
     }
+}
+
+/// Takes the numbers of joints and actuators from the hand, unless they are named.
+///
+/// # Errors
+/// Fails if another number is named.
+fn settle_sizes(config: &mut EnvConfig, hand: &Hand, file: Option<&Path>) -> Result<()> {
+    for (setting, key, what, found) in [
+        (&mut config.num_hand_dofs, "num_hand_dofs", "joints", hand.joints.len()),
+        (&mut config.num_actuators, "num_actuators", "actuators", hand.actuators.len()),
+    ] {
+        setting.settle(found);
+        let named = setting.value;
+        ensure!(named == found, "env.{key} = {named}: the hand of {} has {found} {what}", origin(file));
+    }
+    Ok(())
 }

@@ -81,7 +81,8 @@ impl Columns {
 
     /// Returns the row of an environment after a reset or a step, with these terms of the reward.
     pub(super) fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
-        let (last, episode) = (env.last_step(), env.episode());
+        let last = env.last_step();
+        let episode = env.episode();
         let (goal, error) = if episode.length == 0 { (env.goal(), env.rot_dist()) } else { (last.goal, last.rot_dist) };
         let scalars = [episode.length.into(), error, env.held().into(), episode.goals.into()];
         self.row(env.simulation().qpos(), &goal, scalars, &reward.values())

@@ -91,7 +91,8 @@ impl Live {
         let hands: Vec<LiveHand> = (0..hands).map(hand).collect();
         let hello = hello(&key, seed, &hands, sliders.as_ref());
         let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
-        let (port, machine) = (server.port(), Machine::this().name);
+        let port = server.port();
+        let machine = Machine::this().name;
         os::say(&format!(
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
@@ -135,7 +136,9 @@ impl Live {
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
         let own = &mut self.hands[hand];
         own.player = Player::new(&acting.task, Episodes { first: episode, ..self.episodes });
-        (own.acting, own.episode, own.has_ended) = (acting, episode, false);
+        own.acting = acting;
+        own.episode = episode;
+        own.has_ended = false;
         own.reward = TaskReward::default();
         let mut about = own.about(self.episodes.seed);
         about["hand"] = hand.into();

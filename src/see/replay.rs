@@ -38,7 +38,8 @@ impl Replay {
     /// Fails if they are longer than a page can count, or than a browser opens soon.
     pub fn new(task: &Arc<Task>, camera: Option<Camera>, episodes: usize) -> Result<Self> {
         let steps = task.config().max_episode_steps();
-        let (longest, all) = (steps <= MOST, steps as usize * episodes);
+        let longest = steps <= MOST;
+        let all = steps as usize * episodes;
         ensure!(longest, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
         ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: use fewer --episodes");
         Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
@@ -46,7 +47,8 @@ impl Replay {
 
     /// Records a moment of an episode.
     pub fn observe(&mut self, moment: &Moment) {
-        let (last, begins) = (moment.env.last_step(), moment.step.is_none());
+        let last = moment.env.last_step();
+        let begins = moment.step.is_none();
         let row = self.columns.of(moment.env, if begins { TaskReward::default() } else { last.reward });
         let end = moment.step.and_then(|(_, end)| end).map(|end| match end {
             End::Terminated if last.diverged => "diverged",
@@ -61,7 +63,8 @@ impl Replay {
     /// # Errors
     /// Fails if the text is no trace, or one of another scene.
     pub fn read(&mut self, trace: &str) -> Result<usize> {
-        let (mut begun, mut rows) = (0, 0);
+        let mut begun = 0;
+        let mut rows = 0;
         let lines = trace.lines().enumerate().skip(1).filter(|(_, line)| !line.is_empty());
         for (number, line) in lines {
             let what = || format!("line {}", number + 1);
@@ -105,7 +108,8 @@ impl Replay {
     /// Fails if there are no episodes.
     pub fn page(mut self, about: &About) -> Result<Page> {
         ensure!(!self.episodes.is_empty(), "it has no records of an episode");
-        let (mut rows, mut episodes) = (Vec::new(), Vec::new());
+        let mut rows = Vec::new();
+        let mut episodes = Vec::new();
         for Recorded { rows: own, end } in self.episodes.into_values() {
             let end = match end {
                 Some("diverged") => "the physics diverged",

@@ -159,7 +159,8 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
     shown.with_name(goal).with_pos(compiled.body_pos()[object]).with_mocap(true);
     for geom in 0..compiled.ngeom() as usize {
         let Some((mut pos, mut quat)) = geom_within(compiled, &frames, geom) else { continue };
-        let (kind, mut mesh_name) = (compiled.geom_type()[geom], "");
+        let kind = compiled.geom_type()[geom];
+        let mut mesh_name = "";
         if matches!(kind, MjtGeomBase::mjGEOM_MESH | MjtGeomBase::mjGEOM_SDF) {
             // MuJoCo has moved the vertices of the mesh to its centre, and its geoms with them. It will do so with this one.
             let mesh = compiled.geom_dataid()[geom] as usize;
@@ -168,7 +169,8 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
-        let (size, group) = (compiled.geom_size()[geom], compiled.geom_group()[geom]);
+        let size = compiled.geom_size()[geom];
+        let group = compiled.geom_group()[geom];
         let copy = shown.add_geom();
         copy.with_type(kind).with_size(size).with_pos(pos).with_quat(quat).with_meshname(mesh_name).with_group(group);
         copy.with_contype(0).with_conaffinity(0).with_mass(0.0).with_rgba([0.2, 0.8, 0.2, 0.4]);

@@ -130,7 +130,10 @@ impl Scene {
     pub fn drawing(&self, dressed: Option<&str>, from: Option<Camera>) -> Drawing {
         let model = &*self.model;
         let dressed = dressed.filter(|_| model.ffi().nmesh > 0);
-        let (mut geoms, mut meshes, mut parts, mut floor) = (Vec::new(), Vec::new(), BTreeMap::new(), None);
+        let mut geoms = Vec::new();
+        let mut meshes = Vec::new();
+        let mut parts = BTreeMap::new();
+        let mut floor = None;
         for geom in 0..model.ngeom() as usize {
             if floor.is_none() && is_floor(model, geom) {
                 floor = Some(model.geom_pos()[geom][2]);
@@ -238,7 +241,9 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     let [first, points, normals] =
         [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
-    let (mut places, mut parts) = (BTreeMap::new(), vec![DrawnMesh::default()]);
+    let mut places = BTreeMap::new();
+    let mut parts = vec![DrawnMesh::default()];
+
     for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
         if parts.last().is_some_and(|part| part.corners.len() + 3 > MOST_CORNERS) {
             parts.push(DrawnMesh::default());

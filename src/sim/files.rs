@@ -10,7 +10,10 @@ use crate::os::read_bytes;
 pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     let folder_of = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
     let top = folder_of(scene);
-    let (mut files, mut folders, mut names) = (vec![scene.to_owned()], BTreeSet::new(), BTreeSet::new());
+    let mut files = vec![scene.to_owned()];
+    let mut folders = BTreeSet::new();
+    let mut names = BTreeSet::new();
+
     let mut known = BTreeSet::from([scene.to_owned()]);
     let mut done = 0;
     while done < files.len() {

@@ -41,11 +41,13 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         });
         if model.geom_type()[geom] == MjtGeomBase::mjGEOM_MESH {
             let mesh = model.geom_dataid()[geom] as usize;
-            let (first, count) = (model.mesh_vertadr()[mesh] as usize, model.mesh_vertnum()[mesh] as usize);
+            let first = model.mesh_vertadr()[mesh] as usize;
+            let count = model.mesh_vertnum()[mesh] as usize;
             take(&[&&model.mesh_vert()[first..first + count]]);
         } else if model.geom_type()[geom] == MjtGeomBase::mjGEOM_HFIELD {
             let field = model.geom_dataid()[geom] as usize;
-            let (first, count) = (model.hfield_adr()[field], model.hfield_nrow()[field] * model.hfield_ncol()[field]);
+            let first = model.hfield_adr()[field];
+            let count = model.hfield_nrow()[field] * model.hfield_ncol()[field];
             take(&[&model.hfield_size()[field], &&model.hfield_data()[first as usize..(first + count) as usize]]);
         }
     }
@@ -59,7 +61,10 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         eq_type eq_obj1id eq_obj2id eq_active0 eq_data eq_solref eq_solimp exclude_signature
         pair_signature pair_dim pair_friction pair_solref pair_margin pair_gap
     });
-    let (none, solref, solimp) = ([0.0; 2], [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]);
+    let none = [0.0; 2];
+    let solref = [0.02, 1.0];
+    let solimp = [0.9, 0.95, 0.001, 0.5, 2.0];
+
     let unusual = unusual! { model:
         actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
         tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,

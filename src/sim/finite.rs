@@ -48,13 +48,18 @@ const DERIVED: [&str; 5] = ["body_subtreemass", "dof_length", "geom_aabb", "geom
 
 /// Returns the first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
 fn first_in(text: &str) -> Option<(String, String)> {
-    let (mut heading, mut name, mut derived) = ("", None, None);
+    let mut heading = "";
+    let mut name = None;
+    let mut derived = None;
+
     for line in text.lines() {
         let mut words = line.split_whitespace();
-        let (first, indented) = (words.next().unwrap_or_default(), line.starts_with(' '));
+        let first = words.next().unwrap_or_default();
+        let indented = line.starts_with(' ');
         let mut odd = || words.any(|word| ["nan", "inf"].contains(&word.trim_start_matches('-')));
         if !indented && (line.ends_with(':') || line == first) {
-            (heading, name) = (line.trim_end_matches(':'), None);
+            heading = line.trim_end_matches(':');
+            name = None;
         } else if let Some(named) = line.strip_prefix("  name ") {
             name = Some(named.trim());
         } else if heading != "STATISTIC" && odd() {

@@ -8,6 +8,7 @@ use anyhow::{Result, anyhow};
 use mujoco_rs::mujoco_c::{mjtBuiltin as MjtBuiltin, mjtLightType as MjtLightType};
 use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::SpecItem;
+use mujoco_rs::wrappers::mj_editing::MjsBody;
 use mujoco_rs::wrappers::mj_model::MjtTexture;
 
 use super::compilation::{Compilation, VISUAL};
@@ -55,26 +56,33 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
     }
     for (name, half, opacity) in boxes {
         let body = spec.body_mut(name).ok_or_else(|| anyhow!("there is no body {name}"))?;
-        for (face, [red, green, blue]) in FACES.into_iter().enumerate() {
-            let (axis, sign) = (face / 2, if face % 2 == 0 { 1.0 } else { -1.0 });
-            let (mut size, mut position) = (half.map(|half| 0.88 * half), [0.0; 3]);
-            size[axis] = PLATE * half[axis];
-            position[axis] = sign * half[axis];
-            body.add_geom()
-                .with_type(MjtGeomBase::mjGEOM_BOX)
-                .with_size(size)
-                .with_pos(position)
-                .with_rgba([red, green, blue, opacity])
-                .with_group(VISUAL)
-                .with_contype(0)
-                .with_conaffinity(0)
-                // Regardless of the defaults of its class.
-                .with_quat([1.0, 0.0, 0.0, 0.0])
-                .with_mass(0.0)
-                .with_density(0.0);
-        }
+        add_plates(body, half, opacity);
     }
     spec.compile().map(Some).map_err(|error| anyhow!("{error}"))
+}
+
+/// Adds a coloured plate to each face of a box with these half sizes.
+fn add_plates(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
+    for (face, [red, green, blue]) in FACES.into_iter().enumerate() {
+        let axis = face / 2;
+        let sign = if face % 2 == 0 { 1.0 } else { -1.0 };
+        let mut size = half.map(|half| 0.88 * half);
+        let mut position = [0.0; 3];
+        size[axis] = PLATE * half[axis];
+        position[axis] = sign * half[axis];
+        body.add_geom()
+            .with_type(MjtGeomBase::mjGEOM_BOX)
+            .with_size(size)
+            .with_pos(position)
+            .with_rgba([red, green, blue, opacity])
+            .with_group(VISUAL)
+            .with_contype(0)
+            .with_conaffinity(0)
+            // Regardless of the defaults of its class.
+            .with_quat([1.0, 0.0, 0.0, 0.0])
+            .with_mass(0.0)
+            .with_density(0.0);
+    }
 }
 
 /// Returns the half sizes (m) of a body that is one box in the middle of its frame, without a material.

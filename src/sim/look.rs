@@ -76,13 +76,15 @@ impl Look {
     pub(super) fn set_up(&self, model: &mut MjModel) {
         if let Some(camera) = self.camera {
             let global = &mut model.vis_mut().global;
-            (global.azimuth, global.elevation) = (camera.azimuth as f32, camera.elevation as f32);
+            global.azimuth = camera.azimuth as f32;
+            global.elevation = camera.elevation as f32;
             // MuJoCo's free camera starts 1.5 extents away.
             model.stat_mut().extent = camera.distance / 1.5;
         }
         let [width, height] = self.size.map(|pixels| pixels as i32);
         let visual = model.vis_mut();
-        (visual.global.offwidth, visual.global.offheight) = (width, height);
+        visual.global.offwidth = width;
+        visual.global.offheight = height;
         if self.quality == Quality::Fast {
             visual.quality.offsamples = 0;
             model.light_castshadow_mut().fill(false);

@@ -213,7 +213,8 @@ impl egui::Plugin for CloseLeftPanel {
         let Some(panel) = PanelState::load(context, egui::Id::new("interface_panel")) else { return };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
-        let (button, modifiers) = (egui::PointerButton::Primary, egui::Modifiers::NONE);
+        let button = egui::PointerButton::Primary;
+        let modifiers = egui::Modifiers::NONE;
         let press = |pos, pressed| Event::PointerButton { pos, button, pressed, modifiers };
         let moved = Event::PointerMoved;
         let drag = [moved(edge), press(edge, true), moved(side), press(side, false), Event::PointerGone];

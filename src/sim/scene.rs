@@ -133,7 +133,8 @@ impl Scene {
     pub fn set_look(&mut self, look: &Look, nominal: &Self) {
         let model = Arc::get_mut(&mut self.model).expect("a new scene is not shared");
         // MuJoCo computes these anew with masses, but the picture stays as it is.
-        (model.stat_mut().center, model.stat_mut().extent) = (nominal.model.stat().center, nominal.model.stat().extent);
+        model.stat_mut().center = nominal.model.stat().center;
+        model.stat_mut().extent = nominal.model.stat().extent;
         look.set_up(model);
     }
 
@@ -176,7 +177,8 @@ impl Scene {
     /// Fails if there is no such joint, it is not a hinge, or it has no limits.
     pub fn hinge(&self, name: &str) -> Result<Hinge> {
         let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
-        let (name, kind) = (shortened(name), self.model.jnt_type()[id]);
+        let name = shortened(name);
+        let kind = self.model.jnt_type()[id];
         ensure!(kind == MjtJoint::mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
         ensure!(self.model.jnt_limited()[id], "joint `{name}` must have a range");
         Ok(Hinge {
@@ -278,7 +280,8 @@ impl Scene {
     /// Fails if there is no such actuator, or if it is of another kind.
     pub fn servo(&self, name: &str) -> Result<Actuator> {
         let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
-        let (name, group) = (shortened(name), self.model.actuator_group()[id]);
+        let name = shortened(name);
+        let group = self.model.actuator_group()[id];
         let is_servo = self.is_position_servo(id);
         ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
         let is_disabled = (0..31).contains(&group) && self.model.opt().disableactuator >> group & 1 == 1;

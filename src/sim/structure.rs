@@ -31,6 +31,32 @@ const NO_OBJECT: &str = "has no body with a free joint that the hand could turn;
                          <body name=\"cube\" pos=\"X Y Z\"><freejoint/><geom type=\"box\" size=\".025 .025 .025\" \
                          mass=\".028\" friction=\"1.2\"/></body> to <worldbody>";
 
+/// Takes the only one that was `found` for a part that is not named, or says what is wrong: `none` if there is none, or what there
+/// are several of.
+fn settle(
+    part: &mut String,
+    found: &[Result<String, String>],
+    none: Option<&str>,
+    what: &str,
+    setting: &str,
+) -> Option<String> {
+    if !part.is_empty() {
+        return None;
+    }
+    match found {
+        [Ok(only)] => {
+            part.clone_from(only);
+            None
+        }
+        [Err(problem)] => Some(problem.clone()),
+        [] => none.map(str::to_owned),
+        several => {
+            let names: Vec<String> = several.iter().flatten().map(|name| format!("`{}`", shortened(name))).collect();
+            Some(format!("has several {what}, {}: name one by {setting}", names.join(", ")))
+        }
+    }
+}
+
 impl Scene {
     /// Returns `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
     /// limited hinges of the trees that they move. The fingertips are the last bodies of these trees. The object is the only
@@ -39,7 +65,8 @@ impl Scene {
     /// # Errors
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
     pub fn find_parts(&self, named: &Parts) -> Result<Parts> {
-        let (mut parts, mut problems) = (named.clone(), Vec::new());
+        let mut parts = named.clone();
+        let mut problems = Vec::new();
         if parts.actuators.is_empty() {
             parts.actuators = self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut problems);
         }
@@ -71,22 +98,8 @@ impl Scene {
         let free = others(&|body| self.free_joint(body).is_some());
         let held = self.trees_of_constraints();
         let goals = others(&|body| self.model.body_mocapid()[body] >= 0 && !held.contains(&body));
-        for (found, part, none, what, setting) in [
-            (free, &mut parts.object, Some(NO_OBJECT), "bodies with a free joint", "hand.object"),
-            (goals, &mut parts.goal, None, "mocap bodies", "hand.goal"),
-        ] {
-            match (part.is_empty(), &found[..]) {
-                (false, _) => {}
-                (true, [Ok(only)]) => part.clone_from(only),
-                (true, [Err(problem)]) => problems.push(problem.clone()),
-                (true, []) => problems.extend(none.map(str::to_owned)),
-                (true, several) => {
-                    let names: Vec<String> =
-                        several.iter().flatten().map(|name| format!("`{}`", shortened(name))).collect();
-                    problems.push(format!("has several {what}, {}: name one by {setting}", names.join(", ")));
-                }
-            }
-        }
+        problems.extend(settle(&mut parts.object, &free, Some(NO_OBJECT), "bodies with a free joint", "hand.object"));
+        problems.extend(settle(&mut parts.goal, &goals, None, "mocap bodies", "hand.goal"));
         if !problems.is_empty() {
             bail!(problems.join("; "));
         }
@@ -109,7 +122,8 @@ impl Scene {
     /// Returns the bodies that one of these hinges moves and that carry no other body.
     fn last_bodies(&self, hinges: &[usize]) -> Vec<usize> {
         let count = self.model.nbody() as usize;
-        let (mut moved, mut carries) = (vec![false; count], vec![false; count]);
+        let mut moved = vec![false; count];
+        let mut carries = vec![false; count];
         hinges.iter().for_each(|&joint| moved[self.model.jnt_bodyid()[joint] as usize] = true);
         // Every body has a higher number than its parent.
         for body in 1..count {

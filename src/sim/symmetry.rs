@@ -47,14 +47,17 @@ impl Scene {
 
     /// Returns the axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
     pub fn round_axes(&self, body: Body) -> String {
-        let (form, (sin, cos)) = (self.form(body), 0.5_f64.sin_cos());
+        let form = self.form(body);
+        let (sin, cos) = 0.5_f64.sin_cos();
         let turns = [('x', [cos, sin, 0.0, 0.0]), ('y', [cos, 0.0, sin, 0.0]), ('z', [cos, 0.0, 0.0, sin])];
         turns.into_iter().filter(|&(_, turn)| form.holds(turn)).map(|(axis, _)| axis).collect()
     }
 
     fn form(&self, Body(top): Body) -> Form {
-        let (model, frames) = (&self.model, frames_within(&self.model, top));
-        let (mut inertia, mut moves) = (Inertia::default(), false);
+        let model = &self.model;
+        let frames = frames_within(model, top);
+        let mut inertia = Inertia::default();
+        let mut moves = false;
         for (body, frame) in frames.iter().enumerate() {
             if let Some(frame) = *frame {
                 inertia.add(model, body, frame);
@@ -63,7 +66,9 @@ impl Scene {
         }
         let shape = |geom: usize| {
             let (position, orientation) = geom_within(model, &frames, geom)?;
-            let (kind, data, size) = (model.geom_type()[geom], model.geom_dataid()[geom], model.geom_size()[geom]);
+            let kind = model.geom_type()[geom];
+            let data = model.geom_dataid()[geom];
+            let size = model.geom_size()[geom];
             touches(model, geom).then_some(Shape { kind, data, size, position, orientation })
         };
         Form { shapes: (0..model.ngeom() as usize).filter_map(shape).collect(), inertia, moves }
@@ -130,9 +135,11 @@ impl Shape {
 
 impl Inertia {
     fn add(&mut self, model: &MjModel, body: usize, frame: Placed) {
-        let (mass, principal) = (model.body_mass()[body], model.body_inertia()[body]);
+        let mass = model.body_mass()[body];
+        let principal = model.body_inertia()[body];
         let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
-        let (axes, square) = (matrix(axes), centre.iter().map(|x| x * x).sum::<f64>());
+        let axes = matrix(axes);
+        let square = centre.iter().map(|x| x * x).sum::<f64>();
         for i in 0..3 {
             self.first[i] += mass * centre[i];
             for j in 0..3 {
@@ -145,7 +152,8 @@ impl Inertia {
 
     /// Returns whether the rotation leaves it as it is.
     fn is_kept(&self, turn: Quat) -> bool {
-        let (rotation, second) = (matrix(turn), &self.second);
+        let rotation = matrix(turn);
+        let second = &self.second;
         let turned = [0, 1, 2].map(|i| {
             [0, 1, 2].map(|j| -> f64 {
                 let terms = (0..9).map(|at| rotation[i][at / 3] * second[at / 3][at % 3] * rotation[j][at % 3]);
@@ -153,7 +161,8 @@ impl Inertia {
             })
         });
         let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
-        let (first, second) = (quat::rotate(turn, self.first), second.as_flattened());
+        let first = quat::rotate(turn, self.first);
+        let second = second.as_flattened();
         // A centre of mass that is off by a rounding error does not count.
         let mass_times_length = largest(&self.first).max(1e-9);
         alike(&first, &self.first, mass_times_length) && alike(turned.as_flattened(), second, largest(second))

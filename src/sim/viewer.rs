@@ -53,7 +53,8 @@ impl Viewer {
         let data = &mut simulation.data;
         // A mocap body that was moved after the step (the next goal) is not at its new pose yet.
         data.step1();
-        let (time, goals) = (data.time(), data.mocap_quat().to_vec());
+        let time = data.time();
+        let goals = data.mocap_quat().to_vec();
         self.viewer.sync_data(data);
         // The window's own reset restores the model's defaults without the task's knowledge.
         let was_reset = data.time() < time || data.mocap_quat() != goals;
@@ -63,7 +64,9 @@ impl Viewer {
         self.viewer.render().map_err(|error| described(&error))?;
         let controls = &mut self.panel.borrow_mut().controls;
         let asked = Controls { reset: controls.reset | was_reset, ..*controls };
-        (controls.steps, controls.reset, controls.new_goal) = (0, false, false);
+        controls.steps = 0;
+        controls.reset = false;
+        controls.new_goal = false;
         Ok(asked)
     }
 }

@@ -1,6 +1,6 @@
 //! Text in the corner of a picture, on a darkened background.
 
-use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
+use ab_glyph::{Font, FontRef, OutlinedGlyph, PxScale, ScaleFont, point};
 
 /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
 pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
@@ -9,7 +9,9 @@ pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     let [width, height] = size.map(|pixels| pixels as usize);
     let scale = PxScale::from((height as f32 / 28.0).max(11.0));
     let scaled = font.as_scaled(scale);
-    let (advance, spacing) = (scaled.h_advance(scaled.glyph_id('0')), (scaled.height() * 1.15).ceil());
+    let advance = scaled.h_advance(scaled.glyph_id('0'));
+    let spacing = (scaled.height() * 1.15).ceil();
+
     let margin = (0.6 * scaled.height()).ceil();
     let longest = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
     let [across, down] = [longest as f32 * advance + 2.0 * margin, lines.len() as f32 * spacing + margin];
@@ -21,22 +23,25 @@ pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
         let baseline = 0.5 * margin + i as f32 * spacing + scaled.ascent();
         for (column, letter) in line.chars().enumerate() {
             let place = point(margin + column as f32 * advance, baseline);
-            let Some(outline) = font.outline_glyph(scaled.glyph_id(letter).with_scale_and_position(scale, place))
-            else {
-                continue;
-            };
-            let corner = outline.px_bounds().min;
-            outline.draw(|x, y, cover| {
-                let (x, y) = (corner.x as i64 + i64::from(x), corner.y as i64 + i64::from(y));
-                if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
-                    let at = 3 * (y as usize * width + x as usize);
-                    let cover = cover.clamp(0.0, 1.0);
-                    let channels = &mut rgb[at..at + 3];
-                    channels.iter_mut().for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
-                }
-            });
+            if let Some(outline) = font.outline_glyph(scaled.glyph_id(letter).with_scale_and_position(scale, place)) {
+                draw_letter(rgb, [width, height], &outline);
+            }
         }
     }
+}
+
+fn draw_letter(rgb: &mut [u8], [width, height]: [usize; 2], outline: &OutlinedGlyph) {
+    let corner = outline.px_bounds().min;
+    outline.draw(|x, y, cover| {
+        let x = corner.x as i64 + i64::from(x);
+        let y = corner.y as i64 + i64::from(y);
+        if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
+            let at = 3 * (y as usize * width + x as usize);
+            let cover = cover.clamp(0.0, 1.0);
+            let channels = &mut rgb[at..at + 3];
+            channels.iter_mut().for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
+        }
+    });
 }
 
 #[cfg(test)]
