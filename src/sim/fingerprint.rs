@@ -30,27 +30,7 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         jnt_actfrclimited jnt_actfrcrange jnt_actgravcomp
         dof_armature dof_damping dof_frictionloss dof_solref dof_solimp
     });
-    for geom in 0..model.ngeom() as usize {
-        let is_paired = model.pair_geom1().iter().chain(model.pair_geom2()).any(|&paired| paired as usize == geom);
-        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 && !is_paired {
-            continue;
-        }
-        take(arrays! { model[geom]:
-            geom_type geom_bodyid geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim geom_priority
-            geom_friction geom_solmix geom_solref geom_solimp geom_margin geom_gap geom_fluid
-        });
-        if model.geom_type()[geom] == MjtGeomBase::mjGEOM_MESH {
-            let mesh = model.geom_dataid()[geom] as usize;
-            let first = model.mesh_vertadr()[mesh] as usize;
-            let count = model.mesh_vertnum()[mesh] as usize;
-            take(&[&&model.mesh_vert()[first..first + count]]);
-        } else if model.geom_type()[geom] == MjtGeomBase::mjGEOM_HFIELD {
-            let field = model.geom_dataid()[geom] as usize;
-            let first = model.hfield_adr()[field];
-            let count = model.hfield_nrow()[field] * model.hfield_ncol()[field];
-            take(&[&model.hfield_size()[field], &&model.hfield_data()[first as usize..(first + count) as usize]]);
-        }
-    }
+    take_geoms(model, &mut take);
     take(arrays! { model:
         site_bodyid site_pos site_quat
         wrap_type wrap_objid wrap_prm tendon_adr tendon_num tendon_limited tendon_range tendon_stiffness tendon_damping
@@ -75,6 +55,31 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
         array.into_iter().for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
     }
     format!("{:08x}", hasher.finalize())
+}
+
+/// Takes the geoms that collide with something, and their meshes and height fields.
+fn take_geoms(model: &MjModel, take: &mut dyn FnMut(&[&dyn Debug])) {
+    for geom in 0..model.ngeom() as usize {
+        let is_paired = model.pair_geom1().iter().chain(model.pair_geom2()).any(|&paired| paired as usize == geom);
+        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 && !is_paired {
+            continue;
+        }
+        take(arrays! { model[geom]:
+            geom_type geom_bodyid geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim geom_priority
+            geom_friction geom_solmix geom_solref geom_solimp geom_margin geom_gap geom_fluid
+        });
+        if model.geom_type()[geom] == MjtGeomBase::mjGEOM_MESH {
+            let mesh = model.geom_dataid()[geom] as usize;
+            let first = model.mesh_vertadr()[mesh] as usize;
+            let count = model.mesh_vertnum()[mesh] as usize;
+            take(&[&&model.mesh_vert()[first..first + count]]);
+        } else if model.geom_type()[geom] == MjtGeomBase::mjGEOM_HFIELD {
+            let field = model.geom_dataid()[geom] as usize;
+            let first = model.hfield_adr()[field];
+            let count = model.hfield_nrow()[field] * model.hfield_ncol()[field];
+            take(&[&model.hfield_size()[field], &&model.hfield_data()[first as usize..(first + count) as usize]]);
+        }
+    }
 }
 
 #[cfg(test)]

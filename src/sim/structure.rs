@@ -70,14 +70,10 @@ impl Scene {
         if parts.actuators.is_empty() {
             parts.actuators = self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut problems);
         }
-        let actuators: Vec<usize> =
-            parts.actuators.iter().filter_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, name)).collect();
-        let trees: BTreeSet<usize> = actuators.iter().flat_map(|&id| self.trees_of(id)).collect();
+        let ids = parts.actuators.iter().filter_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, name));
+        let trees: BTreeSet<usize> = ids.flat_map(|id| self.trees_of(id)).collect();
         let of_hand = |body: usize| trees.contains(&(self.model.body_rootid()[body] as usize));
-        let hinges: Vec<usize> = (0..self.model.njnt() as usize)
-            .filter(|&joint| of_hand(self.model.jnt_bodyid()[joint] as usize))
-            .filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_HINGE && self.model.jnt_limited()[joint])
-            .collect();
+        let hinges = self.limited_hinges(&of_hand);
         if parts.joints.is_empty() {
             parts.joints = self.names(MjtObjBase::mjOBJ_JOINT, hinges.iter().copied(), &mut problems);
         }
@@ -91,19 +87,30 @@ impl Scene {
         if parts.fingertips.is_empty() {
             problems.push("has no fingertips; hand.fingertips names them".into());
         }
-        let others = |is_sought: &dyn Fn(usize) -> bool| -> Vec<Result<String, String>> {
-            let found = (1..self.model.nbody() as usize).filter(|&body| !of_hand(body) && is_sought(body));
-            found.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
-        };
-        let free = others(&|body| self.free_joint(body).is_some());
+        let free = self.bodies(&|body| !of_hand(body) && self.free_joint(body).is_some());
         let held = self.trees_of_constraints();
-        let goals = others(&|body| self.model.body_mocapid()[body] >= 0 && !held.contains(&body));
+        let is_mocap = |body: usize| self.model.body_mocapid()[body] >= 0;
+        let goals = self.bodies(&|body| !of_hand(body) && is_mocap(body) && !held.contains(&body));
         problems.extend(settle(&mut parts.object, &free, Some(NO_OBJECT), "bodies with a free joint", "hand.object"));
         problems.extend(settle(&mut parts.goal, &goals, None, "mocap bodies", "hand.goal"));
         if !problems.is_empty() {
             bail!(problems.join("; "));
         }
         Ok(parts)
+    }
+
+    /// The names of the bodies that are `sought`, or what is wrong with a name.
+    fn bodies(&self, sought: &dyn Fn(usize) -> bool) -> Vec<Result<String, String>> {
+        let bodies = (1..self.model.nbody() as usize).filter(|&body| sought(body));
+        bodies.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
+    }
+
+    /// The limited hinges of the bodies that are `sought`.
+    fn limited_hinges(&self, sought: &dyn Fn(usize) -> bool) -> Vec<usize> {
+        let model = &self.model;
+        let hinge = |joint: usize| model.jnt_type()[joint] == MjtJoint::mjJNT_HINGE && model.jnt_limited()[joint];
+        let joints = 0..model.njnt() as usize;
+        joints.filter(|&joint| sought(model.jnt_bodyid()[joint] as usize) && hinge(joint)).collect()
     }
 
     /// Returns the first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.

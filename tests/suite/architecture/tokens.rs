@@ -20,10 +20,6 @@ const LONGER_FILES: &[&str] = &["repose/environment.rs"];
 const LONGER_FUNCTIONS: &[&str] = &[
     "config/overlay.rs: typed",
     "config/rules.rs: violations",
-    "draw/bar_chart.rs: draw",
-    "draw/film/caption.rs: draw",
-    "draw/film/mp4.rs: encode",
-    "evaluate.rs: play_lanes",
     "export/graph.rs: policy_graph",
     "export/graph.rs: canonicalize",
     "export/mod.rs: metadata",
@@ -33,14 +29,9 @@ const LONGER_FUNCTIONS: &[&str] = &[
     "play/mod.rs: play_unseen",
     "plot.rs: plot",
     "plot.rs: runs",
-    "repose/environment.rs: step",
     "repose/environment.rs: restore",
-    "repose/task.rs: new",
     "robustness.rs: robustness",
     "run/table.rs: read_metrics",
-    "sim/fingerprint.rs: fingerprint",
-    "sim/furnish.rs: furnished",
-    "sim/structure.rs: find_parts",
 ];
 
 /// The statements that set several variables from values written side by side. The number only shrinks.
