@@ -12,7 +12,8 @@ use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os;
-use crate::repose::Task;
+use crate::ppo::Checkpoint;
+use crate::repose::{Hand, Task};
 use crate::run;
 use graph::policy_graph;
 
@@ -46,18 +47,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
     let config = task.config();
     let hand = task.hand();
-
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
     let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
     let parts = &hand.parts;
     let groups = &hand.layout.groups;
-    let progress = &loaded.checkpoint.progress;
-
-    let kind = match hand.side() {
-        Some("rh_") => "right Shadow Hand",
-        Some("lh_") => "left Shadow Hand",
-        _ => "own hand",
-    };
     let mut facts = vec![
         ("action_offset", offsets.clone()),
         ("action_scale", list(ranges().map(|[low, high]| (high - low) / 2.0))),
@@ -69,7 +62,7 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("ema_alpha", config.act_moving_average.at(0).to_string()),
         ("fingertip_names", list(&parts.fingertips)),
         ("goal_name", parts.goal.clone()),
-        ("hand", format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())),
+        ("hand", described(hand)),
         ("hinge_names", list(&parts.joints)),
         ("joint_names", list(&parts.actuators)),
         ("object_name", parts.object.clone()),
@@ -80,12 +73,26 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
-    if progress.env_steps > 0 {
-        facts.push(("env_steps", progress.env_steps.to_string()));
-    }
-    facts.extend(progress.best.map(|best| ("goals_per_episode", best.goals.to_string())));
-    facts.extend(loaded.checkpoint.provenance.clone().map(|text| ("provenance", text)));
+    facts.extend(history(&loaded.checkpoint));
     facts
+}
+
+/// What is known of how the policy was trained.
+fn history(checkpoint: &Checkpoint) -> impl Iterator<Item = (&'static str, String)> {
+    let steps = Some(checkpoint.progress.env_steps).filter(|steps| *steps > 0);
+    let steps = steps.map(|steps| ("env_steps", steps.to_string()));
+    let best = checkpoint.progress.best.map(|best| ("goals_per_episode", best.goals.to_string()));
+    let provenance = checkpoint.provenance.clone().map(|text| ("provenance", text));
+    [steps, best, provenance].into_iter().flatten()
+}
+
+fn described(hand: &Hand) -> String {
+    let kind = match hand.side() {
+        Some("rh_") => "right Shadow Hand",
+        Some("lh_") => "left Shadow Hand",
+        _ => "own hand",
+    };
+    format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())
 }
 
 /// Returns all settings of the training as TOML, with the task as it is exported.

@@ -20,9 +20,6 @@ const LONGER_FILES: &[&str] = &["repose/environment.rs"];
 const LONGER_FUNCTIONS: &[&str] = &[
     "config/overlay.rs: typed",
     "config/rules.rs: violations",
-    "export/graph.rs: policy_graph",
-    "export/graph.rs: canonicalize",
-    "export/mod.rs: metadata",
     "play/browser.rs: live",
     "play/browser.rs: from_trace",
     "play/mod.rs: play",
