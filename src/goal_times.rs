@@ -61,7 +61,7 @@ impl GoalTimes {
         }
     }
 
-    /// Returns three values, each null where unknown. `steps_to_goal` holds mean and percentiles, in control steps including
+    /// Three values, each null where unknown. `steps_to_goal` holds mean and percentiles, in control steps including
     /// the hold. `drops_first_second` is a fraction of the episodes. `steps_fit` is the line of the steps without the hold over
     /// the angle: its offset, and its slope in steps per rad.
     pub fn named(&self) -> [(&'static str, Value); 3] {
@@ -83,7 +83,7 @@ impl GoalTimes {
     }
 }
 
-/// Returns the value below which the `fraction` of the `sorted` values lies, interpolated linearly.
+/// The value below which the `fraction` of the `sorted` values lies, interpolated linearly.
 fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     let place = fraction * sorted.len().saturating_sub(1) as f64;
     let below = place as usize;

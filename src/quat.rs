@@ -23,12 +23,12 @@ pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
     [H, H, -H, -H], [H, -H, H, -H], [H, -H, -H, H], [H, -H, -H, -H],
 ];
 
-/// Returns a set of the rotations of a cube, given by their numbers, as bits.
+/// A set of the rotations of a cube, given by their numbers, as bits.
 pub fn mask(rotations: &[usize]) -> u32 {
     rotations.iter().fold(0, |mask, rotation| mask | 1 << rotation)
 }
 
-/// Returns the Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
+/// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
 pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     [aw, ax, ay, az]: [T; 4],
     [bw, bx, by, bz]: [T; 4],
@@ -41,35 +41,35 @@ pub fn mul<T: Copy + Mul<Output = T> + Add<Output = T> + Sub<Output = T>>(
     ]
 }
 
-/// Returns the inverse rotation.
+/// The inverse rotation.
 pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
 }
 
-/// Returns `q` with length 1.
+/// `q` with length 1.
 pub fn normalized(q: Quat) -> Quat {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     q.map(|x| x / length)
 }
 
-/// Returns `v` rotated by `q`.
+/// `v` rotated by `q`.
 pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
     let [_, x, y, z] = mul(mul(q, [0.0, x, y, z]), conj(q));
     [x, y, z]
 }
 
-/// Returns `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
+/// `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
 pub fn canonical(q: Quat) -> Quat {
     if q[0] < 0.0 { q.map(|x| -x) } else { q }
 }
 
-/// Returns the angle in rad, 0 to π, of the rotation that takes `b` to `a`.
+/// The angle in rad, 0 to π, of the rotation that takes `b` to `a`.
 pub fn angle_between(a: Quat, b: Quat) -> f64 {
     let [_, x, y, z] = mul(a, conj(b));
     2.0 * (x * x + y * y + z * z).sqrt().min(1.0).asin()
 }
 
-/// Returns the axis of a rotation times its angle in rad, which is at most π.
+/// The axis of a rotation times its angle in rad, which is at most π.
 pub fn rotation_vector(q: Quat) -> [f64; 3] {
     let [w, axis @ ..] = canonical(q);
     let sine = axis.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -77,7 +77,7 @@ pub fn rotation_vector(q: Quat) -> [f64; 3] {
     axis.map(|x| factor * x)
 }
 
-/// Returns a uniformly distributed rotation, given three uniform numbers in [0, 1).
+/// A uniformly distributed rotation, given three uniform numbers in [0, 1).
 ///
 /// K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {

@@ -51,7 +51,7 @@ const OTHERS: [(&str, &str, &str); 21] = [
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];
 
-/// Returns the quantity with this name, if a training logs it.
+/// The quantity with this name, if a training logs it.
 pub fn tag(name: &str) -> Option<Tag> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {

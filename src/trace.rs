@@ -74,7 +74,7 @@ impl Trace {
         }
     }
 
-    /// Returns the whole text.
+    /// The whole text.
     pub fn finish(self) -> String {
         let lines = std::iter::once(self.header.to_string()).chain(self.episodes.into_iter().flatten());
         lines.map(|line| line + "\n").collect()
@@ -124,7 +124,7 @@ fn entries(matrix: &[f32], size: usize) -> Value {
     entries.map(|(i, value)| json!([i / size, i % size, value])).collect()
 }
 
-/// Returns floats as doubles, so that a reader gets exactly the same values.
+/// Floats as doubles, so that a reader gets exactly the same values.
 fn doubles(values: &[f32]) -> Value {
     values.iter().map(|&x| json!(f64::from(x))).collect()
 }

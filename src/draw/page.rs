@@ -49,12 +49,12 @@ pub struct Page {
 }
 
 impl Page {
-    /// Returns the key of a page, which is different for another scene or other columns.
+    /// The key of a page, which is different for another scene or other columns.
     pub fn key(&self) -> String {
         BASE64_STANDARD.encode(&Sha256::digest(format!("{}{}", self.meta, self.scene))[..12])
     }
 
-    /// Returns the page as text. A live page has no rows, and reads them from its server.
+    /// The page as text. A live page has no rows, and reads them from its server.
     pub fn html(mut self) -> String {
         let is_live = self.meta["live"] == true;
         if is_live {
@@ -94,7 +94,7 @@ impl Page {
     }
 }
 
-/// Returns text without indents, empty lines and lines of comment.
+/// Text without indents, empty lines and lines of comment.
 fn lean(text: &str) -> String {
     let lines = text
         .lines()
@@ -103,7 +103,7 @@ fn lean(text: &str) -> String {
     lines.map(|line| format!("{line}\n")).collect()
 }
 
-/// Returns the hash by which a content security policy names a text.
+/// The hash by which a content security policy names a text.
 fn hash(text: &str) -> String {
     format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(text)))
 }
@@ -126,7 +126,7 @@ fn table(rows: usize, columns: usize, value: impl Fn(usize, usize) -> i64) -> Ve
     [low, high].concat()
 }
 
-/// Returns the factor of each column, and the rows as a table of integers.
+/// The factor of each column, and the rows as a table of integers.
 fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
     let columns = rows.first().map_or(0, Vec::len);
     let largest = |column: usize| rows.iter().fold(1e-9, |most: f64, row| most.max(row[column].abs()));
@@ -136,7 +136,7 @@ fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
     (scale, packed)
 }
 
-/// Returns the entry of a mesh in the scene, and its bytes: points as a table in its bounding box, normals by axis, corners of
+/// The entry of a mesh in the scene, and its bytes: points as a table in its bounding box, normals by axis, corners of
 /// triangles.
 fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     let bounds = |pick: fn(f32, f32) -> f32, start: f32| {

@@ -6,7 +6,7 @@ use crate::config::Activation;
 use crate::ppo::{CLIP, InputTransform, Policy};
 use crate::spaces::{ObjectAndGoal, Spaces};
 
-/// Returns the graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
+/// The graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
 ///
 /// Before anything else, observations are multiplied from the right by a `mirror` `[O, O]`, if there is one.
 pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {

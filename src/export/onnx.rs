@@ -67,7 +67,7 @@ impl Graph {
         self.0 = std::mem::take(&mut self.0).message(field, part);
     }
 
-    /// Returns the bytes of a file with this graph and texts about it, which are sorted by key.
+    /// The bytes of a file with this graph and texts about it, which are sorted by key.
     pub(super) fn file(&self, mut metadata: Vec<(&str, String)>) -> Vec<u8> {
         metadata.sort();
         let model = Message::default()

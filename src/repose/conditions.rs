@@ -28,7 +28,7 @@ impl Conditions {
         Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, twisted: false, bias: Vec::new() }
     }
 
-    /// Returns the scene of the episodes that are not randomised.
+    /// The scene of the episodes that are not randomised.
     pub(super) fn nominal<'a>(&'a self, task: &'a Task) -> &'a Scene {
         self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
     }
@@ -51,17 +51,17 @@ impl Conditions {
         }
     }
 
-    /// Returns what the episode has drawn, if it is randomised.
+    /// What the episode has drawn, if it is randomised.
     pub(super) fn draw(&self) -> Option<&EpisodePhysics> {
         self.draw.as_ref()
     }
 
-    /// Returns the control steps between an action and its effect.
+    /// The control steps between an action and its effect.
     pub(super) fn delay(&self, task: &Task) -> usize {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
     }
 
-    /// Returns the largest delay of any episode.
+    /// The largest delay of any episode.
     pub(super) fn most_delay(&self, task: &Task) -> usize {
         let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.most_delay());
         (task.config.action_delay + drawn) as usize

@@ -19,7 +19,7 @@ pub struct Diverged {
 }
 
 impl Diverged {
-    /// Returns one object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
+    /// One object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
     /// controls of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes,
     /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the object
     /// in each step. In an episode with assistance, `torques` is the torque on the object in each step.
@@ -47,7 +47,7 @@ impl Diverged {
     }
 }
 
-/// Returns a warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
+/// A warning if more than 1 % of the steps diverged: what is learnt or scored then is not the task.
 pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
     (diverged * 100 > steps).then(|| {
         format!(
@@ -119,7 +119,7 @@ impl Recorder {
         tail.torques.extend(torque);
     }
 
-    /// Returns the recorded steps, or `None` before the first step.
+    /// The recorded steps, or `None` before the first step.
     pub(super) fn tail(&self) -> Option<Tail> {
         let mut parts = [&self.before, &self.now].into_iter().flatten().cloned();
         let mut tail = parts.next()?;

@@ -81,47 +81,47 @@ impl Repose {
         &self.last
     }
 
-    /// Returns the goal orientation of the next step.
+    /// The goal orientation of the next step.
     pub fn goal(&self) -> Quat {
         self.goal
     }
 
-    /// Returns the steps within the tolerance that count towards the current goal.
+    /// The steps within the tolerance that count towards the current goal.
     pub fn held(&self) -> u32 {
         self.held
     }
 
-    /// Returns the current rotation error, rad.
+    /// The current rotation error, rad.
     pub fn rot_dist(&self) -> f64 {
         quat::angle_between(self.object().orientation, self.goal)
     }
 
-    /// Returns the physics state.
+    /// The physics state.
     pub fn simulation(&self) -> &Simulation {
         &self.sim
     }
 
-    /// Returns the physics state for modification. Call [`Simulation::refresh`] afterwards.
+    /// The physics state for modification. Call [`Simulation::refresh`] afterwards.
     pub fn simulation_mut(&mut self) -> &mut Simulation {
         &mut self.sim
     }
 
-    /// Returns what this episode has drawn, if it is randomised.
+    /// What this episode has drawn, if it is randomised.
     pub fn draw(&self) -> Option<&EpisodePhysics> {
         self.conditions.draw()
     }
 
-    /// Returns the settings of the task.
+    /// The settings of the task.
     pub fn config(&self) -> &EnvConfig {
         &self.task.config
     }
 
-    /// Returns the sums since the last call.
+    /// The sums since the last call.
     pub fn take_sums(&mut self) -> StepSums {
         std::mem::take(&mut self.sums)
     }
 
-    /// Returns the last episode that has diverged since the last call.
+    /// The last episode that has diverged since the last call.
     pub fn take_diverged(&mut self) -> Option<Diverged> {
         self.diverged.take()
     }
@@ -131,7 +131,7 @@ impl Repose {
         quat::uniform([draw(), draw(), draw()])
     }
 
-    /// Returns the pose of the object.
+    /// The pose of the object.
     pub fn object(&self) -> Pose {
         let at = self.task.hand.object.qpos;
         let q = self.sim.qpos();
@@ -162,7 +162,7 @@ impl Repose {
         }
     }
 
-    /// Returns the velocity of the object, in the world frame.
+    /// The velocity of the object, in the world frame.
     fn object_velocity(&self) -> Velocity {
         let [vx, vy, vz, spin @ ..] =
             self.sim.qvel()[self.task.hand.object.dof..].first_chunk::<6>().expect("a free joint");

@@ -72,12 +72,12 @@ pub struct StepSums {
 }
 
 impl StepSums {
-    /// Returns the mean of each term of the task's reward over the steps, by name.
+    /// The mean of each term of the task's reward over the steps, by name.
     pub fn task_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         self.task.map(|sum| sum / self.steps as f64).named()
     }
 
-    /// Returns the mean of each term that training adds, by name, and the rotation towards the goal in 100 steps, rad.
+    /// The mean of each term that training adds, by name, and the rotation towards the goal in 100 steps, rad.
     pub fn training_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let turned = 100.0 * self.turned / self.steps as f64;
         self.training.map(|sum| sum / self.steps as f64).named().chain([("turned", turned)])

@@ -105,12 +105,12 @@ impl Hand {
         Ok(hand)
     }
 
-    /// Returns where an episode starts the object, before noise, m.
+    /// Where an episode starts the object, before noise, m.
     pub fn place(&self) -> [f64; 3] {
         *self.start[self.object.qpos..].first_chunk().expect("a free joint")
     }
 
-    /// Returns the prefix of its names if it has the names of the Shadow Hand.
+    /// The prefix of its names if it has the names of the Shadow Hand.
     pub fn side(&self) -> Option<&str> {
         let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
         let names = self.parts.joints.iter().map(|name| name.strip_prefix(prefix));
@@ -133,7 +133,7 @@ impl Hand {
     }
 }
 
-/// Returns the parts of a Shadow Hand, if all of its names are there with one prefix.
+/// The parts of a Shadow Hand, if all of its names are there with one prefix.
 fn shadow_hand(scene: &Scene) -> Option<Parts> {
     let joints = scene.joints();
     let actuators = scene.actuators();

@@ -29,7 +29,7 @@ pub struct Lesson {
 }
 
 impl Lesson {
-    /// Returns the lesson that is the task itself, as played and scored.
+    /// The lesson that is the task itself, as played and scored.
     pub fn task(env: &EnvConfig) -> Self {
         Self {
             act_moving_average: env.act_moving_average.at(0),
@@ -44,7 +44,7 @@ impl Lesson {
         }
     }
 
-    /// Returns the lesson after `env_steps` control steps of the whole run.
+    /// The lesson after `env_steps` control steps of the whole run.
     pub fn at(env_steps: u64, config: &Config) -> Self {
         let training = &config.training;
         Self {
@@ -78,22 +78,22 @@ impl Lesson {
         all
     }
 
-    /// Returns the values that change during training, by name.
+    /// The values that change during training, by name.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         self.described().into_iter().map(|(about, value)| (about.0, value))
     }
 
-    /// Returns the descriptions of these values.
+    /// The descriptions of these values.
     pub fn descriptions() -> impl Iterator<Item = Description> {
         Self::default().described().into_iter().map(|(about, _)| about)
     }
 
-    /// Returns the reward that training adds to a step.
+    /// The reward that training adds to a step.
     pub(super) fn reward(&self, step: &Step) -> TrainingReward {
         training_reward(&self.weights, step)
     }
 
-    /// Returns the reward that is learnt from, given the task's reward and what training adds to it.
+    /// The reward that is learnt from, given the task's reward and what training adds to it.
     pub(super) fn total(&self, task: f64, added: &TrainingReward) -> f64 {
         self.task_reward * task + added.total()
     }

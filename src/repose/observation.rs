@@ -54,7 +54,7 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Returns the layout for a hand with this many joints, fingertips and actuators.
+    /// The layout for a hand with this many joints, fingertips and actuators.
     pub fn new(joints: usize, fingertips: usize, actuators: usize) -> Self {
         const NOTHING: &[usize] = &[];
         // Points and velocities change their y, axes their x and z, and so do quaternions.
@@ -88,18 +88,18 @@ impl Layout {
         self.groups.iter().filter(|group| group.sensing == Measured)
     }
 
-    /// Returns the index of the first value of a group, by the group's place in the table.
+    /// The index of the first value of a group, by the group's place in the table.
     pub(super) fn start(&self, group: usize) -> usize {
         self.groups[group].start
     }
 
-    /// Returns the indices of the first values of the fingertips.
+    /// The indices of the first values of the fingertips.
     pub(super) fn tips(&self) -> impl Iterator<Item = usize> {
         let Group { start, length, .. } = self.groups[TIPS];
         (start..start + length).step_by(TIP_SIZE)
     }
 
-    /// Returns the indices of the values that change their sign in the mirror, the plane y = 0 of the world.
+    /// The indices of the values that change their sign in the mirror, the plane y = 0 of the world.
     pub(super) fn mirrored(&self) -> Vec<usize> {
         // No other group in which something changes is longer than one fingertip.
         let of_group = |Group { start, length, mirrored, .. }: Group| {
@@ -109,7 +109,7 @@ impl Layout {
         self.groups.into_iter().flat_map(of_group).collect()
     }
 
-    /// Returns the description of observations and actions for a learner, for an object with these rotations.
+    /// The description of observations and actions for a learner, for an object with these rotations.
     pub fn spaces(&self, rotations: &[usize]) -> Spaces {
         let [object, goal, relative] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
         Spaces {
@@ -121,7 +121,7 @@ impl Layout {
     }
 }
 
-/// Returns the rotation error that an observation shows, rad.
+/// The rotation error that an observation shows, rad.
 fn rotation_error(spaces: &Spaces, observation: &[f32]) -> f32 {
     let places = spaces.object_and_goal.expect("an object and its goal");
     2.0 * observation[places.relative].clamp(0.0, 1.0).acos()

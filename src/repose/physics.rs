@@ -58,7 +58,7 @@ fn none(_: &Hand, _: &[f64]) -> Vec<Change> {
     Vec::new()
 }
 
-/// Returns the changes of each of these parts, given one value for all of them or one for each.
+/// The changes of each of these parts, given one value for all of them or one for each.
 fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
     parts.iter().zip(values.iter().cycle()).map(|(&part, &value)| change(part, value)).collect()
 }
@@ -104,7 +104,7 @@ pub const QUANTITIES: [Quantity; 10] = [
 const OTHERS: [&str; 3] = ["cone", "noise", "bias"];
 
 impl Quantity {
-    /// Returns the number of values in an episode of this hand.
+    /// The number of values in an episode of this hand.
     fn count(&self, hand: &Hand) -> usize {
         match self.law {
             Law::Uniform(_) | Law::Size(_) | Law::Whole(_) => 1,
@@ -143,7 +143,7 @@ impl Quantity {
     }
 }
 
-/// Returns the factors on the lengths of the object that are drawn.
+/// The factors on the lengths of the object that are drawn.
 pub(super) fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
     let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
     if low == high { vec![low] } else { (0..SIZES).map(place).collect() }
@@ -158,12 +158,12 @@ pub(super) fn normal(rng: &mut Rng, std: f64) -> f64 {
 pub struct Physics(Vec<Vec<f64>>);
 
 impl Physics {
-    /// Returns the physics of the scene as it is.
+    /// The physics of the scene as it is.
     pub(super) fn neutral(hand: &Hand) -> Self {
         Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral; quantity.count(hand)]).collect())
     }
 
-    /// Returns the physics that a task sets.
+    /// The physics that a task sets.
     pub(super) fn of_task(config: &EnvConfig) -> Self {
         Self(QUANTITIES.iter().map(|quantity| (quantity.task)(config)).collect())
     }
@@ -173,13 +173,13 @@ impl Physics {
         self.0[place] = values;
     }
 
-    /// Returns what it changes in a scene.
+    /// What it changes in a scene.
     pub(super) fn changes(&self, hand: &Hand) -> Vec<Change> {
         let differ = QUANTITIES.iter().zip(&self.0).filter(|(of, values)| values.iter().any(|x| *x != of.neutral));
         differ.flat_map(|(quantity, values)| (quantity.change)(hand, values)).collect()
     }
 
-    /// Returns the values by name, as a dump reports them.
+    /// The values by name, as a dump reports them.
     pub(super) fn as_json(&self) -> Value {
         let value = |(quantity, values): (&Quantity, &Vec<f64>)| {
             let value = match quantity.law {

@@ -41,7 +41,7 @@ pub struct EpisodePhysics {
 }
 
 impl EpisodePhysics {
-    /// Returns the control steps between an action and its effect, in addition to the delay of the task.
+    /// The control steps between an action and its effect, in addition to the delay of the task.
     pub fn delay(&self) -> u32 {
         self.physics["delay"][0] as u32
     }
@@ -69,12 +69,12 @@ impl Randomization {
         Ok(Some(Arc::new(Self { variants, config, nominal, sizes, noise, bias })))
     }
 
-    /// Returns the scene of the episodes that are not randomised.
+    /// The scene of the episodes that are not randomised.
     pub fn nominal(&self) -> &Scene {
         &self.nominal
     }
 
-    /// Returns the most control steps between an action and its effect, in addition to the delay of the task.
+    /// The most control steps between an action and its effect, in addition to the delay of the task.
     pub fn most_delay(&self) -> u32 {
         self.config.delay[1]
     }
@@ -108,18 +108,18 @@ impl Randomization {
         self.variants.vary(simulation, self.variant(draw), &draw.physics.changes(&task.hand));
     }
 
-    /// Returns a scene with the physics of a draw.
+    /// A scene with the physics of a draw.
     pub fn scene_of(&self, draw: &EpisodePhysics, task: &Task) -> Scene {
         self.variants.scene(self.variant(draw), &draw.physics.changes(&task.hand))
     }
 
-    /// Returns the number of the scene with the size of a draw.
+    /// The number of the scene with the size of a draw.
     fn variant(&self, draw: &EpisodePhysics) -> usize {
         let [size] = draw.physics["cube_size"] else { unreachable!("one factor") };
         self.sizes.iter().position(|other| *other == size).expect("a size that can be drawn, or the nominal one")
     }
 
-    /// Returns the noise on the observations of an episode, if there is any.
+    /// The noise on the observations of an episode, if there is any.
     pub(super) fn noise(&self, draw: &EpisodePhysics) -> Option<&NoiseStd> {
         Some(&self.noise).filter(|_| draw.has_noise)
     }
@@ -130,7 +130,7 @@ impl Randomization {
         if draw.has_bias { drawn } else { Vec::new() }
     }
 
-    /// Returns the force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.
+    /// The force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.
     pub(super) fn push(&self, draw: &EpisodePhysics, rng: &Rng, step: u32) -> Option<[f64; 3]> {
         let std = self.config.push;
         let rng = &mut rng::beside_at(rng, "push", step / self.config.push_steps);

@@ -115,27 +115,27 @@ pub type TaskReward = Terms<0, { TASK.len() }>;
 pub type TrainingReward = Terms<1, { TRAINING.len() }>;
 
 impl<const LIST: usize, const N: usize> Terms<LIST, N> {
-    /// Returns the terms with these values, in order.
+    /// The terms with these values, in order.
     pub fn new(values: [f64; N]) -> Self {
         Self(values)
     }
 
-    /// Returns the descriptions of the terms, in order.
+    /// The descriptions of the terms, in order.
     pub fn descriptions() -> Vec<Description> {
         LISTS[LIST]()
     }
 
-    /// Returns the values, in order.
+    /// The values, in order.
     pub fn values(&self) -> [f64; N] {
         self.0
     }
 
-    /// Returns the values by name.
+    /// The values by name.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> + use<LIST, N> {
         Self::descriptions().into_iter().map(|Description(name, _)| name).zip(self.0)
     }
 
-    /// Returns the sum of the terms.
+    /// The sum of the terms.
     pub fn total(&self) -> f64 {
         self.0.iter().sum()
     }
@@ -182,19 +182,19 @@ impl<'de, const LIST: usize, const N: usize> Deserialize<'de> for Terms<LIST, N>
     }
 }
 
-/// Returns the task's reward of a step.
+/// The task's reward of a step.
 pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
     Terms::new(TASK.each_ref().map(|TaskTerm(_, value)| value(env, step)))
 }
 
-/// Returns the reward that training adds to a step, given the weights of its terms.
+/// The reward that training adds to a step, given the weights of its terms.
 pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
     let mut values = weights.values();
     values.iter_mut().zip(&TRAINING).for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
     Terms::new(values)
 }
 
-/// Returns the weights of the training's terms after `env_steps` control steps of the whole run.
+/// The weights of the training's terms after `env_steps` control steps of the whole run.
 pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
     Terms::new(TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
@@ -202,7 +202,7 @@ pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> Tra
     }))
 }
 
-/// Returns the weights that change in the course of a training, with their descriptions.
+/// The weights that change in the course of a training, with their descriptions.
 pub(super) fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
     TRAINING.iter().zip(weights.values()).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
         Weight::Constant(_) => None,

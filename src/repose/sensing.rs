@@ -34,7 +34,7 @@ impl NoiseStd {
         Ok(Self(layout.groups.into_iter().flat_map(of_group).filter(|&(_, std)| std != 0.0).collect()))
     }
 
-    /// Returns whether nothing is added to any value.
+    /// Whether nothing is added to any value.
     pub(super) fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

@@ -42,17 +42,17 @@ impl Servos {
         self.due.iter_mut().zip(self.under_way.drain(..self.targets.len())).for_each(|(due, target)| *due = target);
     }
 
-    /// Returns the targets that take effect now.
+    /// The targets that take effect now.
     pub(super) fn due(&self) -> &[f64] {
         &self.due
     }
 
-    /// Returns the last targets.
+    /// The last targets.
     pub(super) fn last(&self) -> &[f64] {
         &self.targets
     }
 
-    /// Returns `count` sets of targets: those under way and, in front of them, the oldest one again.
+    /// `count` sets of targets: those under way and, in front of them, the oldest one again.
     pub(super) fn under_way(&self, count: usize) -> impl Iterator<Item = f64> {
         let actuators = self.targets.len();
         let missing = (count * actuators).saturating_sub(self.under_way.len());

@@ -18,7 +18,7 @@ impl Clock {
         Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
     }
 
-    /// Returns the steps since the last call, at this multiple of real time.
+    /// The steps since the last call, at this multiple of real time.
     pub(super) fn steps_due(&mut self, speed: f64) -> u32 {
         let passed = self.last.elapsed().as_secs_f64();
         self.last = Instant::now();

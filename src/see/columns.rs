@@ -59,27 +59,27 @@ impl Columns {
         Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
     }
 
-    /// Returns how many numbers give the poses.
+    /// How many numbers give the poses.
     fn poses(&self) -> usize {
         self.drawing.start.len()
     }
 
-    /// Returns the names of the scalars.
+    /// The names of the scalars.
     fn scalars() -> Vec<&'static str> {
         SCALARS.into_iter().chain(Self::terms()).collect()
     }
 
-    /// Returns the names of the terms of the reward.
+    /// The names of the terms of the reward.
     fn terms() -> impl Iterator<Item = &'static str> {
         TaskReward::default().named().map(|(name, _)| name)
     }
 
-    /// Returns the place of the rotation error.
+    /// The place of the rotation error.
     pub(super) fn error(&self) -> usize {
         self.poses() + 1
     }
 
-    /// Returns the row of an environment after a reset or a step, with these terms of the reward.
+    /// The row of an environment after a reset or a step, with these terms of the reward.
     pub(super) fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
         let last = env.last_step();
         let episode = env.episode();
@@ -88,7 +88,7 @@ impl Columns {
         self.row(env.simulation().qpos(), &goal, scalars, &reward.values())
     }
 
-    /// Returns the row of a record of a trace.
+    /// The row of a record of a trace.
     ///
     /// # Errors
     /// Fails if it is not a record, or is one of another scene.
@@ -143,7 +143,7 @@ impl Columns {
         }
     }
 
-    /// Returns the page of these rows, with more entries for what it says of itself. Only the first one has meshes.
+    /// The page of these rows, with more entries for what it says of itself. Only the first one has meshes.
     pub(super) fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Result<Page> {
         let mut meta = self.meta(about);
         for (key, value) in more.as_object().into_iter().flatten() {

@@ -151,7 +151,7 @@ impl Live {
         self.server.greet(&hello(&self.key, self.episodes.seed, &self.hands, self.sliders.as_ref()));
     }
 
-    /// Returns the row of all hands, as the page reads it.
+    /// The row of all hands, as the page reads it.
     fn row(&mut self) -> String {
         let rows = self.hands.iter_mut().flat_map(|hand| {
             let reward = std::mem::take(&mut hand.reward);
@@ -163,7 +163,7 @@ impl Live {
 }
 
 impl LiveHand {
-    /// Returns what the page says of its episode, which is drawn from this seed.
+    /// What the page says of its episode, which is drawn from this seed.
     fn about(&self, seed: u64) -> Value {
         let mut about = json!({ "seed": format!("{seed}, episode {}", self.episode) });
         if let Some(policy) = &self.acting.policy {
@@ -179,7 +179,7 @@ impl LiveHand {
     }
 }
 
-/// Returns the first event for a viewer: the key of the page, and what is under way.
+/// The first event for a viewer: the key of the page, and what is under way.
 fn hello(key: &str, seed: u64, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
     let episodes: Vec<Value> = hands.iter().map(|hand| hand.about(seed)).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
@@ -189,7 +189,7 @@ fn hello(key: &str, seed: u64, hands: &[LiveHand], sliders: Option<&Sliders>) ->
     event("hello", &hello)
 }
 
-/// Returns an event as the protocol writes it.
+/// An event as the protocol writes it.
 fn event(name: &str, data: &Value) -> String {
     format!("event: {name}\ndata: {data}\n\n")
 }

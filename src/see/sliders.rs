@@ -52,7 +52,7 @@ impl Sliders {
         }
     }
 
-    /// Returns what happens on a request of the page: `[[actuator, value], …]`.
+    /// What happens on a request of the page: `[[actuator, value], …]`.
     pub(super) fn on_post(&self) -> OnPost {
         let own = self.clone();
         Box::new(move |body| {
@@ -71,17 +71,17 @@ impl Sliders {
         })
     }
 
-    /// Returns whether one has moved since the last call.
+    /// Whether one has moved since the last call.
     pub(super) fn take_moved(&self) -> bool {
         std::mem::take(&mut self.state().moved)
     }
 
-    /// Returns the value of each.
+    /// The value of each.
     pub(super) fn values(&self) -> Value {
         self.state().sliders.iter().map(Slider::value).collect()
     }
 
-    /// Returns what a page needs to show them.
+    /// What a page needs to show them.
     pub(super) fn described(&self) -> Value {
         let described = |slider: &Slider| {
             let [low, high] = slider.range;

@@ -54,12 +54,12 @@ pub struct Compilation {
 }
 
 impl Compilation {
-    /// Returns the compilation that keeps all of a scene but its timestep in s and its friction cones.
+    /// The compilation that keeps all of a scene but its timestep in s and its friction cones.
     pub fn plain(timestep: f64, cone: Cone) -> Self {
         Self { timestep, cone, object: String::new(), size: 1.0, shifts: false, adds_goal: None }
     }
 
-    /// Returns whether it keeps all of a scene but its options.
+    /// Whether it keeps all of a scene but its options.
     pub fn keeps_all(&self) -> bool {
         self.size == 1.0 && !self.shifts && self.adds_goal.is_none()
     }
@@ -122,7 +122,7 @@ impl Compilation {
     }
 }
 
-/// Returns MuJoCo's whole message about a file that it cannot parse. The wrapper's message has at most 99 bytes.
+/// MuJoCo's whole message about a file that it cannot parse. The wrapper's message has at most 99 bytes.
 fn parse_error(file: &Path) -> Option<String> {
     let name = CString::new(file.to_str()?).ok()?;
     let mut message = [0_u8; 4096];
@@ -143,7 +143,7 @@ fn refused(error: impl Display) -> Error {
     anyhow!("MuJoCo refuses this scene: {}", error.to_string().replace('\n', "\n  "))
 }
 
-/// Returns the name of a scene's file, for messages.
+/// The name of a scene's file, for messages.
 pub fn origin(file: Option<&Path>) -> String {
     file.map_or("the built-in scene".into(), |path| path.display().to_string())
 }

@@ -95,12 +95,12 @@ pub struct DrawnMesh {
 }
 
 impl Drawing {
-    /// Returns the number of values in `qpos`.
+    /// The number of values in `qpos`.
     pub fn positions(&self) -> usize {
         self.start.len() - 7 * self.bodies.iter().filter(|body| body.mocap.is_some()).count()
     }
 
-    /// Returns where quaternions begin among the numbers.
+    /// Where quaternions begin among the numbers.
     pub fn quaternions(&self) -> Vec<usize> {
         let of_body = |body: &DrawnBody| {
             let of_joints = body.joints.iter().filter_map(|joint| match joint.r#type {
@@ -197,7 +197,7 @@ fn is_floor(model: &MjModel, geom: usize) -> bool {
     endless && level && model.geom_group()[geom] < HIDDEN
 }
 
-/// Returns a shape, unless it is of a kind that a page does not draw, or hidden.
+/// A shape, unless it is of a kind that a page does not draw, or hidden.
 fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<DrawnGeom> {
     let kind = match model.geom_type()[geom] {
         MjtGeomBase::mjGEOM_PLANE => "plane",
@@ -235,7 +235,7 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<Dra
     })
 }
 
-/// Returns the parts of a mesh. They have one corner for each pair of point and normal that a triangle uses, in the order of first
+/// The parts of a mesh. They have one corner for each pair of point and normal that a triangle uses, in the order of first
 /// use.
 fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     let [first, points, normals] =

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::os::read_bytes;
 
-/// Returns the files that a scene may read: its own, included files, meshes, textures, height fields. Each is looked for in every
+/// The files that a scene may read: its own, included files, meshes, textures, height fields. Each is looked for in every
 /// folder that the scene names, so some may not belong to it.
 pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     let folder_of = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
@@ -40,7 +40,7 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Returns the names and values of all attributes.
+/// The names and values of all attributes.
 fn attributes(text: &str) -> impl Iterator<Item = (&str, &str)> {
     text.match_indices('=').filter_map(|(at, _)| {
         let name = text[..at].trim_end().rsplit(|c: char| !c.is_alphanumeric()).next()?;

@@ -17,7 +17,7 @@ macro_rules! unusual {
     };
 }
 
-/// Returns a checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
+/// A checksum (CRC-32), as hexadecimal digits, of everything in a scene that changes its motion. Geoms that collide with
 /// nothing are left out, and so are sensors, keyframes and plugins. The quantities of the second list count only where they are
 /// unusual, so that the checksum of other scenes stays the same when the list grows.
 pub(super) fn fingerprint(model: &MjModel) -> String {

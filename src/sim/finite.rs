@@ -8,7 +8,7 @@ use tempfile::NamedTempFile;
 
 use crate::os::shortened;
 
-/// Returns a description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
+/// A description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
 /// prints every array of a model, so that none is forgotten here.
 ///
 /// # Errors
@@ -31,7 +31,7 @@ pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
     Ok(found.or_else(|| first_in_assets(model)))
 }
 
-/// Returns the same for the arrays that MuJoCo does not print.
+/// The same for the arrays that MuJoCo does not print.
 fn first_in_assets(model: &MjModel) -> Option<String> {
     let of = |starts: &[i32], at: usize| starts.iter().rposition(|&start| start as usize <= at).unwrap_or_default();
     let height = model.hfield_data().iter().position(|x| !x.is_finite());
@@ -46,7 +46,7 @@ fn first_in_assets(model: &MjModel) -> Option<String> {
 /// Quantities that MuJoCo computes when it compiles a model, in addition to the names that end with 0.
 const DERIVED: [&str; 5] = ["body_subtreemass", "dof_length", "geom_aabb", "geom_rbound", "bvh_aabb"];
 
-/// Returns the first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
+/// The first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
 fn first_in(text: &str) -> Option<(String, String)> {
     let mut heading = "";
     let mut name = None;

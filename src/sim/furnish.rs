@@ -85,7 +85,7 @@ fn add_plates(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
     }
 }
 
-/// Returns the half sizes (m) of a body that is one box in the middle of its frame, without a material.
+/// The half sizes (m) of a body that is one box in the middle of its frame, without a material.
 fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
     let geom = usize::try_from(model.body_geomadr()[body]).ok()?;
     let is_plain = model.body_geomnum()[body] == 1

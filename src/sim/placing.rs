@@ -7,7 +7,7 @@ use crate::quat::{self, Quat};
 /// A position in m, and an orientation.
 pub(super) type Placed = ([f64; 3], Quat);
 
-/// Returns the poses in the frame of the body `top`: of itself and of the bodies that it carries, where no joint has moved.
+/// The poses in the frame of the body `top`: of itself and of the bodies that it carries, where no joint has moved.
 pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
     let mut frames = vec![None; model.nbody() as usize];
     frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
@@ -19,13 +19,13 @@ pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> 
     frames
 }
 
-/// Returns the pose of a geom in the frame that the poses of bodies are given in, if its body has one.
+/// The pose of a geom in the frame that the poses of bodies are given in, if its body has one.
 pub(super) fn geom_within(model: &MjModel, frames: &[Option<Placed>], geom: usize) -> Option<Placed> {
     let frame = frames[model.geom_bodyid()[geom] as usize]?;
     Some(inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]))
 }
 
-/// Returns a pose that is given in a frame as a pose in the surroundings of that frame.
+/// A pose that is given in a frame as a pose in the surroundings of that frame.
 pub(super) fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> Placed {
     let [x, y, z] = quat::rotate(axes, position);
     ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))

@@ -73,7 +73,7 @@ pub enum Frame {
 pub struct Mocap(pub(super) usize);
 
 impl Mocap {
-    /// Returns its number among the mocap bodies.
+    /// Its number among the mocap bodies.
     pub fn number(self) -> usize {
         self.0
     }
@@ -151,22 +151,22 @@ impl Scene {
         Ok(Self { model: Arc::new(model), own_timestep })
     }
 
-    /// Returns a checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
+    /// A checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
     pub fn fingerprint(&self) -> String {
         fingerprint(&self.model)
     }
 
-    /// Returns the size of the compiled scene in bytes.
+    /// The size of the compiled scene in bytes.
     pub fn size(&self) -> usize {
         self.model.size()
     }
 
-    /// Returns the number of geoms.
+    /// The number of geoms.
     pub fn geoms(&self) -> usize {
         self.model.ngeom() as usize
     }
 
-    /// Returns the number of controls.
+    /// The number of controls.
     pub fn controls(&self) -> usize {
         self.model.nu() as usize
     }
@@ -201,18 +201,18 @@ impl Scene {
         Ok(FreeJoint { body, qpos, dof, inertia })
     }
 
-    /// Returns the number of the first joint of a body if it is a free joint.
+    /// The number of the first joint of a body if it is a free joint.
     pub(super) fn free_joint(&self, body: usize) -> Option<usize> {
         let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
         joint.filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE)
     }
 
-    /// Returns the timestep in its file, s, in whose place another is used.
+    /// The timestep in its file, s, in whose place another is used.
     pub fn own_timestep(&self) -> f64 {
         self.own_timestep
     }
 
-    /// Returns the names of its keyframes.
+    /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
         let name = |id| self.model.id_to_name(MjtObjBase::mjOBJ_KEY, id).unwrap_or_default().to_owned();
         (0..self.model.nkey() as usize).map(name).collect()
@@ -237,7 +237,7 @@ impl Scene {
         Ok(Frame::Site(self.find(MjtObjBase::mjOBJ_SITE, "body or site", name)?))
     }
 
-    /// Returns the number of the keyframe in which an episode starts: `name`, else `start` or `home`, else the only one, if any.
+    /// The number of the keyframe in which an episode starts: `name`, else `start` or `home`, else the only one, if any.
     ///
     /// # Errors
     /// Fails if there is no keyframe `name`.
@@ -249,13 +249,13 @@ impl Scene {
         Ok(known.or((self.model.nkey() == 1).then_some(0)))
     }
 
-    /// Returns the generalised positions of a keyframe, by its number, or the default ones.
+    /// The generalised positions of a keyframe, by its number, or the default ones.
     pub fn pose_of(&self, keyframe: Option<usize>) -> Vec<f64> {
         let size = self.model.nq() as usize;
         keyframe.map_or(self.model.qpos0(), |key| &self.model.key_qpos()[key * size..][..size]).to_vec()
     }
 
-    /// Returns the first body of the kinematic tree to which a frame belongs.
+    /// The first body of the kinematic tree to which a frame belongs.
     pub fn root(&self, frame: Frame) -> Body {
         let body = match frame {
             Frame::Body(Body(body)) => body,
@@ -303,7 +303,7 @@ impl Scene {
         self.model.name_to_id(kind, name).with_context(|| format!("has no {what} `{}`", shortened(name)))
     }
 
-    /// Returns whether the force is kp · (control - length), with or without damping.
+    /// Whether the force is kp · (control - length), with or without damping.
     fn is_position_servo(&self, id: usize) -> bool {
         let kp = self.model.actuator_gainprm()[id][0];
         self.model.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED

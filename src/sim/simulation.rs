@@ -23,7 +23,7 @@ pub enum Validity {
 pub struct SimulationState(Box<[f64]>);
 
 impl SimulationState {
-    /// Returns the values of the state.
+    /// The values of the state.
     pub fn numbers(&self) -> &[f64] {
         &self.0
     }
@@ -52,7 +52,7 @@ impl Simulation {
         self.spare = self.take_own_model();
     }
 
-    /// Returns its own model, if there is one, and uses the model of the scene in its place.
+    /// Gives up its own model, if there is one, which is returned, and uses the model of the scene.
     pub(super) fn take_own_model(&mut self) -> Option<MjModel> {
         match self.shared.take() {
             Some(shared) => Arc::into_inner(self.data.swap_model(shared)),
@@ -105,7 +105,7 @@ impl Simulation {
         (0..substeps).for_each(|_| self.data.step());
     }
 
-    /// Returns whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
+    /// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
         [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC, MjtWarning::mjWARN_BADCTRL]
@@ -113,42 +113,42 @@ impl Simulation {
             .any(|&kind| warnings[kind as usize].number > 0)
     }
 
-    /// Returns the generalised positions.
+    /// The generalised positions.
     pub fn qpos(&self) -> &[f64] {
         self.data.qpos()
     }
 
-    /// Returns the generalised positions for modification.
+    /// The generalised positions for modification.
     pub fn qpos_mut(&mut self) -> &mut [f64] {
         self.data.qpos_mut()
     }
 
-    /// Returns the generalised velocities.
+    /// The generalised velocities.
     pub fn qvel(&self) -> &[f64] {
         self.data.qvel()
     }
 
-    /// Returns the generalised velocities for modification.
+    /// The generalised velocities for modification.
     pub fn qvel_mut(&mut self) -> &mut [f64] {
         self.data.qvel_mut()
     }
 
-    /// Returns the controls in the model's order.
+    /// The controls in the model's order.
     pub fn ctrl(&self) -> &[f64] {
         self.data.ctrl()
     }
 
-    /// Returns the controls for modification.
+    /// The controls for modification.
     pub fn ctrl_mut(&mut self) -> &mut [f64] {
         self.data.ctrl_mut()
     }
 
-    /// Returns the number of values of a state.
+    /// The number of values of a state.
     pub fn state_size(&self) -> usize {
         self.data.model().state_size(EVERYTHING)
     }
 
-    /// Returns a copy of the state.
+    /// A copy of the state.
     pub fn state(&self) -> SimulationState {
         SimulationState(self.data.state(EVERYTHING))
     }
@@ -168,12 +168,12 @@ impl Simulation {
         Ok(())
     }
 
-    /// Returns the length of an actuator: an angle, a sum of angles, or the length of a tendon in m.
+    /// The length of an actuator: an angle, a sum of angles, or the length of a tendon in m.
     pub fn length(&self, actuator: Actuator) -> f64 {
         self.data.actuator_length()[actuator.id]
     }
 
-    /// Returns the pose of a frame.
+    /// The pose of a frame.
     pub fn pose(&self, frame: Frame) -> Pose {
         match frame {
             Frame::Body(Body(id)) => Pose { position: self.data.xpos()[id], orientation: self.data.xquat()[id] },
@@ -186,7 +186,7 @@ impl Simulation {
         }
     }
 
-    /// Returns the velocity of a frame at its origin.
+    /// The velocity of a frame at its origin.
     pub fn velocity(&self, frame: Frame) -> Velocity {
         let (kind, id) = match frame {
             // XBODY is the frame's origin. BODY would be the centre of mass.

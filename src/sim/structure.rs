@@ -58,7 +58,7 @@ fn settle(
 }
 
 impl Scene {
-    /// Returns `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
+    /// `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
     /// limited hinges of the trees that they move. The fingertips are the last bodies of these trees. The object is the only
     /// other body with a free joint. The goal is the only other mocap body that no equality constraint ties to something.
     ///
@@ -113,7 +113,7 @@ impl Scene {
         joints.filter(|&joint| sought(model.jnt_bodyid()[joint] as usize) && hinge(joint)).collect()
     }
 
-    /// Returns the first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.
+    /// The first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.
     fn trees_of_constraints(&self) -> BTreeSet<usize> {
         let model = &self.model;
         let ids = model.eq_objtype().iter().zip(model.eq_obj1id().iter().zip(model.eq_obj2id()));
@@ -126,7 +126,7 @@ impl Scene {
         bodies.map(|body| model.body_rootid()[body] as usize).collect()
     }
 
-    /// Returns the bodies that one of these hinges moves and that carry no other body.
+    /// The bodies that one of these hinges moves and that carry no other body.
     fn last_bodies(&self, hinges: &[usize]) -> Vec<usize> {
         let count = self.model.nbody() as usize;
         let mut moved = vec![false; count];
@@ -141,7 +141,7 @@ impl Scene {
         (1..count).filter(|&body| moved[body] && !carries[body]).collect()
     }
 
-    /// Returns the first bodies of the trees that an actuator moves.
+    /// The first bodies of the trees that an actuator moves.
     fn trees_of(&self, actuator: usize) -> impl Iterator<Item = usize> {
         let bodies = self.wraps(actuator).into_iter().filter_map(|(kind, id, _)| match kind {
             MjtWrap::mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
@@ -151,7 +151,7 @@ impl Scene {
         bodies.map(|body| self.model.body_rootid()[body as usize] as usize).filter(|&root| root != 0)
     }
 
-    /// Returns the joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
+    /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
     /// in space drives no sum.
     pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
         let name = |joint: usize| self.model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
@@ -159,7 +159,7 @@ impl Scene {
         joints.map(|(_, joint, coefficient)| (name(joint), coefficient)).collect()
     }
 
-    /// Returns what an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
+    /// What an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
     fn wraps(&self, actuator: usize) -> Vec<(MjtWrap, usize, f64)> {
         let target = self.model.actuator_trnid()[actuator][0] as usize;
         let wrap =
@@ -174,7 +174,7 @@ impl Scene {
         }
     }
 
-    /// Returns the name of an object, or a sentence if it has none.
+    /// The name of an object, or a sentence if it has none.
     fn name(&self, kind: MjtObjBase, id: usize) -> Result<String, String> {
         let name = self.model.id_to_name(kind, id).filter(|name| !name.is_empty());
         let what = match kind {
@@ -185,18 +185,18 @@ impl Scene {
         name.map(str::to_owned).ok_or_else(|| format!("{what} {id} of the compiled scene needs a name"))
     }
 
-    /// Returns the names of those objects that have one, and lists the others.
+    /// The names of those objects that have one. The others become `problems`.
     fn names(&self, kind: MjtObjBase, ids: impl IntoIterator<Item = usize>, problems: &mut Vec<String>) -> Vec<String> {
         let names = ids.into_iter().map(|id| self.name(kind, id));
         names.filter_map(|name| name.map_err(|problem| problems.push(problem)).ok()).collect()
     }
 
-    /// Returns the names of all joints that have one.
+    /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
         self.names(MjtObjBase::mjOBJ_JOINT, 0..self.model.njnt() as usize, &mut Vec::new())
     }
 
-    /// Returns the names of all actuators that have one.
+    /// The names of all actuators that have one.
     pub fn actuators(&self) -> Vec<String> {
         self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut Vec::new())
     }

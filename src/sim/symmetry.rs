@@ -37,7 +37,7 @@ struct Form {
 }
 
 impl Scene {
-    /// Returns the numbers of the rotations in [`CUBE_ROTATIONS`] that map a body, with all that is attached to it, onto itself.
+    /// The numbers of the rotations in [`CUBE_ROTATIONS`] that map a body, with all that is attached to it, onto itself.
     /// With moving parts there is only the identity.
     pub fn symmetry(&self, body: Body) -> Vec<usize> {
         let form = self.form(body);
@@ -45,7 +45,7 @@ impl Scene {
         turns.enumerate().filter(|&(i, turn)| i == 0 || form.holds(turn)).map(|(i, _)| i).collect()
     }
 
-    /// Returns the axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
+    /// The axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
     pub fn round_axes(&self, body: Body) -> String {
         let form = self.form(body);
         let (sin, cos) = 0.5_f64.sin_cos();
@@ -76,14 +76,14 @@ impl Scene {
 }
 
 impl Form {
-    /// Returns whether a rotation maps it onto itself.
+    /// Whether a rotation maps it onto itself.
     fn holds(&self, turn: Quat) -> bool {
         let onto = |shape: &Shape| self.shapes.iter().any(|other| shape.turned(turn).fills(other));
         !self.moves && self.inertia.is_kept(turn) && self.shapes.iter().all(onto)
     }
 }
 
-/// Returns whether a geom can be in a contact.
+/// Whether a geom can be in a contact.
 fn touches(model: &MjModel, geom: usize) -> bool {
     let pairs = [model.pair_geom1(), model.pair_geom2()];
     model.geom_contype()[geom] != 0
@@ -91,13 +91,13 @@ fn touches(model: &MjModel, geom: usize) -> bool {
         || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
 }
 
-/// Returns the rotation as a matrix: its columns are the rotated axes.
+/// The rotation as a matrix: its columns are the rotated axes.
 fn matrix(turn: Quat) -> [[f64; 3]; 3] {
     let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| quat::rotate(turn, axis));
     [0, 1, 2].map(|row| columns.map(|column| column[row]))
 }
 
-/// Returns whether values are equal but for rounding.
+/// Whether values are equal but for rounding.
 fn alike<'a>(a: impl IntoIterator<Item = &'a f64>, b: impl IntoIterator<Item = &'a f64>, scale: f64) -> bool {
     a.into_iter().zip(b).all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
 }
@@ -108,7 +108,7 @@ impl Shape {
         Self { position, orientation, ..*self }
     }
 
-    /// Returns whether this shape is in the place of another and fills the same space.
+    /// Whether this shape is in the place of another and fills the same space.
     fn fills(&self, other: &Self) -> bool {
         let scale = self.size.iter().chain(&self.position).fold(0.0, |most: f64, x| most.max(x.abs()));
         if (self.kind, self.data) != (other.kind, other.data) || !alike(&self.position, &other.position, scale) {
@@ -150,7 +150,7 @@ impl Inertia {
         }
     }
 
-    /// Returns whether the rotation leaves it as it is.
+    /// Whether the rotation leaves it as it is.
     fn is_kept(&self, turn: Quat) -> bool {
         let rotation = matrix(turn);
         let second = &self.second;

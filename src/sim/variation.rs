@@ -69,14 +69,14 @@ impl Change {
         }
     }
 
-    /// Returns whether MuJoCo derives other values from what is changed, such as the scale of contact forces from the masses.
+    /// Whether MuJoCo derives other values from what is changed, such as the scale of contact forces from the masses.
     fn is_structural(&self) -> bool {
         matches!(self, Self::Mass(..) | Self::CentreOfMass(..))
     }
 }
 
 impl Scene {
-    /// Returns this scene with these changes.
+    /// This scene with these changes.
     pub fn varied(&self, changes: &[Change]) -> Self {
         Self { model: Arc::new(changed((*self.model).clone(), changes, &Workspaces::default())), ..*self }
     }
@@ -85,7 +85,7 @@ impl Scene {
 /// Workspaces for updating the constants of a model, one for each thread that has needed one at the same time.
 type Workspaces = Mutex<Vec<MjData<Box<MjModel>>>>;
 
-/// Returns a model with these changes, and with what MuJoCo derives from masses at compile time.
+/// A model with these changes, and with what MuJoCo derives from masses at compile time.
 fn changed(mut model: MjModel, changes: &[Change], workspaces: &Workspaces) -> MjModel {
     changes.iter().for_each(|change| change.apply(&mut model));
     if !changes.iter().any(Change::is_structural) {
@@ -119,7 +119,7 @@ impl Variants {
         Ok(Self { scenes, workspaces: Workspaces::default() })
     }
 
-    /// Returns a scene (by number) with these changes.
+    /// A scene (by number) with these changes.
     pub fn scene(&self, scene: usize, changes: &[Change]) -> Scene {
         self.scenes[scene].varied(changes)
     }

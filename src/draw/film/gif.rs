@@ -40,7 +40,7 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
     encoder.into_inner()?.into_inner().map_err(|error| anyhow!("{}", error.error()))
 }
 
-/// Returns what differs from the previous frame, if there was one: the smallest rectangle around all changes, or one pixel.
+/// What differs from the previous frame, if there was one: the smallest rectangle around all changes, or one pixel.
 fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> Frame<'static> {
     let height = rgb.len() / (3 * width);
     let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
