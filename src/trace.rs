@@ -45,7 +45,7 @@ impl Trace {
             "fingertip_names": hand.parts.fingertips,
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
-            "mirror": task.mirror().map(|matrix| entries(&matrix, hand.layout.size)),
+            "mirror_matrix": task.mirror().map(|matrix| entries(&matrix, hand.layout.size)),
         });
         add_settings(config, &mut header);
         Self { header, episodes: Vec::new(), last: usize::MAX }

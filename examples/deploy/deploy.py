@@ -319,8 +319,8 @@ def check(policy, hand, trace):
             sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
     # A policy for the hand on the other side sees the mirror image of this one.
     mirror = np.eye(hand.size)
-    if header.get("mirror"):
-        rows, columns, values = np.array(header["mirror"]).T
+    if header.get("mirror_matrix"):
+        rows, columns, values = np.array(header["mirror_matrix"]).T
         mirror = np.zeros_like(mirror)
         mirror[rows.astype(int), columns.astype(int)] = values
     largest, compared = [0.0, 0.0], 0
