@@ -32,6 +32,13 @@ impl EnvState {
         parts.into_iter().reduce(join).unwrap_or_default()
     }
 
+    /// Adds a list that may be longer or shorter elsewhere, with its length.
+    pub fn put_list(&mut self, values: impl IntoIterator<Item = f64>) {
+        let before = self.numbers.len();
+        self.numbers.extend(values);
+        self.counters.push((self.numbers.len() - before) as u64);
+    }
+
     /// The rows of each of `count` environments.
     ///
     /// # Errors
@@ -65,18 +72,13 @@ impl<'a> SavedEnv<'a> {
         self.numbers.split_off(..count).context("the state has too few numbers")
     }
 
-    /// How many numbers are left.
-    pub fn numbers_left(&self) -> usize {
-        self.numbers.len()
-    }
-
-    /// Reads all numbers except the last `kept`.
+    /// Reads the next list that [`EnvState::put_list`] has added.
     ///
     /// # Errors
-    /// Fails if fewer than `kept` are left.
-    pub fn numbers_but(&mut self, kept: usize) -> Result<&'a [f64]> {
-        let count = self.numbers.len().checked_sub(kept);
-        count.and_then(|count| self.numbers.split_off(..count)).context("the state has too few numbers")
+    /// Fails if fewer numbers are left.
+    pub fn list(&mut self) -> Result<&'a [f64]> {
+        let [length] = self.counters()?;
+        self.next(length as usize)
     }
 
     /// Reads the next `N` counters.

@@ -387,16 +387,16 @@ impl Env for Repose {
 
 impl Resumable for Repose {
     fn save(&self, state: &mut EnvState) {
-        state.numbers.extend(self.sim.state().numbers());
-        state.numbers.extend(self.goal);
-        state.numbers.extend(self.last.action.iter().copied().map(f64::from));
-        state.numbers.extend(self.servos.last());
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
         state.counters.push(u64::from(self.episode.randomized));
+        state.put_list(self.sim.state().numbers().iter().copied());
+        state.numbers.extend(self.goal);
+        state.numbers.extend(self.last.action.iter().copied().map(f64::from));
+        state.numbers.extend(self.servos.last());
         self.episode.save(state);
-        // Always the same number of values.
-        state.numbers.extend(self.servos.under_way(self.conditions.most_delay(&self.task)));
+        // As long as it can become, so that all environments of a run have equally many values.
+        state.put_list(self.servos.under_way(self.conditions.most_delay(&self.task)));
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
@@ -410,23 +410,21 @@ impl Resumable for Repose {
         let [randomized] = state.counters()?;
         ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
-        let actuators = self.task.hand.actuators.len();
-        let fixed = 4 + 2 * actuators + EpisodeStats::NUMBERS;
-        // A fork may have other delays than its parent.
-        let under_way = state.numbers_left().saturating_sub(self.sim.state_size() + fixed) / actuators;
-        self.sim.restore(state.numbers_but(fixed + under_way * actuators)?)?;
+        self.sim.restore(state.list()?)?;
         // A fork may also have no forces on the object, but its parent's state has one.
         self.sim.push(self.task.hand.object.body, [0.0; 3]);
         self.sim.twist(self.task.hand.object.body, [0.0; 3]);
         self.goal = state.numbers()?;
         let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
         ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
+        let actuators = self.task.hand.actuators.len();
         self.last.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
         let clipped = self.last.action.iter().all(|action| (-1.0..=1.0).contains(action));
         ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.last.action);
         let targets = state.next(actuators)?;
         self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
-        let under_way = state.next(under_way * actuators)?;
+        let under_way = state.list()?;
+        ensure!(under_way.len().is_multiple_of(actuators), "it has {} targets under way", under_way.len());
         self.servos.restore(targets, under_way, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
         self.recorder.clear();

@@ -32,9 +32,6 @@ pub struct EpisodeStats {
 }
 
 impl EpisodeStats {
-    /// The number of `f64` values that [`Self::save`] writes.
-    pub(super) const NUMBERS: usize = 6;
-
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);
         state.numbers.extend(self.reward.values());

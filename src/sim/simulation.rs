@@ -143,11 +143,6 @@ impl Simulation {
         self.data.ctrl_mut()
     }
 
-    /// The number of values of a state.
-    pub fn state_size(&self) -> usize {
-        self.data.model().state_size(EVERYTHING)
-    }
-
     /// A copy of the state.
     pub fn state(&self) -> SimulationState {
         SimulationState(self.data.state(EVERYTHING))
@@ -159,7 +154,7 @@ impl Simulation {
     /// # Errors
     /// Fails if the state is of another scene or has diverged.
     pub fn restore(&mut self, numbers: &[f64]) -> Result<()> {
-        let size = self.state_size();
+        let size = self.data.model().state_size(EVERYTHING);
         ensure!(numbers.len() == size, "the state has {} values, but this scene needs {size}", numbers.len());
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
