@@ -53,7 +53,7 @@ pub enum PolicySource {
 }
 
 impl PolicySource {
-    /// Returns the origin that `place` names: `builtin`, `robust` (unless there is such a file or folder), a file, or a run
+    /// The origin that `place` names: `builtin`, `robust` (unless there is such a file or folder), a file, or a run
     /// folder. A run folder stands for its best checkpoint or, if there is none yet, its latest.
     ///
     /// # Errors
@@ -66,7 +66,7 @@ impl PolicySource {
         }
     }
 
-    /// Returns the file, or the name of what is built in.
+    /// The file, or the name of what is built in.
     pub fn path(&self) -> &Path {
         match self {
             Self::BuiltIn(policy) => Path::new(policy.name),
@@ -74,7 +74,7 @@ impl PolicySource {
         }
     }
 
-    /// Returns the file, unless it is built in.
+    /// The file, unless it is built in.
     pub fn file(&self) -> Option<&Path> {
         match self {
             Self::BuiltIn(_) => None,
@@ -194,9 +194,9 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
     Checkpoint::parse(&bytes).with_context(|| cannot_use(path))
 }
 
-/// Returns the first of the listed files (newest first) that is not damaged, and prints a warning for each one before it. A file
+/// The first of the listed files (newest first) that is not damaged. A warning names each one before it. A file
 /// that cannot be read or used is not skipped, because it may be usable later. Continuing from an older one would discard its
-/// progress. If a file has vanished since it was listed, e.g. because a training goes on, the list is made once more.
+/// progress. If a file has vanished since it was listed, e.g. because training goes on, the list is made once more.
 ///
 /// # Errors
 /// Fails if there is no file, if one cannot be read or used, or if all are damaged (with the error of the last one).
@@ -216,13 +216,13 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     Ok((last.clone(), read(last)?))
 }
 
-/// Returns whether the file is not there.
+/// Whether the file is not there.
 fn is_absence(error: &Error) -> bool {
     let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     kinds.map(std::io::Error::kind).any(|kind| kind == std::io::ErrorKind::NotFound)
 }
 
-/// Returns whether the bytes of the file are damaged, as opposed to intact but unusable.
+/// Whether the bytes of the file are damaged, as opposed to intact but unusable.
 pub fn is_damage(error: &Error) -> bool {
     error.is::<Damaged>()
 }

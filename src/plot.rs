@@ -37,7 +37,7 @@ const SMOOTH: usize = 50;
 const SUGGESTIONS: usize = 3;
 
 /// A run: name, place on the x axis in each row, lengths of the smoothing windows, names of all columns, and the requested columns.
-struct Run {
+struct RunTable {
     name: String,
     along: Vec<f64>,
     windows: Vec<usize>,
@@ -62,25 +62,6 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &args.metric)?;
     ensure!(!args.seeds || runs.len() > 1, "--seeds: there is only one run; give the runs of several seeds");
-    let has_values = |run: &Run, name: &str| run.columns.get(name).is_some_and(|all| all.iter().any(|x| !x.is_nan()));
-    let known = |name: &str| runs.iter().any(|run| has_values(run, name));
-    let mut panels = Vec::new();
-    for (usual, other) in metrics {
-        let name = other.filter(|other| !known(usual) && known(other)).unwrap_or(usual);
-        let curves: Vec<Curve> = runs.iter().map(|run| run.curve(name)).collect();
-        let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
-        let mut title = tag(name).map_or_else(|| name.to_owned(), |known| known.title);
-        let curves = if args.seeds {
-            let curves: Vec<Curve> = curves.into_iter().filter(|curve| !curve.points.is_empty()).collect();
-            if curves.len() < runs.len() {
-                title += &format!(" ({} of {} seeds)", curves.len(), runs.len());
-            }
-            vec![mean_and_band(&curves)]
-        } else {
-            curves
-        };
-        panels.push(Subplot { title, curves, nothing: nothing.to_owned() });
-    }
     let along = match args.along {
         Along::Steps => "million control steps",
         Along::Hours => "hours of collecting and learning",
@@ -90,25 +71,69 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     } else {
         runs.iter().map(|run| run.name.clone()).collect()
     };
+    let panels = metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, args)).collect();
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
     let plural = if runs.len() == 1 { "" } else { "s" };
     os::say(&format!("{}: {} run{plural}", args.out.display(), runs.len()));
     Ok(())
 }
 
+/// The name of the metric that is drawn: the other one if only that has values.
+fn known_name<'a>((usual, other): Metric<'a>, runs: &[RunTable]) -> &'a str {
+    let is_known = |name: &str| {
+        let mut columns = runs.iter().filter_map(|run| run.columns.get(name));
+        columns.any(|values| values.iter().any(|x| !x.is_nan()))
+    };
+    other.filter(|other| !is_known(usual) && is_known(other)).unwrap_or(usual)
+}
+
+/// The panel of a metric: a curve for each run, or for several seeds one curve and a band.
+fn panel(name: &str, runs: &[RunTable], args: &PlotArgs) -> Subplot {
+    let mut title = tag(name).map_or_else(|| name.to_owned(), |known| known.title);
+    let mut curves: Vec<Curve> = runs.iter().map(|run| run.curve(name)).collect();
+    if args.seeds {
+        curves.retain(|curve| !curve.points.is_empty());
+        if curves.len() < runs.len() {
+            title += &format!(" ({} of {} seeds)", curves.len(), runs.len());
+        }
+        curves = vec![mean_and_band(&curves)];
+    }
+    let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
+    Subplot { title, curves, nothing: nothing.to_owned() }
+}
+
 /// Reads each run that can be drawn, and warns of each that cannot.
 ///
 /// # Errors
 /// Fails if none of them can be drawn.
-fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
-    let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
-    let mut known = HashSet::new();
+fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
+    let tables = tables(args, wanted)?;
+    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
+    let steps = || tables.iter().map(|(_, table)| &table.columns[ALONG[0]]);
+    let shortest = steps().map(Vec::len).min().unwrap_or(0);
+    let rows = args.smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
+    let in_row = steps().filter_map(|steps| Some(steps.get(1)? - steps[0]));
+    let window = rows as f64 * in_row.fold(f64::INFINITY, f64::min);
+    let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
+        let along = match args.along {
+            Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
+            Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
+        };
+        let windows = lengths_of_windows(&columns[ALONG[0]], window);
+        RunTable { name: name_of(place), along, windows, names, columns }
+    };
+    Ok(tables.into_iter().map(run).collect())
+}
+
+/// Reads the table of each run once, however many names the run has, e.g. a link `latest`.
+fn tables<'a>(args: &'a PlotArgs, wanted: &[&str]) -> Result<Vec<(&'a Path, MetricsTable)>> {
     let required = match args.along {
         Along::Steps => &ALONG[..1],
         Along::Hours => &ALONG,
     };
+    let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
+    let mut known = HashSet::new();
     for (i, place) in args.runs.iter().enumerate() {
-        // A run by two names, e.g. through a link `latest`, is one run.
         let whole = run::table_of(place).canonicalize();
         if whole.is_ok_and(|whole| !known.insert(whole)) {
             continue;
@@ -123,28 +148,14 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<Run>> {
             Err(error) => os::say(&format!("warning: {error:#}; skipped")),
         }
     }
-    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
-    let shortest = tables.iter().map(|(_, table)| table.columns[ALONG[0]].len()).min().unwrap_or(0);
-    let smooth = args.smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
-    let steps = tables.iter().map(|(_, table)| &table.columns[ALONG[0]]);
-    let in_row = steps.filter_map(|steps| Some(steps.get(1)? - steps[0]));
-    let window = smooth as f64 * in_row.fold(f64::INFINITY, f64::min);
-    let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
-        let along = match args.along {
-            Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
-            Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
-        };
-        let windows = lengths_of_windows(&columns[ALONG[0]], window);
-        Run { name: name_of(place), along, windows, names, columns }
-    };
-    Ok(tables.into_iter().map(run).collect())
+    Ok(tables)
 }
 
 /// Checks that each of these columns is in at least one run, and warns of the runs without it.
 ///
 /// # Errors
 /// Fails on the first column that no run has, and names the nearest ones.
-fn expect_columns(runs: &[Run], metrics: &[String]) -> Result<()> {
+fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
     for name in metrics {
         let lacking = runs.iter().filter(|run| !run.columns.contains_key(name));
         let lacking: Vec<&str> = lacking.map(|run| &run.name[..]).collect();
@@ -167,8 +178,8 @@ fn expect_columns(runs: &[Run], metrics: &[String]) -> Result<()> {
     Ok(())
 }
 
-impl Run {
-    /// Returns the curve of a metric with these values.
+impl RunTable {
+    /// The curve of a metric, without points if the run has no such column.
     fn curve(&self, name: &str) -> Curve {
         let Some(values) = self.columns.get(name) else { return Curve::default() };
         let dots = name.starts_with(EVALUATION);
@@ -179,8 +190,8 @@ impl Run {
     }
 }
 
-/// Returns the mean of these curves and the band from the lowest to the highest, where all of them have values. The points are
-/// taken from the first curve, and the others are interpolated linearly.
+/// The mean of these curves and the band from the lowest to the highest, where all of them have values. The points are those of the
+/// first curve, and the others are interpolated linearly.
 fn mean_and_band(curves: &[Curve]) -> Curve {
     let dots = curves.iter().any(|curve| curve.dots);
     let mut mean = Curve { dots, ..Curve::default() };
@@ -197,7 +208,7 @@ fn mean_and_band(curves: &[Curve]) -> Curve {
     mean
 }
 
-/// Returns the numbers of consecutive rows that lie in the same window of this many steps.
+/// The numbers of consecutive rows that lie in the same window of this many steps.
 fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
     let first = steps[0];
     // Rounded, because steps are whole numbers and the window is a multiple of their difference.
@@ -207,7 +218,7 @@ fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
         .collect()
 }
 
-/// Returns the hours until the end of each iteration of a run.
+/// The hours until the end of each iteration of a run.
 fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
     let add = |seconds: &mut f64, (collect, update): (&f64, &f64)| {
         *seconds += collect + update;
@@ -216,7 +227,7 @@ fn hours(collect_s: &[f64], update_s: &[f64]) -> Vec<f64> {
     collect_s.iter().zip(update_s).scan(0.0, add).collect()
 }
 
-/// Returns the name of a run, with control characters replaced. It is the name of its folder, or of a table that has a name of
+/// The name of a run, with control characters replaced: the name of its folder, or of a table that has a name of
 /// its own, as in docs/curves.
 fn name_of(place: &Path) -> String {
     let whole = place.canonicalize().unwrap_or_else(|_| place.to_owned());
@@ -231,16 +242,15 @@ fn name_of(place: &Path) -> String {
     name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()
 }
 
-/// Returns the means over consecutive windows of these numbers of rows. Rows without a value are skipped, as are windows with
+/// The means over consecutive windows of these numbers of rows, `[x, value]`. Rows without a value are skipped, as are windows with
 /// only such rows.
 fn smooth(along: &[f64], values: &[f64], lengths: &[usize]) -> Vec<[f64; 2]> {
     let mut begin = 0;
     let means = lengths.iter().filter_map(|length| {
         let window = begin..begin + length;
         begin = window.end;
-        let (along, values) = (&along[window.clone()], &values[window]);
-        let mean = |values: &[f64]| {
-            let known: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+        let mean = |all: &[f64]| {
+            let known: Vec<f64> = all[window.clone()].iter().copied().filter(|value| value.is_finite()).collect();
             (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
         };
         Some([mean(along)?, mean(values)?])

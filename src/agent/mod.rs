@@ -71,7 +71,7 @@ impl<L> Iteration<L> {
 }
 
 impl Agent<Repose> {
-    /// Creates the agent of a training with these settings, at the start of its first episodes. It gets the environments
+    /// Creates the agent of a training run with these settings, at the start of its first episodes. It gets the environments
     /// that `exchange` assigns to this rank.
     ///
     /// # Errors

@@ -61,7 +61,8 @@ pub fn read_bytes_if(path: &Path, check: impl Fn(&[u8]) -> Result<()>) -> Result
     ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
     let size = facts.len();
     ensure!(size <= LARGEST_BYTES, "{}: {size} bytes is larger than any file of this program", path.display());
-    let (mut file, mut bytes) = (File::open(path).cannot("read", path)?, Vec::new());
+    let mut file = File::open(path).cannot("read", path)?;
+    let mut bytes = Vec::new();
     file.by_ref().take(BEGINNING).read_to_end(&mut bytes).cannot("read", path)?;
     check(&bytes)?;
     let room = bytes.try_reserve_exact(size as usize);
@@ -78,7 +79,7 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// Returns the stamp of a file, if it is there.
+    /// The stamp of a file, if it is there.
     pub fn of(path: &Path) -> Option<Self> {
         let facts = fs::metadata(path).ok()?;
         Some(Self { inode: facts.ino(), modified: facts.modified().ok() })

@@ -44,7 +44,8 @@ impl Request {
     /// Fails with the answer to send.
     pub(super) fn read(stream: &mut TcpStream) -> Result<Option<Self>, Refusal> {
         let deadline = Instant::now() + PATIENCE;
-        let (mut bytes, mut end) = (Vec::new(), None);
+        let mut bytes = Vec::new();
+        let mut end = None;
         while end.is_none() {
             if !read_some(stream, &mut bytes, LONGEST_HEAD, deadline)? {
                 return Ok(None);
@@ -84,7 +85,7 @@ impl Request {
         fits.then_some(Self { method: method.into(), path: path.into(), headers: headers?, body: Vec::new() })
     }
 
-    /// Returns the value of a header, unless it is there more than once.
+    /// The value of a header, unless it is there more than once.
     fn header(&self, name: &str) -> Option<&str> {
         let mut found = self.headers.iter().filter(|(own, _)| own == name);
         let (_, value) = found.next()?;
@@ -148,7 +149,7 @@ fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline:
     }
 }
 
-/// Returns the head of an answer that is not cached, and is not shown inside another page.
+/// The head of an answer that is not cached, and is not shown inside another page.
 pub(super) fn head(status: &str, more: &[(&str, &str)]) -> String {
     let always = [
         ("Cache-Control", "no-store"),
@@ -179,7 +180,8 @@ pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal, more: 
     let more = [more, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
     let sent = answer(stream, status, &more, &format!("{sentence}\n"));
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
-        let (deadline, mut rest) = (Instant::now() + LINGER, Vec::new());
+        let deadline = Instant::now() + LINGER;
+        let mut rest = Vec::new();
         while rest.len() < MOST_LINGERED && read_some(stream, &mut rest, MOST_LINGERED, deadline) == Ok(true) {}
     }
 }

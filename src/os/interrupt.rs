@@ -37,7 +37,7 @@ pub struct Requests {
 }
 
 impl Requests {
-    /// Returns requests that never arrive.
+    /// Requests that never arrive.
     pub fn none() -> Self {
         let (patient, stop, signal, save) = Default::default();
         Self { since: Instant::now(), patient, stop, signal, save }
@@ -95,12 +95,12 @@ impl Requests {
         }
     }
 
-    /// Returns the flag that is set when the program is requested to stop.
+    /// The flag that is set when the program is requested to stop.
     pub fn stop(&self) -> &AtomicBool {
         &self.stop
     }
 
-    /// Returns the signal that requested the stop, or 0 if none did.
+    /// The signal that requested the stop, or 0 if none did.
     pub fn signal(&self) -> i32 {
         self.signal.load(Ordering::Relaxed)
     }
@@ -110,7 +110,8 @@ impl Requests {
     /// # Errors
     /// Fails if the system refuses a thread.
     pub fn stop_after(&self, limit: Duration) -> Result<()> {
-        let (stop, left) = (self.stop.clone(), limit.saturating_sub(self.since.elapsed()));
+        let stop = self.stop.clone();
+        let left = limit.saturating_sub(self.since.elapsed());
         let clock = thread::Builder::new().name("time limit".into()).spawn(move || {
             thread::sleep(left);
             stop.store(true, Ordering::Relaxed);
@@ -118,13 +119,13 @@ impl Requests {
         clock.map(drop).context("cannot start a thread for the time limit")
     }
 
-    /// Returns whether a save was requested since the last call.
+    /// Whether a save was requested since the last call.
     pub fn take_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
     }
 }
 
-/// Returns the exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.
+/// The exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.
 pub fn exit_code(signal: i32) -> ExitCode {
     if signal == 0 { ExitCode::SUCCESS } else { ExitCode::from(128 + signal as u8) }
 }

@@ -2,7 +2,7 @@
 //!
 //! On a file system without locks, the time of the lock file replaces the lock: it is renewed as long as the training runs.
 //!
-//! The file contains the name of its holder. A training that ends normally removes that name. So a name in a file that nobody
+//! The file contains the name of its holder. A training run that ends normally removes that name. So a name in a file that nobody
 //! holds means that the training has failed or was killed.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
@@ -100,7 +100,7 @@ impl Locked {
         Ok(self)
     }
 
-    /// Releases the lock and removes the name of this program, after a training that ended normally.
+    /// Releases the lock and removes the name of this program, after a training run that ended normally.
     pub fn release(self) {
         // The file may belong to another program by now.
         if holder(&self.path) == name() {
@@ -113,9 +113,10 @@ impl Locked {
         expect_named(&self.path, &self.file).is_ok()
     }
 
-    /// Returns a function that checks the same later, without borrowing the lock.
+    /// A function that checks the same later, without borrowing the lock.
     pub fn watch(&self) -> impl Fn() -> bool + Send + use<> {
-        let (path, file) = (self.path.clone(), self.file.try_clone());
+        let path = self.path.clone();
+        let file = self.file.try_clone();
         move || file.as_ref().is_ok_and(|file| expect_named(&path, file).is_ok())
     }
 }
@@ -141,7 +142,8 @@ impl Renewal {
         thread::sleep(SETTLED);
         ensure!(holder(&path) == own, "{} is in use by another program{}", folder.display(), holder(&path));
         say(&format!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display()));
-        let (renewed, lives) = (path.clone(), Arc::new(()));
+        let renewed = path.clone();
+        let lives = Arc::new(());
         let alive = Arc::downgrade(&lives);
         let renew = move || {
             while alive.strong_count() > 0 {
@@ -168,7 +170,7 @@ impl Drop for Renewal {
 /// What the lock file of a run folder shows to a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hold {
-    /// A training holds it.
+    /// A training run holds it.
     Held,
     /// Nobody holds it, and it contains no name or does not exist.
     Released,
@@ -196,14 +198,14 @@ impl Hold {
     }
 }
 
-/// Returns who holds the lock file, as it was signed.
+/// Who holds the lock file, as it was signed.
 fn holder(path: &Path) -> String {
     let mut holder = String::new();
     let _ = File::open(path).and_then(|file| file.take(100).read_to_string(&mut holder));
     shortened(&holder)
 }
 
-/// Returns the name of this program, as lock files are signed with it.
+/// The name of this program, as lock files are signed with it.
 fn name() -> String {
     format!(": process {} on {}", std::process::id(), Machine::this().name)
 }

@@ -18,7 +18,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// Returns this machine. What the system does not report is empty or 0.
+    /// This machine. What the system does not report is empty or 0.
     pub fn this() -> Self {
         let text = |path| fs::read_to_string(path).unwrap_or_default();
         Self {
@@ -29,7 +29,7 @@ impl Machine {
     }
 }
 
-/// Returns what the system says of this process in the line that begins with `name`, or nothing if there is none.
+/// What the system says of this process in the line that begins with `name`, or nothing if there is none.
 pub(super) fn process_status(name: &str) -> String {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
@@ -48,14 +48,14 @@ pub fn processor_seconds() -> Option<f64> {
     Some(times.sum::<Option<f64>>()? / TICKS_PER_S)
 }
 
-/// Returns the number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
+/// The number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
 fn count(list: &str) -> usize {
     let number = |text: &str| text.trim().parse::<usize>().ok();
     let ranges = list.split(',').map(|part| part.split_once('-').unwrap_or((part, part)));
     ranges.filter_map(|(first, last)| Some((number(last)? + 1).saturating_sub(number(first)?))).sum()
 }
 
-/// Returns a checksum (CRC-32) of the file of this program, or 0 if it cannot be read.
+/// A checksum (CRC-32) of the file of this program, or 0 if it cannot be read.
 pub fn program_checksum() -> u32 {
     let program = std::env::current_exe().ok().and_then(|path| read_bytes(&path).ok());
     program.map_or(0, |bytes| crc32fast::hash(&bytes))

@@ -17,7 +17,7 @@ const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 /// The CRC-32 of the mesh files in this package, one after another in the order of their names.
 const CHECKSUM: u32 = 0x88cc_c91c;
 
-/// Returns the contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged.
+/// The contents of the mesh files, whose `names` are sorted. They are fetched first unless the cache folder has them undamaged.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.
@@ -38,7 +38,7 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     undamaged(&folder, names, CHECKSUM).with_context(damaged)
 }
 
-/// Returns the contents of these files if they are all there and have this CRC-32 together.
+/// The contents of these files if they are all there and have this CRC-32 together.
 fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>>> {
     let files: Option<Vec<Vec<u8>>> = names.iter().map(|name| read_bytes(&folder.join(name)).ok()).collect();
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)

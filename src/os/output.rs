@@ -168,7 +168,7 @@ impl OutputFile {
         named.and_then(|()| sync_folder(target)).cannot("write", &self.path)
     }
 
-    /// Returns the path as the user gave it.
+    /// The path as the user gave it.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -179,7 +179,7 @@ impl OutputFile {
     }
 }
 
-/// Returns the absolute path to which a path leads through links. The file need not exist, but its folder must.
+/// The absolute path to which a path leads through links. The file need not exist, but its folder must.
 pub fn final_path(path: &Path) -> Option<PathBuf> {
     let end = end_of_links(path).ok()?;
     Some(folder_of(&end).canonicalize().ok()?.join(end.file_name()?))
@@ -227,7 +227,7 @@ pub fn put_aside(path: &Path, extension: &str) -> io::Result<PathBuf> {
     fs::rename(path, &aside).map(|()| aside)
 }
 
-/// Returns `path`, or a numbered variant of it, that does not exist yet.
+/// `path`, or a numbered variant of it, that does not exist yet.
 fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));

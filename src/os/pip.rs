@@ -41,7 +41,7 @@ pub(crate) fn unpack_wheel(package: &str, hash: &str, selection: &[&str], folder
     run(python(folder, "zipfile").arg("-e").arg(&wheel).arg(folder)).map(drop)
 }
 
-/// Returns the variables that set where pip gets packages from: the user's own or, where there is none, the values in
+/// The variables that set where pip gets packages from: the user's own or, where there is none, the values in
 /// the user's configuration files.
 fn sources(folder: &Path) -> Vec<(String, String)> {
     let config = env::var_os(CONFIG).map(|file| std::path::absolute(&file).unwrap_or(file.into()));
@@ -72,7 +72,7 @@ fn sources(folder: &Path) -> Vec<(String, String)> {
     found.collect()
 }
 
-/// Returns the absolute path of what exists here, since pip runs in another folder. Anything else, e.g. an address, stays as it is.
+/// The absolute path of what exists here, since pip runs in another folder. Anything else, e.g. an address, stays as it is.
 fn absolute(place: &str) -> String {
     let path = Path::new(place);
     let found = path.exists().then(|| std::path::absolute(path).ok()).flatten();
@@ -92,7 +92,7 @@ pub(crate) fn stop() {
     }
 }
 
-/// Returns the command that runs a module of Python, isolated from the user's folder, variables and own packages. It runs in
+/// The command that runs a module of Python, isolated from the user's folder, variables and own packages. It runs in
 /// `folder`, since the python3 of a version manager may look for its settings there.
 fn python(folder: &Path, module: &str) -> Command {
     let mut command = Command::new("python3");
@@ -129,7 +129,7 @@ fn run(command: &mut Command) -> Result<String, String> {
     Err(format!("python3 failed: {last}"))
 }
 
-/// Returns at most 100 characters of a line.
+/// At most 100 characters of a line.
 fn shortened(line: &str) -> String {
     let start: String = line.chars().take(100).collect();
     if start.len() < line.len() { format!("{start}…") } else { start }

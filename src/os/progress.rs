@@ -129,7 +129,7 @@ impl Status {
         }
     }
 
-    /// Returns the parts of the line, the most important first.
+    /// The parts of the line, the most important first.
     fn parts(&self, left: Duration) -> Vec<String> {
         let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
         let evaluated =
@@ -142,7 +142,7 @@ impl Status {
         ]
     }
 
-    /// Returns the line with the parts that fit into `width` columns.
+    /// The line with the parts that fit into `width` columns.
     fn line(&self, total_steps: u64, left: Duration, width: usize) -> String {
         let mut line = steps_of_all(self.env_steps, total_steps);
         for part in self.parts(left) {
@@ -155,7 +155,7 @@ impl Status {
     }
 }
 
-/// Returns the steps made out of all steps, e.g. `10.01/200M`. The total has no zeros at its end.
+/// The steps made out of all steps, e.g. `10.01/200M`. The total has no zeros at its end.
 pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
     let (digits, unit, name) = match total_steps {
         0..10_000 => return format!("{env_steps}/{total_steps}"),
@@ -166,7 +166,7 @@ pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
     format!("{made}/{}{name}", total.trim_end_matches('0').trim_end_matches('.'))
 }
 
-/// Returns a time as hours, minutes and seconds, e.g. `2:05:33`.
+/// A time as hours, minutes and seconds, e.g. `2:05:33`.
 pub fn clock(time: Duration) -> String {
     let seconds = time.as_secs();
     format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
@@ -180,7 +180,7 @@ pub(super) fn is_dumb() -> bool {
 /// The progress bar of a job with many items.
 pub type Bar = ProgressBar;
 
-/// Returns the progress bar of a job, at zero of `total` items, e.g. frames. It is shown on a terminal only, until it is dropped.
+/// The progress bar of a job, at zero of `total` items, e.g. frames. It is shown on a terminal only, until it is dropped.
 /// `job` distinguishes several jobs, e.g. by the policy that plays.
 pub fn progress_bar(total: u64, items: &str, job: &str) -> Bar {
     let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");

@@ -53,7 +53,7 @@ struct News {
 }
 
 impl News {
-    /// Returns the number of the next event.
+    /// The number of the next event.
     fn next(&self) -> u64 {
         self.first + self.events.len() as u64
     }
@@ -77,7 +77,7 @@ impl Server {
         Ok(Self { shared, port })
     }
 
-    /// Returns the port.
+    /// The port.
     pub fn port(&self) -> u16 {
         self.port
     }
@@ -108,7 +108,7 @@ impl Server {
 }
 
 impl Shared {
-    /// Returns the news. They are consistent even after a panic of a thread that held them.
+    /// The news. They are consistent even after a panic of a thread that held them.
     fn news(&self) -> MutexGuard<'_, News> {
         self.news.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -199,7 +199,7 @@ struct Slot {
 }
 
 impl Slot {
-    /// Returns a slot, unless all of them are taken.
+    /// A slot, unless all of them are taken.
     fn take(shared: &Arc<Shared>, most: usize, count: fn(&mut News) -> &mut usize) -> Option<Self> {
         let mut news = shared.news();
         let taken = count(&mut news);

@@ -3,7 +3,7 @@
 /// The maximum length of a name that is compared with the known ones: the comparison takes quadratic time.
 const LONGEST: usize = 64;
 
-/// Returns the known names that are like `name`, the nearest first. Names have parts, divided by `separator`.
+/// The known names that are like `name`, the nearest first. Names have parts, divided by `separator`.
 pub fn similar<'a>(name: &str, known: impl Iterator<Item = &'a str>, separator: char) -> Vec<&'a str> {
     if name.len() > LONGEST {
         return Vec::new();

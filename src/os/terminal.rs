@@ -29,14 +29,14 @@ pub(super) fn is_read(text: &str) -> Result<bool> {
 /// The most characters of a foreign text that a message quotes.
 const LONGEST_QUOTE: usize = 100;
 
-/// Returns a text from an untrusted file, short enough for a message and on one line.
+/// A text from an untrusted file, short enough for a message and on one line.
 pub fn shortened(text: &str) -> String {
     let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
     let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
     if text.chars().nth(LONGEST_QUOTE).is_some() { format!("{start}…") } else { start }
 }
 
-/// Returns a number with these decimals, or `-` if it is not known (NaN).
+/// A number with these decimals, or `-` if it is not known (NaN).
 pub fn number(value: f64, decimals: usize) -> String {
     let text = if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") };
     // Not `-0.00`.
@@ -58,7 +58,7 @@ fn is_steering(c: char) -> bool {
     c.is_control() || unseen || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns a text of one line. Characters that control a terminal are escaped as in JSON, so that JSON stays valid.
+/// A text of one line. Characters that control a terminal are escaped as in JSON, so that JSON stays valid.
 pub fn harmless(text: &str) -> String {
     let mut harmless = String::with_capacity(text.len());
     for c in text.chars() {
@@ -85,7 +85,7 @@ pub fn say(line: &str) {
     let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
 }
 
-/// Returns a text as a single shell word, quoted if necessary.
+/// A text as a single shell word, quoted if necessary.
 pub fn quoted(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
     if !text.is_empty() && text.chars().all(plain) {
@@ -95,7 +95,7 @@ pub fn quoted(text: &str) -> String {
     }
 }
 
-/// Returns a path as a single shell word, even if it is not valid UTF-8.
+/// A path as a single shell word, even if it is not valid UTF-8.
 pub fn quoted_path(path: &Path) -> String {
     path.to_str().map_or_else(
         || {
@@ -107,7 +107,7 @@ pub fn quoted_path(path: &Path) -> String {
     )
 }
 
-/// Returns how the user has called this program, for commands that are printed: by cargo, by a path, or by its name.
+/// How the user has called this program, for commands that are printed: by cargo, by a path, or by its name.
 pub fn called_as() -> String {
     let exe = std::env::current_exe().unwrap_or_default();
     if std::env::var_os("CARGO_PKG_NAME").is_some_and(|name| name == env!("CARGO_PKG_NAME")) {

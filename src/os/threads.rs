@@ -15,7 +15,7 @@ pub fn start_threads(threads: usize) -> Result<()> {
     pool(threads)?.build_global().map_err(|error| cannot_start(threads, error))
 }
 
-/// Returns a pool of its own with this number of worker threads (0: one per core), in which a caller can install work.
+/// A pool of its own with this number of worker threads (0: one per core), in which a caller can install work.
 ///
 /// # Errors
 /// Fails if the number is too large, or if the system refuses the threads.

@@ -23,17 +23,17 @@ impl Checkpoints {
         Self { folder: run.join(CHECKPOINTS) }
     }
 
-    /// Returns the path of the folder.
+    /// The path of the folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Returns the path of the newest checkpoint.
+    /// The path of the newest checkpoint.
     pub fn latest(&self) -> PathBuf {
         self.folder.join("latest.safetensors")
     }
 
-    /// Returns the path of the checkpoint that scored best.
+    /// The path of the checkpoint that scored best.
     pub fn best(&self) -> PathBuf {
         self.folder.join("best.safetensors")
     }
@@ -81,7 +81,7 @@ impl Checkpoints {
         fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder)).cannot("create", &self.folder)
     }
 
-    /// Returns all checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
+    /// All checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
     /// copy if the file system does not support hard links. It is older than the newest if the program ended just before updating
     /// it.
     pub fn newest_first(&self) -> Vec<PathBuf> {
@@ -94,12 +94,12 @@ impl Checkpoints {
         found
     }
 
-    /// Returns the number of checkpoints, not counting `latest` and `best`.
+    /// The number of checkpoints, not counting `latest` and `best`.
     pub fn count(&self) -> usize {
         self.numbered().len()
     }
 
-    /// Returns the checkpoints named after iterations, the newest first.
+    /// The checkpoints named after iterations, the newest first.
     fn numbered(&self) -> Vec<(u64, PathBuf)> {
         let entries = fs::read_dir(&self.folder).into_iter().flatten().flatten();
         let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
@@ -128,7 +128,7 @@ pub(super) fn expect_no_link(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Returns the time when a file was written, if it is there.
+/// The time when a file was written, if it is there.
 pub(super) fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|facts| facts.modified()).ok()
 }

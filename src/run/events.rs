@@ -95,7 +95,8 @@ impl EventFile {
 
     fn write(&self, what: What, step: u64) -> Result<()> {
         let event = Event { wall_time: now(), step: step as i64, what: Some(what), ..Event::default() };
-        let (bytes, mut writer) = (event.write_to_bytes()?, RecordWriter::new(BufWriter::new(&self.file)));
+        let bytes = event.write_to_bytes()?;
+        let mut writer = RecordWriter::new(BufWriter::new(&self.file));
         writer.write(&bytes).and_then(|()| writer.flush()).cannot("write", &self.path)
     }
 
@@ -130,7 +131,7 @@ pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     Ok(())
 }
 
-/// Returns this program's event files in `folder`, each with the seconds in its name.
+/// This program's event files in `folder`, each with the seconds in its name.
 pub(super) fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).cannot("read", folder)?;
@@ -144,7 +145,7 @@ pub(super) fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     Ok(ours.collect())
 }
 
-/// Returns the seconds since 1970.
+/// The seconds since 1970.
 pub(super) fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }

@@ -97,7 +97,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Whether a training was killed here before its first checkpoint was complete: the same command may begin again.
+    /// Whether a training run was killed here before its first checkpoint was complete: the same command may begin again.
     fn is_half_begun(&self) -> Result<bool> {
         let early = |name: &OsString| {
             let begins = [LOCK, POLICY, CHECKPOINTS, OUR_PARTIAL].iter();
@@ -131,7 +131,7 @@ impl RunFolder {
         let _ = fs::remove_dir_all(self.path);
     }
 
-    /// Returns the existing run folder that `place` belongs to: `place` is the folder itself, its checkpoints folder, or a
+    /// The existing run folder that `place` belongs to: `place` is the folder itself, its checkpoints folder, or a
     /// checkpoint in it.
     ///
     /// # Errors
@@ -196,7 +196,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Returns the files of the run: files with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`.
+    /// The files of the run: files with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`.
     /// Other files in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
@@ -213,15 +213,15 @@ impl RunFolder {
         Ok(found)
     }
 
-    /// Returns whether the user has asked the training to stop by an empty file with the name `stop`, and removes it. Any other
-    /// file of that name, and one that was there before, is the user's.
+    /// Whether the user asks by an empty file `stop` to end the training run. The file is then removed. Any other file of that name,
+    /// and one that was there before, is the user's.
     pub fn take_stop(&self) -> bool {
         let path = self.path.join(STOP);
         let is_request = fs::symlink_metadata(&path).is_ok_and(|facts| facts.is_file() && facts.len() == 0);
         is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
     }
 
-    /// Writes or removes the file that marks a training as not to be continued: all steps are made, or a file `stop` has ended
+    /// Writes or removes the file that marks a training run as not to be continued: all steps are made, or a file `stop` has ended
     /// it. If that fails, a script at most continues what is finished.
     pub fn mark_finished(&self, finished: bool) {
         let path = self.path.join(FINISHED);
@@ -232,17 +232,17 @@ impl RunFolder {
         let _ = if finished { write_whole(&path, b"") } else { fs::remove_file(path).map_err(Into::into) };
     }
 
-    /// Returns the path of the folder.
+    /// The path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns its checkpoints.
+    /// Its checkpoints.
     pub fn checkpoints(&self) -> Checkpoints {
         Checkpoints::new(&self.path)
     }
 
-    /// Returns the path of the policy without its training state: the best one, or the latest if none was scored yet.
+    /// The path of the policy without its training state: the best one, or the latest if none was scored yet.
     pub fn policy(&self) -> PathBuf {
         self.path.join(POLICY)
     }
@@ -261,7 +261,7 @@ impl RunFolder {
         write_whole(&folder.join(name), text.as_bytes())
     }
 
-    /// Returns the path and the text of the configuration in the folder, or `None` if there is none.
+    /// The path and the text of the configuration in the folder, or `None` if there is none.
     ///
     /// # Errors
     /// Fails if the file cannot be read.
@@ -285,7 +285,7 @@ impl RunFolder {
     }
 }
 
-/// Returns the checkpoint that `place` refers to: `place` itself, or the best checkpoint of a run folder. If there is no
+/// The checkpoint that `place` refers to: `place` itself, or the best checkpoint of a run folder. If there is no
 /// best one yet, it is the latest.
 ///
 /// # Errors
@@ -300,7 +300,7 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
-/// Returns the folder of the newest run that has a checkpoint, if any.
+/// The folder of the newest run that has a checkpoint, if any.
 pub fn newest_run() -> Option<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder::at(entry.path()));
     // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.

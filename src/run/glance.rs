@@ -49,7 +49,7 @@ impl Glance {
     }
 }
 
-/// Returns the folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out. Someone who
+/// The folders in `folder`, or in the default folder of runs, which may be runs. Links to folders are left out. Someone who
 /// `waits` for the first run finds no folders where the default folder does not exist yet.
 ///
 /// # Errors

@@ -62,12 +62,12 @@ pub(super) fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
     Ok(vec![session_value("session_end_info", 4, &info)?])
 }
 
-/// Returns the metrics after an evaluation.
+/// The metrics after an evaluation.
 pub(super) fn metrics(best: f64, drop_rate: f64, steps_per_s: f64) -> [(&'static str, f64); 3] {
     [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", steps_per_s)]
 }
 
-/// Returns the message `SessionStartInfo`.
+/// The message `SessionStartInfo`.
 fn start_info(settings: &Table) -> Result<Vec<u8>> {
     let entries: Result<Vec<_>> = settings.iter().map(|(key, value)| entry(key, value)).collect();
     let entries = entries?;
@@ -77,7 +77,7 @@ fn start_info(settings: &Table) -> Result<Vec<u8>> {
     })
 }
 
-/// Returns an entry of the map of settings: a key, and a `google.protobuf.Value`.
+/// An entry of the map of settings: a key, and a `google.protobuf.Value`.
 fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
     let value = message(|out| match value {
         Value::Integer(x) => out.write_double(2, *x as f64),
@@ -92,7 +92,7 @@ fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
     })
 }
 
-/// Returns the value that holds a message of the plugin, which is this field of `HParamsPluginData`.
+/// The value that holds a message of the plugin, which is this field of `HParamsPluginData`.
 fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
     let content = message(|out| out.write_bytes(field, info))?;
     // The value itself is empty: a list of no numbers.
@@ -119,7 +119,7 @@ mod tests {
 
     use super::*;
 
-    /// Returns the fields of a message: their numbers, and their bytes, or the bytes of a double.
+    /// The fields of a message: their numbers, and their bytes, or the bytes of a double.
     fn fields(bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
         let (mut stream, mut found) = (CodedInputStream::from_bytes(bytes), Vec::new());
         while !stream.eof().unwrap() {

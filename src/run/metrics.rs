@@ -34,7 +34,8 @@ impl Metrics {
             Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
             file => file.and_then(|file| rows(file, header, iterations.end)).cannot("write", path)?,
         };
-        let (mut notes, mut expected) = (Vec::new(), iterations.end - iterations.start);
+        let mut notes = Vec::new();
+        let mut expected = iterations.end - iterations.start;
         if found.is_none() {
             let aside = put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
             let aside = aside.display();
@@ -107,7 +108,8 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     if !file.metadata()?.is_file() {
         return Ok(Some(Rows::default()));
     }
-    let (mut reader, mut line) = (BufReader::new(file), Vec::new());
+    let mut reader = BufReader::new(file);
+    let mut line = Vec::new();
     let length = next_row(&mut reader, &mut line)?;
     // The header may have been written only in part, e.g. on a full disk.
     if !line.ends_with(b"\n") && header.as_bytes().starts_with(&line) {
@@ -117,12 +119,14 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
         return Ok(None);
     }
     let commas = |line: &[u8]| line.iter().filter(|&&byte| byte == b',').count();
-    let (columns, mut found) = (commas(&line), Rows { length, ..Rows::default() });
+    let columns = commas(&line);
+    let mut found = Rows { length, ..Rows::default() };
     while let read @ 1.. = next_row(&mut reader, &mut line)? {
         let number = line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse().ok());
         let whole = line.ends_with(b"\n") && commas(&line) == columns;
         if found.dropped == 0 && whole && number.is_some_and(|number: u64| number <= iterations) {
-            (found.length, found.kept) = (found.length + read, found.kept + 1);
+            found.length += read;
+            found.kept += 1;
         } else {
             found.dropped += 1;
         }

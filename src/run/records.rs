@@ -13,7 +13,7 @@ use tensorboard_rs::masked_crc32c::masked_crc32c;
 /// The most bytes of an event. This program writes none that is larger. A record that claims to be is damaged.
 const LARGEST: u64 = 64 << 20;
 
-/// Returns the number of bytes at the start of a file that are whole events up to `last_step`. Steps do not decrease within a
+/// The number of bytes at the start of a file that are whole events up to `last_step`. Steps do not decrease within a
 /// file.
 ///
 /// # Errors
@@ -40,7 +40,8 @@ fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
 
 /// Reads `count` bytes and their checksum. Returns `None` if they are incomplete or do not match.
 fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
-    let (mut bytes, mut checksum) = (Vec::new(), [0; 4]);
+    let mut bytes = Vec::new();
+    let mut checksum = [0; 4];
     if reader.by_ref().take(count as u64).read_to_end(&mut bytes)? < count {
         return Ok(None);
     }
@@ -50,9 +51,10 @@ fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
     }
 }
 
-/// Returns the step of an event, or 0 if it has none. Returns `None` if it is not a protobuf message.
+/// The step of an event, or 0 if it has none, or `None` if it is not a protobuf message.
 fn step_of(event: &[u8]) -> Option<i64> {
-    let (mut stream, mut step) = (CodedInputStream::from_bytes(event), 0);
+    let mut stream = CodedInputStream::from_bytes(event);
+    let mut step = 0;
     while !stream.eof().ok()? {
         match stream.read_tag_unpack().ok()? {
             (2, WireType::WireTypeVarint) => step = stream.read_int64().ok()?,
@@ -72,7 +74,7 @@ mod tests {
 
     use super::*;
 
-    /// Returns an event as another library writes it.
+    /// An event as another library writes it.
     fn event(step: i64, values: usize) -> Vec<u8> {
         let (mut event, mut summary) = (Event::new(), Summary::new());
         for _ in 0..values {

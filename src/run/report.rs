@@ -62,7 +62,7 @@ impl<W> Log<W> {
             Some(Ok(())) => {
                 self.unsynced += 1;
                 if std::mem::take(&mut self.failing) {
-                    let (name, lost) = (self.name, self.lost);
+                    let Self { name, lost, .. } = self;
                     progress.warn(&format!("logging to {name} has resumed; it lacks {lost} iterations so far"));
                 }
             }
@@ -115,7 +115,8 @@ impl Report {
 
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
     pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
-        (self.iterations, self.env_steps) = (iterations, env_steps);
+        self.iterations = iterations;
+        self.env_steps = env_steps;
         // A session that ended before its next checkpoint may have logged later steps. These are made again.
         match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
             Ok(events) => self.events.writer = Some(events),
@@ -155,7 +156,8 @@ impl Report {
         histograms: &[(&'static str, Histogram)],
         status: &Status,
     ) {
-        (self.iterations.end, self.env_steps) = (iteration, status.env_steps);
+        self.iterations.end = iteration;
+        self.env_steps = status.env_steps;
         let names = values.iter().map(|(name, _)| name.as_ref());
         assert!(names.eq(self.header.split(',').skip(FIXED.len())), "values do not match the tags: {}", self.header);
         let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };

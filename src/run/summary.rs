@@ -16,7 +16,7 @@ pub type Descriptions = HashMap<String, String>;
 /// The number of the field `data_class` of the metadata, which tensorboard-proto does not know.
 const DATA_CLASS: u32 = 4;
 
-/// Returns a value of a tag. The first one in a file has the tag's description.
+/// A value of a tag. The first one in a file has the tag's description.
 pub(super) fn value(tag: &str, content: Content, description: Option<String>) -> Summary_Value {
     // The plugin that shows the value, and the class of its data (`DataClass` in TensorBoard's summary.proto).
     let (plugin, data_class) = match content {
@@ -32,7 +32,7 @@ pub(super) fn value(tag: &str, content: Content, description: Option<String>) ->
     value
 }
 
-/// Returns a value of a tag that says which plugin shows it, and of which class its data are.
+/// A value of a tag that says which plugin shows it, and of which class its data are.
 pub(super) fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32) -> Summary_Value {
     let mut value = Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
     let metadata = value.mut_metadata();
@@ -41,7 +41,7 @@ pub(super) fn with_metadata(tag: &str, content: Content, plugin: &str, data_clas
     value
 }
 
-/// Returns a text in Markdown.
+/// A text in Markdown.
 pub(super) fn markdown(text: &str) -> TensorProto {
     let mut tensor = TensorProto { dtype: DataType::DT_STRING, ..TensorProto::default() };
     // A shape without dimensions: a single string.

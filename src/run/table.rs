@@ -1,8 +1,8 @@
 //! Reading `metrics.csv`, for charts. Any file may be given: sizes are bounded, and messages quote little of it.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -33,7 +33,7 @@ pub struct MetricsTable {
     pub columns: HashMap<String, Vec<f64>>,
 }
 
-/// Returns the table that `place` means: a file, or the table of a run folder.
+/// The table that `place` means: a file, or the table of a run folder.
 pub fn table_of(place: &Path) -> PathBuf {
     if place.is_dir() { place.join(METRICS) } else { place.to_owned() }
 }
@@ -57,29 +57,38 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
         bail!("{} has no column {column}; it has {}", path.display(), shortened(&header));
     }
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
-    let mut columns: BTreeMap<usize, Vec<f64>> = asked.flatten().map(|place| (place, Vec::new())).collect();
-    let places: Vec<usize> = columns.keys().copied().collect();
+    let places: Vec<usize> = BTreeSet::from_iter(asked.flatten()).into_iter().collect();
+    let columns = read_columns(reader, &path, &places, names.len())?;
+    let columns = places.iter().map(|&place| names[place].to_owned()).zip(columns).collect();
+    let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
+    Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
+}
+
+/// Reads the cells at these places, in rising order, of all rows of `path` that have this number of cells.
+fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: usize) -> Result<Vec<Vec<f64>>> {
+    let mut columns = vec![Vec::new(); places.len()];
+    let mut line = Vec::new();
     let mut row = 0;
-    while next_row(&mut reader, &mut line).cannot("read", &path)? > 0 {
+    while next_row(&mut reader, &mut line).cannot("read", path)? > 0 {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
         // Skips incomplete rows: the last row of a run in progress may be one.
-        let Some(cells) = cells(line.trim_ascii_end(), &places, names.len()) else { continue };
-        for (column, cell) in columns.values_mut().zip(cells) {
+        let Some(cells) = cells(line.trim_ascii_end(), places, count) else { continue };
+        for (column, cell) in columns.iter_mut().zip(cells) {
             column.push(number(cell).with_context(|| {
                 let cell = String::from_utf8_lossy(cell);
                 format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell))
             })?);
         }
     }
-    let columns = columns.into_iter().map(|(place, values)| (names[place].to_owned(), values)).collect();
-    let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
-    Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
+    Ok(columns)
 }
 
-/// Returns the cells at these places of a row, in rising order, or `None` if it does not have this number of cells.
+/// The cells at these places of a row, in rising order, or `None` if it does not have this number of cells.
 fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
-    let (mut rest, mut first, mut found) = (row, 0, Vec::with_capacity(places.len()));
+    let mut rest = row;
+    let mut first = 0;
+    let mut found = Vec::with_capacity(places.len());
     for &place in places {
         rest = after_commas(rest, place - first)?;
         first = place;
@@ -90,7 +99,7 @@ fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u
     is_last.then_some(found)
 }
 
-/// Returns what follows this number of commas, if there are as many. Most of a long row is counted in chunks, a few
+/// What follows this number of commas, if there are as many. Most of a long row is counted in chunks, a few
 /// instructions each.
 fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
     let mut begin = 0;
@@ -99,19 +108,20 @@ fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
         if usize::from(commas) >= count {
             break;
         }
-        (begin, count) = (begin + chunk.len(), count - usize::from(commas));
+        begin += chunk.len();
+        count -= usize::from(commas);
     }
     let commas = row[begin..].iter().enumerate().filter(|(_, byte)| **byte == b',').map(|(at, _)| begin + at + 1);
     [0].into_iter().chain(commas).nth(count).map(|after| &row[after..])
 }
 
-/// Returns the number in a cell, NaN where there is none or it cannot be drawn.
+/// The number in a cell, NaN where there is none or it cannot be drawn.
 fn number(cell: &[u8]) -> Result<f64> {
     let number: f64 = if cell.is_empty() { f64::NAN } else { str::from_utf8(cell)?.parse()? };
     Ok(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN })
 }
 
-/// Returns the value at `x` on the straight lines between `points`, or `None` outside of them.
+/// The value at `x` on the straight lines between `points`, or `None` outside of them.
 pub fn value_at(points: &[[f64; 2]], x: f64) -> Option<f64> {
     let after = points.partition_point(|point| point[0] < x);
     let [right, high] = *points.get(after)?;

@@ -50,7 +50,7 @@ impl Comparison {
         Ok(Self { settings: configs.map(|(a, b)| a.compared_with(b)), rows })
     }
 
-    /// Returns it as lines that follow the table of both runs.
+    /// The lines that follow the table of both runs.
     pub(super) fn lines(&self) -> Vec<String> {
         let words = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<String>>();
         let settings = match self.settings.as_deref() {
@@ -77,7 +77,7 @@ impl Comparison {
         [vec![String::new()], aligned(&settings, 2), vec![String::new()], figures].concat()
     }
 
-    /// Returns it as an object of JSON, with these objects of both runs.
+    /// Its object of JSON, with these objects of both runs.
     pub(super) fn as_json(&self, runs: &[Value]) -> Value {
         let settings = self.settings.as_ref().map(|all| {
             let both = all.iter().map(|(key, both)| (key.clone(), json!(both)));
@@ -112,14 +112,14 @@ fn curves(run: &Run) -> Result<Curves> {
     }))
 }
 
-/// Returns the steps at which A was evaluated within the evaluations of B: the last one, and others evenly before it.
+/// The steps at which A was evaluated within the evaluations of B: the last one, and others evenly before it.
 fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
     let common: Vec<f64> = a[0].iter().map(|[step, _]| *step).filter(|step| value_at(&b[0], *step).is_some()).collect();
     let count = common.len().min(MOST_MARKS);
     (1..=count).map(|mark| common[mark * common.len() / count - 1]).collect()
 }
 
-/// Returns the mean of the values after `begin` up to `end`, or NaN if there are none.
+/// The mean of the values after `begin` up to `end`, or NaN if there are none.
 fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
     let inside = points.iter().filter(|[step, _]| *step > begin && *step <= end).map(|[_, value]| *value);
     let (sum, count) = inside.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));

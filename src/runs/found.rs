@@ -21,8 +21,8 @@ const LONGEST_NAME: usize = 40;
 
 /// Where a run stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum State {
-    /// A training writes into it.
+pub(super) enum RunState {
+    /// A training run writes into it.
     Training,
     /// All steps are made.
     Finished,
@@ -37,7 +37,7 @@ pub(super) enum State {
 pub(super) struct Run {
     pub(super) path: PathBuf,
     pub(super) name: String,
-    state: State,
+    state: RunState,
     total_steps: Option<u64>,
     pub(super) figures: Figures,
     pub(super) config: Option<Config>,
@@ -86,7 +86,7 @@ impl Run {
         let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         Self {
             name: whole.file_name().unwrap_or(whole.as_os_str()).to_string_lossy().into_owned(),
-            state: State::of(glance, figures.env_steps, needed, now),
+            state: RunState::of(glance, figures.env_steps, needed, now),
             total_steps,
             changed: config.as_ref().map_or(Vec::new(), |config| default.compared_with(config)),
             problems: problem.into_iter().chain(figures.problem.clone()).collect(),
@@ -101,14 +101,14 @@ impl Run {
         self.figures.stamp.is_some()
     }
 
-    /// Returns the time that its steps take at its present speed, if it trains.
+    /// The time that its steps take at its present speed, if it trains.
     fn left(&self) -> Option<Duration> {
         let steps = self.total_steps?.saturating_sub(self.figures.env_steps?);
         let left = Duration::try_from_secs_f64(steps as f64 / self.figures.steps_per_s).ok();
-        left.filter(|_| self.state == State::Training)
+        left.filter(|_| self.state == RunState::Training)
     }
 
-    /// Returns it as the cells of a row.
+    /// The cells of its row.
     pub(super) fn cells(&self) -> Vec<String> {
         let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
         let steps = match (env_steps, self.total_steps) {
@@ -139,7 +139,7 @@ impl Run {
         ]
     }
 
-    /// Returns it as an object of JSON.
+    /// Its object of JSON.
     pub(super) fn as_json(&self) -> Value {
         let changed = self.changed.iter().map(|(key, [_, own])| (key.clone(), json!(own)));
         let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
@@ -179,7 +179,8 @@ impl Figures {
             let table = read_metrics(run, &names[..1], &names[1..])?;
             let [steps, speeds, goals] = names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
             let known = |values: &[f64]| values.iter().copied().filter(|value| !value.is_nan()).collect::<Vec<f64>>();
-            let (speeds, goals) = (known(&speeds[speeds.len().saturating_sub(LAST)..]), known(goals));
+            let speeds = known(&speeds[speeds.len().saturating_sub(LAST)..]);
+            let goals = known(goals);
             Ok(Self {
                 env_steps: Some(steps.last().map_or(0, |steps| *steps as u64)),
                 steps_per_s: speeds.iter().sum::<f64>() / speeds.len() as f64,
@@ -192,8 +193,8 @@ impl Figures {
     }
 }
 
-impl State {
-    /// Returns the state of a run with these files and steps.
+impl RunState {
+    /// The state of a run with these files and steps.
     fn of(glance: &Glance, env_steps: Option<u64>, total_steps: Option<u64>, now: SystemTime) -> Self {
         let all = env_steps.zip(total_steps).map(|(made, all)| made >= all);
         let age = glance.logged.map(|logged| now.duration_since(logged).unwrap_or_default());
@@ -227,20 +228,20 @@ mod tests {
         let state = |hold, is_marked, made: Option<u64>, age| {
             let logged = Some(now - Duration::from_secs(age));
             let glance = Glance { begun: None, hold, is_marked, config: None, metrics: None, logged };
-            State::of(&glance, made, Some(9), now)
+            RunState::of(&glance, made, Some(9), now)
         };
         use Hold::{Elsewhere, Held, Left, Released};
         assert_eq!(
             state(Held, true, Some(9), 500),
-            State::Training,
+            RunState::Training,
             "resumed with more steps, before its first iteration"
         );
-        assert_eq!(state(Left, false, Some(9), 500), State::Finished);
-        assert_eq!(state(Released, true, None, 500), State::Finished, "a table that cannot be read");
-        assert_eq!(state(Released, true, Some(5), 500), State::Stopped, "by a file");
-        assert_eq!(state(Released, false, Some(5), 500), State::Stopped);
-        assert_eq!([state(Left, false, Some(5), 3), state(Left, false, None, 3)], [State::Failed; 2]);
-        assert_eq!(state(Elsewhere, false, Some(5), 3), State::Training);
-        assert_eq!(state(Elsewhere, false, Some(5), 500), State::Failed);
+        assert_eq!(state(Left, false, Some(9), 500), RunState::Finished);
+        assert_eq!(state(Released, true, None, 500), RunState::Finished, "a table that cannot be read");
+        assert_eq!(state(Released, true, Some(5), 500), RunState::Stopped, "by a file");
+        assert_eq!(state(Released, false, Some(5), 500), RunState::Stopped);
+        assert_eq!([state(Left, false, Some(5), 3), state(Left, false, None, 3)], [RunState::Failed; 2]);
+        assert_eq!(state(Elsewhere, false, Some(5), 3), RunState::Training);
+        assert_eq!(state(Elsewhere, false, Some(5), 500), RunState::Failed);
     }
 }

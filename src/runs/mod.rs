@@ -33,7 +33,8 @@ const WORDS: usize = 2;
 pub fn runs(args: &RunsArgs) -> Result<()> {
     os::start_threads(0)?;
     let default = Config::default();
-    let (mut screen, mut before) = (Screen::default(), Vec::new());
+    let mut screen = Screen::default();
+    let mut before = Vec::new();
     loop {
         let runs = read(args, &default, &before)?;
         let compared = match &runs[..] {
@@ -90,7 +91,7 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     Ok(found.into_par_iter().map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now)).collect())
 }
 
-/// Returns the runs as lines, each with its letter if they have some.
+/// The runs as lines, each with its letter if they have some.
 fn table(runs: &[Run], letters: &[&str]) -> Vec<String> {
     let heads = HEADS.map(String::from).to_vec();
     let rows = [heads].into_iter().chain(runs.iter().map(Run::cells));

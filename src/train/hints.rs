@@ -1,4 +1,4 @@
-//! Notes about settings that are valid but rarely intended, printed before a training starts.
+//! Notes about settings that are valid but rarely intended, printed before a training run starts.
 
 use crate::config::Config;
 
@@ -11,7 +11,7 @@ const LITTLE: f64 = 0.1;
 /// The memory for the models of randomised environments above which there is a note, bytes.
 const MUCH: usize = 2 << 30;
 
-/// Returns the notes about these settings, compared with the `default`, for a scene of this size in bytes.
+/// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
 pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
     let (mut hints, total) = (Vec::from_iter(of_ramps(config)), config.run.total_steps);
     let samples = config.samples_per_minibatch();

@@ -1,4 +1,4 @@
-//! A training on several ranks: they agree on what follows an iteration.
+//! A training run on several ranks: they agree on what follows an iteration.
 
 use std::sync::atomic::Ordering;
 
@@ -73,12 +73,13 @@ impl Session {
         Ok(Decision { save, hand_over, stop })
     }
 
-    /// Returns the steps that led to each divergence, as files with these names and texts.
+    /// The steps that led to each divergence, as files with these names and texts.
     pub(super) fn dumps(&mut self) -> Vec<(String, String)> {
         if !self.dumps {
             return Vec::new();
         }
-        let (iteration, first) = (self.agent.iteration, self.agent.pool.blocks[0].first);
+        let iteration = self.agent.iteration;
+        let first = self.agent.pool.blocks[0].first;
         let mut own: Vec<(String, String)> = Vec::new();
         for (env, hand) in (first..).zip(self.agent.pool.envs_mut()) {
             let Some(diverged) = hand.take_diverged() else { continue };

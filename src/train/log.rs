@@ -16,19 +16,19 @@ pub(super) struct Ended {
 }
 
 impl Ended {
-    /// Computes the scores of `episodes` with control steps of `ctrl_dt` seconds, in a training with or without randomised ones.
+    /// Computes the scores of `episodes` with control steps of `ctrl_dt` seconds, in a training run with or without randomised ones.
     pub(super) fn new(episodes: &[EpisodeStats], ctrl_dt: f64, randomizes: bool) -> Self {
         let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
         Self { nominal: Score::of(&nominal, ctrl_dt), randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)) }
     }
 
-    /// Returns the score to show: the score of the task as it is, if such episodes ended.
+    /// The score to show: the score of the task as it is, if such episodes ended.
     pub(super) fn shown(&self) -> &Score {
         self.randomized.as_ref().filter(|_| self.nominal.episodes == 0).unwrap_or(&self.nominal)
     }
 }
 
-/// Returns the values of an iteration by name, always the same names in the same order. They cover the episodes that ended in
+/// The values of an iteration by name, always the same names in the same order. They cover the episodes that ended in
 /// it, all its steps, the lesson and the evaluation (a score of no episodes if there was none). Then come the update and the
 /// timings, with the traffic of the exchange.
 pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
@@ -52,7 +52,7 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     row
 }
 
-/// Returns the names of the values of any iteration, in a training with or without randomised episodes.
+/// The names of the values of any iteration, in a training run with or without randomised episodes.
 pub(super) fn tags(randomizes: bool) -> Vec<String> {
     let traffic = Exchange::alone(1).take_traffic();
     let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], 0.0, randomizes));
@@ -63,13 +63,13 @@ pub(super) fn tags(randomizes: bool) -> Vec<String> {
 const ACTIONS: &str = "histogram/actions";
 const ADVANTAGES: &str = "histogram/advantages";
 
-/// Returns the values with these names and all other things that are logged, with their descriptions.
+/// The values with these names and all other things that are logged, with their descriptions.
 pub(super) fn described(names: &[String]) -> Descriptions {
     let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
     all.map(|name| (name.to_owned(), tag(name).map(|known| known.description).unwrap_or_default())).collect()
 }
 
-/// Returns the histograms of the rollout that was just learnt from.
+/// The histograms of the rollout that was just learnt from.
 pub(super) fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
     let all = |of: fn(&RolloutBlock) -> &[f32]| histogram(rollout.blocks.iter().flat_map(of));
     vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
@@ -165,7 +165,7 @@ mod tests {
         let expected = [&episode_columns, BETWEEN, &evaluated, AFTER].join(", ");
         assert_eq!(row(&nominal), expected);
         assert_eq!(tags(false), names(&expected));
-        // Randomised episodes are apart, in columns that only such a training has.
+        // Randomised episodes are apart, in columns that only such a training run has.
         let both = ended(true);
         let apart = of("randomized", &OF_TRAINING, &both.randomized.unwrap());
         assert!(apart.starts_with("randomized/return 0, randomized/length 200, randomized/goals 8"), "{apart}");

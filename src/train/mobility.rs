@@ -27,21 +27,25 @@ pub(super) fn mobility(task: &Arc<Task>, default: &EnvConfig) -> String {
     let task = &task.smoothed_as_in(default);
     let played = (0..EPISODES).into_par_iter().map(|episode| play(task, episode));
     let (turned, steps, drops) = played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
-    let (rate, object) = (100.0 * turned / f64::from(steps.max(1)), &task.hand().parts.object);
+    let rate = 100.0 * turned / f64::from(steps.max(1));
+    let object = &task.hand().parts.object;
     format!(
         "random actions turn `{object}` by {rate:.2} rad in 100 steps (the built-in hand: {OF_BUILTIN}), and drop it in {drops} of \
          {EPISODES} episodes; docs/HANDS.md says how to raise the turning rate"
     )
 }
 
-/// Returns how far the object turned, in how many steps, and whether it was dropped.
+/// How far the object turned, in how many steps, and whether it was dropped.
 fn play(task: &Arc<Task>, episode: u64) -> (f64, u32, u32) {
-    let (mut env, spaces) = (Repose::new(task), task.spaces());
-    let (mut observation, mut action) = (vec![0.0; spaces.observation_size], vec![0.0; spaces.action_size]);
+    let mut env = Repose::new(task);
+    let spaces = task.spaces();
+    let mut observation = vec![0.0; spaces.observation_size];
+    let mut action = vec![0.0; spaces.action_size];
     let mut rng = rng::stream(0, "mobility", episode);
     let normal = Normal::new(0.0, STD).expect("a standard deviation");
     env.reset(rng::stream(0, "mobility of", episode), &mut observation);
-    let (mut turned, mut steps) = (0.0, 0);
+    let mut turned = 0.0;
+    let mut steps = 0;
     for step in 0..STEPS {
         let before = env.object().orientation;
         action.fill_with(|| normal.sample(&mut rng));

@@ -1,11 +1,11 @@
 //! The training loop: collect, learn, evaluate, report, save.
 
+mod duties;
 mod hints;
 mod lockstep;
 mod log;
 mod mobility;
 mod outcome;
-mod role;
 mod saver;
 mod session;
 mod start;
@@ -25,12 +25,12 @@ use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums, Task};
 use crate::run::Histogram;
 use crate::schedule::panic_message;
+use duties::{Duties, Follower, Lead};
 use hints::hints;
 use lockstep::Stop;
 use log::histograms;
 use mobility::mobility;
 use outcome::Outcome;
-use role::{Follower, Lead, Role};
 use session::Session;
 
 /// Trains until all steps are made or a stop is requested, and returns the exit code of the program. If a launcher has started
@@ -91,33 +91,36 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
 /// Computes, and leaves reporting and saving to the first rank.
 fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     let mut session = Session::follow(exchange)?;
+    if session.finished() {
+        return Ok(ExitCode::SUCCESS);
+    }
     requests.wait_for_end();
     run(&mut session, &mut Follower, requests)
 }
 
 /// Iterates until all steps are made or a stop is requested, and returns the exit code. All ranks run it together.
-fn run(session: &mut Session, role: &mut dyn Role, requests: &Requests) -> Result<ExitCode> {
-    if !session.begin(requests, role).map_err(|error| role.give_up(error))? {
-        return role.stop(Stop::by_signal(requests));
+fn run(session: &mut Session, duties: &mut dyn Duties, requests: &Requests) -> Result<ExitCode> {
+    if !session.begin(requests, duties).map_err(|error| duties.give_up(error))? {
+        return duties.stop(Stop::by_signal(requests));
     }
     while !session.finished() {
-        let iterated = session.iterate(requests, role).map_err(|error| role.give_up(error))?;
-        let Some(outcome) = iterated else { return role.stop(Stop::by_signal(requests)) };
+        let iterated = session.iterate(requests, duties).map_err(|error| duties.give_up(error))?;
+        let Some(outcome) = iterated else { return duties.stop(Stop::by_signal(requests)) };
         if outcome.decision.hand_over {
-            role.keep(session.checkpoint());
+            duties.keep(session.checkpoint());
         }
-        role.report(session, &outcome)?;
+        duties.report(session, &outcome)?;
         if session.finished() {
             break;
         }
         if let Some(stop) = outcome.decision.stop {
-            return role.stop(stop);
+            return duties.stop(stop);
         }
         if outcome.decision.save {
-            role.save();
+            duties.save();
         }
     }
-    role.finish(session)?;
+    duties.finish(session)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -127,7 +130,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
-    fn iterate(&mut self, requests: &Requests, role: &mut dyn Role) -> Result<Option<Outcome>> {
+    fn iterate(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
         let never = Requests::none();
         let now = self.requests_now(requests, &never);
@@ -137,12 +140,12 @@ impl Session {
             let Some(iteration) = self.agent.iterate(now.stop())? else { return Ok(None) };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, now, role)? else { return Ok(None) };
+            let Some(evaluation) = self.evaluate(due, now, duties)? else { return Ok(None) };
             let histograms = self.histograms();
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
             let dumps = self.dumps();
-            let decision = self.decide(requests, role.is_stopped_by_file(), improved)?;
+            let decision = self.decide(requests, duties.is_stopped_by_file(), improved)?;
             Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, histograms, dumps, decision }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
@@ -180,8 +183,8 @@ impl Session {
     }
 
     fn evaluation_episodes(&self) -> Episodes {
-        let (seed, count) = (self.config.run.seed, self.config.run.eval_episodes);
-        Episodes { seed, purpose: "evaluation", first: 0, count }
+        let run = &self.config.run;
+        Episodes { seed: run.seed, purpose: "evaluation", first: 0, count: run.eval_episodes }
     }
 
     /// Hands over the state before the first iteration, after an evaluation if the run ends when evaluations no longer rise. Returns
@@ -189,11 +192,11 @@ impl Session {
     ///
     /// # Errors
     /// Fails as an evaluation does.
-    fn begin(&mut self, requests: &Requests, role: &mut dyn Role) -> Result<bool> {
+    fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let never = Requests::none();
             let now = self.requests_now(requests, &never);
-            let Some(before) = caught(|| self.evaluate(true, now, role))? else { return Ok(false) };
+            let Some(before) = caught(|| self.evaluate(true, now, duties))? else { return Ok(false) };
             let known = figures(&before);
             ensure!(
                 known.iter().all(|x| x.is_finite()),
@@ -202,7 +205,7 @@ impl Session {
             self.take_down(&before);
             self.rise = Some(Rise::new(known));
         }
-        role.keep(self.checkpoint());
+        duties.keep(self.checkpoint());
         Ok(true)
     }
 
@@ -219,7 +222,7 @@ impl Session {
     }
 
     /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
-    fn evaluate(&self, due: bool, requests: &Requests, role: &mut dyn Role) -> Result<Option<Score>> {
+    fn evaluate(&self, due: bool, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Score>> {
         let ctrl_dt = self.task.config().ctrl_dt;
         if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
@@ -228,11 +231,11 @@ impl Session {
         let actor = Actor::Mean(self.agent.ppo.policy().freeze());
         let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
-            role.attend(requests);
+            duties.attend(requests);
             Ok(())
         })?;
         let score = played.map(|played| Score::of(&played, ctrl_dt));
-        score.iter().for_each(|score| role.evaluated(self.agent.env_steps, score));
+        score.iter().for_each(|score| duties.evaluated(self.agent.env_steps, score));
         Ok(score)
     }
 }
@@ -243,7 +246,7 @@ fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
     caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))))
 }
 
-/// Returns the figures by which a run that ends when evaluations no longer rise is compared with its start.
+/// The figures by which a run that ends when evaluations no longer rise is compared with its start.
 fn figures(score: &Score) -> [f64; 3] {
     HEADLINE.map(|column| score[column])
 }
@@ -254,7 +257,7 @@ const EARLY: u64 = 50;
 /// The iterations between two sets of histograms.
 const HISTOGRAMS_EVERY: u64 = 50;
 
-/// Returns whether there is an evaluation after this iteration. It depends on nothing else, so that a stop leaves no trace.
+/// Whether there is an evaluation after this iteration. It depends on nothing else, so that a stop leaves no trace.
 fn evaluates(iteration: u64, every: u64) -> bool {
     iteration.is_multiple_of(every) || iteration == EARLY && every > EARLY
 }

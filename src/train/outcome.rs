@@ -1,4 +1,4 @@
-//! The results of an iteration of a training.
+//! The results of an iteration of a training run.
 
 use super::lockstep::Decision;
 use crate::agent::Iteration;

@@ -1,4 +1,4 @@
-//! Saving a training to disk: checkpoints and the best policy, in its run folder or, if that is not possible, elsewhere.
+//! Saving a training run to disk: checkpoints and the best policy, in its run folder or, if that is not possible, elsewhere.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
 
-/// The saver of a training. It always holds the state at the end of the last complete iteration, or the state that was last
+/// The saver of a training run. It always holds the state at the end of the last complete iteration, or the state that was last
 /// handed over. This state remains if the next iteration does not complete.
 ///
 /// Nothing in the folder of a resumed run is changed before the first iteration is done. Until then, a user who named the wrong
@@ -48,7 +48,7 @@ pub(super) struct Held {
 }
 
 impl Saver {
-    /// Creates the saver of a training with these options and settings at its `initial` state, which may be the newest checkpoint
+    /// Creates the saver of a training run with these options and settings at its `initial` state, which may be the newest checkpoint
     /// in the folder.
     pub(super) fn new(
         (folder, lock): (RunFolder, Locked),
@@ -75,7 +75,8 @@ impl Saver {
         let is_best = last.progress.best != self.held.last.progress.best;
         self.held.last = Arc::new(last);
         if is_best {
-            (self.held.best, self.held.best_is_saved) = (Some(self.held.last.clone()), false);
+            self.held.best = Some(self.held.last.clone());
+            self.held.best_is_saved = false;
         }
         self.save_before_fatal_errors();
     }
@@ -113,7 +114,7 @@ impl Saver {
         Ok(())
     }
 
-    /// Releases the folder after a training that has ended normally. After any other end, the name stays in the lock file.
+    /// Releases the folder after a training run that has ended normally. After any other end, the name stays in the lock file.
     pub(super) fn release(&mut self) {
         self.lock.take().into_iter().for_each(Locked::release);
     }
@@ -170,7 +171,8 @@ impl Saver {
 
     /// Arranges for the state at the end of the last iteration to be saved if MuJoCo is about to end the process.
     fn save_before_fatal_errors(&self) {
-        let (held, holds) = (self.held.clone(), self.lock.as_ref().map(Locked::watch));
+        let held = self.held.clone();
+        let holds = self.lock.as_ref().map(Locked::watch);
         sim::before_fatal_error(move |said| {
             os::say(&format!("error: {said}"));
             if !held.wrote {
@@ -180,7 +182,8 @@ impl Saver {
             let ours = holds.is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
             match ours.and_then(|()| held.write(&held.folder, held.keep)) {
                 Ok(()) => {
-                    let (iteration, command) = (held.last.progress.iteration, held.how_to_resume(&held.folder));
+                    let iteration = held.last.progress.iteration;
+                    let command = held.how_to_resume(&held.folder);
                     os::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
                 }
                 Err(error) => os::say(&format!("error: {:#}", held.elsewhere(error))),
@@ -190,7 +193,7 @@ impl Saver {
 }
 
 impl Held {
-    /// Returns the progress of the training as text.
+    /// The progress of the training as text.
     pub(super) fn steps_made(&self) -> String {
         format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
     }
@@ -224,13 +227,13 @@ impl Held {
         }
     }
 
-    /// Returns the command that resumes the run in this folder with the same options.
+    /// The command that resumes the run in this folder with the same options.
     pub(super) fn how_to_resume(&self, run: &RunFolder) -> String {
         format!("{} train --resume {}{}", os::called_as(), os::quoted_path(run.path()), self.options)
     }
 }
 
-/// Returns the score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run. It is the score
+/// The score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run. It is the score
 /// of the best checkpoint in the folder. If that is lost, the score of the policy that was made from it counts, else the score
 /// in the resumed checkpoint.
 pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<Evaluation>) -> Option<Evaluation> {
@@ -270,7 +273,7 @@ fn keep_policy(folder: &RunFolder, last: &Checkpoint) -> Result<()> {
     os::write_whole(&folder.policy(), &policy.to_bytes()?)
 }
 
-/// Returns the versions of the program and its parts, as written into a run folder.
+/// The versions of the program and its parts, as written into a run folder.
 fn version() -> String {
     format!(
         "shadow-repose {}\ncommit {}\nmujoco {}\n{}\ntarget {}\n",

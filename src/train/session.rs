@@ -1,4 +1,4 @@
-//! A training that is set up: its environments, learner and saver.
+//! A training run that is set up: its environments, learner and saver.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use crate::repose::{Record, Repose, Task};
 use crate::run::{self, RunFolder};
 use crate::sim;
 
-/// Everything that a training owns, except its saver.
+/// Everything that a training run owns, except its saver.
 pub(super) struct Session {
     /// The settings of the run.
     pub config: Config,
@@ -56,7 +56,7 @@ impl Session {
         if let Some(warning) = session.agent.exchange.expect_alike(&session.scene)?.filter(|_| threads == 0) {
             os::say(&format!("warning: {warning}"));
         }
-        // A new folder is created last, so that a training that cannot be set up leaves none behind.
+        // A new folder is created last, so that a training run that cannot be set up leaves none behind.
         let (place, from_newest) = match existing {
             Some(existing) => existing,
             None => (RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?, false),
@@ -122,7 +122,7 @@ impl Session {
         checkpoint.finish()
     }
 
-    /// Returns the complete state at the end of the last iteration.
+    /// The complete state at the end of the last iteration.
     pub(super) fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = Checkpoint::default();
         self.agent.save(&mut checkpoint);
@@ -134,12 +134,12 @@ impl Session {
         checkpoint
     }
 
-    /// Returns whether all steps are made, or evaluations no longer rise.
+    /// Whether all steps are made, or evaluations no longer rise.
     pub(super) fn finished(&self) -> bool {
         self.agent.env_steps >= self.config.run.total_steps || self.is_flat()
     }
 
-    /// Returns whether the run ends because evaluations no longer rise.
+    /// Whether the run ends because evaluations no longer rise.
     pub(super) fn is_flat(&self) -> bool {
         self.rise.is_some_and(|rise| rise.since >= self.config.run.patience)
     }

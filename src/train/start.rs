@@ -1,4 +1,4 @@
-//! What a training starts from: settings, and a policy or a state. Only the first rank needs the files. The others receive the
+//! What a training run starts from: settings, and a policy or a state. Only the first rank needs the files. The others receive the
 //! plan.
 
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use crate::ranks::Exchange;
 use crate::repose::{Record, Task};
 use crate::run::{self, RunFolder};
 
-/// The settings of a training and what it starts from.
+/// The settings of a training run and what it starts from.
 pub(super) struct Plan {
     /// The settings of the run.
     pub config: Config,
@@ -32,7 +32,7 @@ pub(super) struct Plan {
     pub dumps: bool,
 }
 
-/// What a training takes from the checkpoint that it starts from.
+/// What a training run takes from the checkpoint that it starts from.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) enum Takes {
     /// The policy. Everything else is as in any new run.
@@ -47,7 +47,7 @@ pub(super) enum Takes {
 pub(super) type Existing = ((RunFolder, Locked), bool);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
-type Message = (String, Option<(Takes, Vec<u8>)>, Option<Evaluation>, Option<String>, bool);
+type PlanParts = (String, Option<(Takes, Vec<u8>)>, Option<Evaluation>, Option<String>, bool);
 
 impl Plan {
     /// Plans what the command line asks for, in the folder of a run if it exists.
@@ -62,7 +62,7 @@ impl Plan {
         }
     }
 
-    /// Returns the plan of a training that starts from random weights. The path of its scene is made absolute, so that the run does
+    /// The plan of a training run that starts from random weights. The path of its scene is made absolute, so that the run does
     /// not depend on the folder in which it was started.
     ///
     /// # Errors
@@ -92,7 +92,7 @@ impl Plan {
         Ok(Self { from: Some((Takes::Policy, checkpoint)), context, ..plan })
     }
 
-    /// Plans to resume a training from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
+    /// Plans to resume a training run from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
     ///
     /// # Errors
     /// Fails if a setting is given that cannot be changed, or if the run cannot be resumed.
@@ -192,25 +192,26 @@ impl Plan {
     pub(super) fn send(&self, exchange: &Exchange) -> Result<()> {
         if !exchange.is_alone() {
             let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| checkpoint.to_bytes().map(|bytes| (*takes, bytes));
-            let (config, from) = (self.config.to_text(), self.from.as_ref().map(bytes).transpose()?);
-            exchange.broadcast::<Message>(Some((config, from, self.best, self.context.clone(), self.dumps)));
+            let config = self.config.to_text();
+            let from = self.from.as_ref().map(bytes).transpose()?;
+            exchange.broadcast::<PlanParts>(Some((config, from, self.best, self.context.clone(), self.dumps)));
         }
         Ok(())
     }
 
-    /// Returns the plan that the first rank has sent.
+    /// The plan that the first rank has sent.
     ///
     /// # Errors
     /// Fails if the sender runs another version of the program.
     pub(super) fn receive(exchange: &Exchange) -> Result<Self> {
-        let (config, from, best, context, dumps) = exchange.broadcast::<Message>(None);
+        let (config, from, best, context, dumps) = exchange.broadcast::<PlanParts>(None);
         let config = Settings::new().file(Source::new("the settings that were sent", config)).resolve()?;
         let from = from.map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
         Ok(Self { config, from: from.transpose()?, best, context, dumps })
     }
 }
 
-/// Returns the checkpoint `place`, or the checkpoints of the run there, the newest first.
+/// The checkpoint `place`, or the checkpoints of the run there, the newest first.
 fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
     if !place.is_dir() {
         return Ok(vec![place.to_owned()]);

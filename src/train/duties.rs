@@ -22,7 +22,7 @@ const FAR: f64 = 10.0;
 const FAR_FOR: u32 = 20;
 
 /// What a rank does besides computing. By default that is nothing.
-pub(super) trait Role {
+pub(super) trait Duties {
     /// Whether the user asks by a file to stop.
     fn is_stopped_by_file(&self) -> bool {
         false
@@ -73,7 +73,7 @@ pub(super) trait Role {
 /// A rank that only computes.
 pub(super) struct Follower;
 
-impl Role for Follower {}
+impl Duties for Follower {}
 
 /// The first rank.
 pub(super) struct Lead {
@@ -151,7 +151,7 @@ impl Lead {
     }
 }
 
-impl Role for Lead {
+impl Duties for Lead {
     fn is_stopped_by_file(&self) -> bool {
         self.saver.held.folder.take_stop()
     }
