@@ -24,11 +24,7 @@ const LONGER_FUNCTIONS: &[&str] = &[
     "play/browser.rs: from_trace",
     "play/mod.rs: play",
     "play/mod.rs: play_unseen",
-    "plot.rs: plot",
-    "plot.rs: runs",
-    "repose/environment.rs: restore",
     "robustness.rs: robustness",
-    "run/table.rs: read_metrics",
 ];
 
 /// The statements that set several variables from values written side by side. The number only shrinks.
