@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::{Error, Result};
+use anyhow::Result;
 
 use super::lockstep::Stop;
 use super::log::{Ended, described, row, tags};
@@ -47,27 +47,6 @@ pub(super) trait Duties {
 
     /// Saves the state that was kept.
     fn save(&mut self) {}
-
-    /// Ends a run that is asked to stop. The exit code is the program's.
-    ///
-    /// # Errors
-    /// Fails if the run folder cannot be written to.
-    fn stop(&mut self, stop: Stop) -> Result<ExitCode> {
-        Ok(os::exit_code(stop.signal))
-    }
-
-    /// Ends a run that has failed for this reason.
-    fn give_up(&mut self, reason: Error) -> Error {
-        reason
-    }
-
-    /// Ends a run that has made all its steps.
-    ///
-    /// # Errors
-    /// Fails if the run folder cannot be written to.
-    fn finish(&mut self, _session: &Session) -> Result<()> {
-        Ok(())
-    }
 }
 
 /// A rank that only computes.
@@ -79,6 +58,7 @@ impl Duties for Follower {}
 pub(super) struct Lead {
     report: Report,
     saver: Saver,
+    quiet: bool,
     /// The number of steps of this session in which the physics diverged.
     diverged: u64,
     /// Whether the warning about them was printed.
@@ -96,7 +76,7 @@ impl Lead {
         let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
         let report = Report::new(saver.held.folder.path(), &tags, progress);
         let report = report.described(described(&tags), config.to_text(), hparams);
-        Self { report, saver, diverged: 0, warned: false, far: 0 }
+        Self { report, saver, quiet, diverged: 0, warned: false, far: 0 }
     }
 
     /// Writes into the folder of a new run for the first time.
@@ -132,22 +112,58 @@ impl Lead {
         }
     }
 
-    /// Prints how many steps diverged, if there was a warning.
-    pub(super) fn say_how_many_diverged(&self) {
+    /// Ends the run: saves for the last time, and says how it ended. The exit code is the program's.
+    ///
+    /// # Errors
+    /// Fails as the run has, or if the run folder cannot be written to.
+    pub(super) fn end(mut self, session: &Session, ended: Result<Option<Stop>>) -> Result<ExitCode> {
+        if !matches!(ended, Ok(Some(_))) {
+            self.report.end(ended.is_ok());
+        }
+        let saved = self.saver.save_at_last(&mut self.report);
         if self.warned {
             os::say(&format!("warning: {} steps of this session diverged", self.diverged));
         }
+        let held = &self.saver.held;
+        let stop = ended.inspect_err(|_| match &saved {
+            Ok(()) if held.wrote => os::say(&format!("saved the state after {}", held.steps_made())),
+            Ok(()) => os::say("the run folder was not changed"),
+            Err(error) => os::say(&format!("error: {error:#}")),
+        })?;
+        saved?;
+        match stop {
+            None => self.finish(session),
+            Some(stop) => self.stop(stop),
+        }
+        Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
     }
 
-    /// Prints how to look at a run that has finished.
-    pub(super) fn say_what_next(&self, env: &EnvConfig) {
-        let program = os::called_as();
-        let run = self.saver.held.folder.path();
-        let word = os::quoted_path(run);
-        let all = run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let all = os::quoted_path(all);
-        let play = format!("{program} play --ckpt {word}{}", scene_option(env));
-        os::say(&format!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {all}"));
+    fn finish(&mut self, session: &Session) {
+        let held = &self.saver.held;
+        held.folder.mark_finished(true);
+        let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
+        os::say(&format!("{why}: {}; {}", held.steps_made(), held.folder.path().display()));
+        if let Some(rise) = &session.rise {
+            os::say(&before_and_after(rise, session.config.run.eval_episodes));
+        }
+        if !self.quiet {
+            say_what_next(held.folder.path(), &session.config.env);
+        }
+        self.saver.release();
+    }
+
+    fn stop(&mut self, stop: Stop) {
+        let held = &self.saver.held;
+        if !held.wrote {
+            return os::say(
+                "stopped before the first iteration: the run is unchanged; repeat the same command to continue",
+            );
+        }
+        held.folder.mark_finished(stop.by_file);
+        let reason = if stop.by_file { "stopped by the file `stop`" } else { "stopped" };
+        os::say(&format!("{reason} after {}; resume with", held.steps_made()));
+        os::say(&format!("  {}", held.how_to_resume(&held.folder)));
+        self.saver.release();
     }
 }
 
@@ -174,10 +190,7 @@ impl Duties for Lead {
     }
 
     fn report(&mut self, session: &Session, outcome: &Outcome) -> Result<()> {
-        if let Err(error) = self.saver.open_folder(&mut self.report) {
-            self.report.finish();
-            return Err(self.saver.held.elsewhere(error));
-        }
+        self.saver.open_folder(&mut self.report)?;
         for (name, text) in &outcome.dumps {
             let dumped = self.saver.held.folder.dump(name, text);
             dumped.unwrap_or_else(|error| self.report.warn(&format!("{error:#}")));
@@ -199,47 +212,6 @@ impl Duties for Lead {
     fn save(&mut self) {
         self.saver.save_or_warn(&mut self.report);
     }
-
-    fn stop(&mut self, stop: Stop) -> Result<ExitCode> {
-        self.saver.save_at_last(&mut self.report)?;
-        let held = &self.saver.held;
-        if held.wrote {
-            held.folder.mark_finished(stop.by_file);
-            let reason = if stop.by_file { "stopped by the file `stop`" } else { "stopped" };
-            os::say(&format!("{reason} after {}; resume with", held.steps_made()));
-            os::say(&format!("  {}", held.how_to_resume(&held.folder)));
-            self.saver.release();
-        } else {
-            os::say("stopped before the first iteration: the run is unchanged; repeat the same command to continue");
-        }
-        Ok(os::exit_code(stop.signal))
-    }
-
-    fn give_up(&mut self, reason: Error) -> Error {
-        self.report.end(false);
-        let saved = self.saver.save_at_last(&mut self.report);
-        let held = &self.saver.held;
-        match saved {
-            Ok(()) if held.wrote => os::say(&format!("saved the state after {}", held.steps_made())),
-            Ok(()) => os::say("the run folder was not changed"),
-            Err(error) => os::say(&format!("error: {error:#}")),
-        }
-        reason
-    }
-
-    fn finish(&mut self, session: &Session) -> Result<()> {
-        self.report.end(true);
-        self.saver.save_at_last(&mut self.report)?;
-        let held = &self.saver.held;
-        held.folder.mark_finished(true);
-        let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
-        os::say(&format!("{why}: {}; {}", held.steps_made(), held.folder.path().display()));
-        if let Some(rise) = &session.rise {
-            os::say(&before_and_after(rise, session.config.run.eval_episodes));
-        }
-        self.saver.release();
-        Ok(())
-    }
 }
 
 /// The first evaluation and the best one as a table.
@@ -250,4 +222,13 @@ fn before_and_after(rise: &Rise, episodes: usize) -> String {
         table += &format!("\n  {:<20} {:>8} {:>8}", measure.label(), measure.text(before), measure.text(best));
     }
     table
+}
+
+/// Prints how to look at a run that has finished.
+fn say_what_next(run: &Path, env: &EnvConfig) {
+    let program = os::called_as();
+    let word = os::quoted_path(run);
+    let all = run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let play = format!("{program} play --ckpt {word}{}", scene_option(env));
+    os::say(&format!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {}", os::quoted_path(all)));
 }

@@ -27,11 +27,11 @@ impl Stop {
 /// What follows an iteration.
 #[derive(Debug, Default)]
 pub(super) struct Decision {
-    /// Whether to save.
+    /// Whether to save, although the run goes on.
     pub save: bool,
     /// Whether the state is handed to the saver. If nobody else waits, it always is: the next iteration may be cut short.
     pub hand_over: bool,
-    /// Whether the run stops here.
+    /// Whether the run stops here, before its end.
     pub stop: Option<Stop>,
 }
 
@@ -66,11 +66,12 @@ impl Session {
         }
         let any = |of: fn(&Vote) -> bool| votes.iter().any(of);
         let signal = votes.iter().map(|vote| vote.signal).max().unwrap_or(0);
-        let stop = any(|vote| vote.stop).then_some(Stop { by_file, signal });
+        let finished = self.finished();
+        let stop = (!finished && any(|vote| vote.stop)).then_some(Stop { by_file, signal });
         let save = any(|vote| vote.save) || self.agent.iteration.is_multiple_of(self.config.run.checkpoint_every);
-        let last = self.finished() || stop.is_some();
-        let hand_over = exchange.is_alone() || last || save || any(|vote| vote.improved);
-        Ok(Decision { save, hand_over, stop })
+        let is_last = finished || stop.is_some();
+        let hand_over = exchange.is_alone() || is_last || save || any(|vote| vote.improved);
+        Ok(Decision { save: save && !is_last, hand_over, stop })
     }
 
     /// The steps that led to each divergence, as files with these names and texts.

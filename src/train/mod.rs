@@ -79,13 +79,8 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     if args.resume.is_none() {
         lead.open_folder()?;
     }
-    let code = run(&mut session, &mut lead, requests);
-    lead.say_how_many_diverged();
-    let code = code?;
-    if session.finished() && !args.quiet {
-        lead.say_what_next(&session.config.env);
-    }
-    Ok(code)
+    let ended = run(&mut session, &mut lead, requests);
+    lead.end(&session, ended)
 }
 
 /// Computes, and leaves reporting and saving to the first rank.
@@ -95,33 +90,29 @@ fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     requests.wait_for_end();
-    run(&mut session, &mut Follower, requests)
+    let stop = run(&mut session, &mut Follower, requests)?;
+    Ok(os::exit_code(stop.map_or(0, |stop| stop.signal)))
 }
 
-/// Iterates until all steps are made or a stop is requested, and returns the exit code. All ranks run it together.
-fn run(session: &mut Session, duties: &mut dyn Duties, requests: &Requests) -> Result<ExitCode> {
-    if !session.begin(requests, duties).map_err(|error| duties.give_up(error))? {
-        return duties.stop(Stop::by_signal(requests));
+/// Iterates until all steps are made, or until a stop is requested, which is returned. All ranks run it together.
+fn run(session: &mut Session, duties: &mut dyn Duties, requests: &Requests) -> Result<Option<Stop>> {
+    if !session.begin(requests, duties)? {
+        return Ok(Some(Stop::by_signal(requests)));
     }
     while !session.finished() {
-        let iterated = session.iterate(requests, duties).map_err(|error| duties.give_up(error))?;
-        let Some(outcome) = iterated else { return duties.stop(Stop::by_signal(requests)) };
+        let Some(outcome) = session.iterate(requests, duties)? else { return Ok(Some(Stop::by_signal(requests))) };
         if outcome.decision.hand_over {
             duties.keep(session.checkpoint());
         }
         duties.report(session, &outcome)?;
-        if session.finished() {
-            break;
-        }
-        if let Some(stop) = outcome.decision.stop {
-            return duties.stop(stop);
+        if outcome.decision.stop.is_some() {
+            return Ok(outcome.decision.stop);
         }
         if outcome.decision.save {
             duties.save();
         }
     }
-    duties.finish(session)?;
-    Ok(ExitCode::SUCCESS)
+    Ok(None)
 }
 
 impl Session {
@@ -307,7 +298,7 @@ mod tests {
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
         let error = session.iterate(&never, &mut lead).unwrap_err();
-        let error = format!("{:#}", lead.give_up(error));
+        let error = format!("{:#}", lead.end(&session, Err(error)).unwrap_err());
         assert!(error.contains("iteration 2: panic: "), "{error}");
         let saved = os::read_bytes(&latest).unwrap();
         assert_eq!(Checkpoint::parse(&saved).unwrap().progress.iteration, 1);

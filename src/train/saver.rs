@@ -164,7 +164,9 @@ impl Saver {
     /// # Errors
     /// Fails if the folder cannot be written to. The message states where the state is instead.
     pub(super) fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
-        let saved = if self.held.wrote { self.save(report) } else { Ok(()) };
+        let iteration = |state: &Checkpoint| state.progress.iteration;
+        let is_new = self.held.wrote || iteration(&self.held.last) > iteration(&self.initial);
+        let saved = if is_new { self.save(report) } else { Ok(()) };
         report.finish();
         saved.map_err(|error| self.held.elsewhere(error))
     }
