@@ -178,8 +178,8 @@ impl Session {
         Episodes { seed: run.seed, purpose: "evaluation", first: 0, count: run.eval_episodes }
     }
 
-    /// Hands over the state before the first iteration, after an evaluation if the run ends when evaluations no longer rise. Returns
-    /// whether it can go on: no stop was requested meanwhile.
+    /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Says whether it can go on: no stop
+    /// was requested meanwhile.
     ///
     /// # Errors
     /// Fails as an evaluation does.
@@ -195,8 +195,8 @@ impl Session {
             );
             self.take_down(&before);
             self.rise = Some(Rise::new(known));
+            duties.keep(self.checkpoint());
         }
-        duties.keep(self.checkpoint());
         Ok(true)
     }
 

@@ -46,16 +46,8 @@ impl Session {
         if let (Some(folder), Some(init)) = (&args.run_dir, &args.init) {
             run::expect_other_policy(folder, init)?;
         }
-        let (mut plan, existing) = Plan::of(args)?;
-        let loaded = plan.load_task()?;
-        let exchange = exchange.clone().over(plan.config.shards())?;
-        plan.send(&exchange)?;
-        let threads = plan.config.run.threads;
-        os::start_threads(threads)?;
-        let session = Self::new(plan, loaded, exchange)?;
-        if let Some(warning) = session.agent.exchange.expect_alike(&session.scene)?.filter(|_| threads == 0) {
-            os::say(&format!("warning: {warning}"));
-        }
+        let (plan, existing) = Plan::of(args)?;
+        let session = Self::set_up(plan, exchange)?;
         // A new folder is created last, so that a training run that cannot be set up leaves none behind.
         let (place, from_newest) = match existing {
             Some(existing) => existing,
@@ -71,14 +63,25 @@ impl Session {
     /// Fails as [`Plan::receive`] and [`Session::new`] do.
     pub(super) fn follow(exchange: &Exchange) -> Result<Self> {
         sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
-        let mut plan = Plan::receive(exchange)?;
-        let loaded = plan.load_task()?;
-        os::start_threads(plan.config.run.threads)?;
-        let exchange = exchange.clone().over(plan.config.shards())?;
-        let session = Self::new(plan, loaded, exchange)?;
-        session.agent.exchange.expect_alike(&session.scene)?;
+        let session = Self::set_up(Plan::receive(exchange)?, exchange)?;
         // Together with the state that the saver begins with.
         session.checkpoint();
+        Ok(session)
+    }
+
+    /// Sets up what is planned, on all ranks together.
+    fn set_up(mut plan: Plan, exchange: &Exchange) -> Result<Self> {
+        let loaded = plan.load_task()?;
+        let exchange = exchange.clone().over(plan.config.shards())?;
+        if exchange.is_first() {
+            plan.send(&exchange)?;
+        }
+        let threads = plan.config.run.threads;
+        os::start_threads(threads)?;
+        let session = Self::new(plan, loaded, exchange)?;
+        let exchange = &session.agent.exchange;
+        let warning = exchange.expect_alike(&session.scene)?.filter(|_| exchange.is_first() && threads == 0);
+        warning.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
         Ok(session)
     }
 
