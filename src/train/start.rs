@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::saver::best_so_far;
 use crate::agent::expect_states;
 use crate::cli::TrainArgs;
-use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
+use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source, short};
 use crate::load::{self, PolicySource};
 use crate::os::{self, Locked};
 use crate::ppo::{Checkpoint, Evaluation, Fork};
@@ -112,9 +112,9 @@ impl Plan {
             .with_context(|| format!("cannot resume {}", place.display()))?;
         let context = format!("cannot resume from {}", path.display());
         let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args));
-        let config = config.and_then(|config| expect_states(&checkpoint, &config).map(|()| config));
-        expect_same(&checkpoint, &path, args)?;
         let config = config.with_context(|| context.clone())?;
+        expect_same(&Settings::new().file(load::source(&checkpoint, &path)).resolve()?, &config)?;
+        expect_states(&checkpoint, &config).with_context(|| context.clone())?;
         expect_config(&folder, &config)?;
         // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
         // one must not replace it.
@@ -224,7 +224,7 @@ fn settings(args: &TrainArgs) -> Result<Settings> {
     Ok(Settings::new().user_file(args.settings.config.as_deref())?.sets(&overrides(args)))
 }
 
-/// Returns the single settings, including settings that have their own options.
+/// The single settings, including settings that have their own options.
 fn overrides(args: &TrainArgs) -> Vec<Override> {
     let options = [
         ("run.seed", args.seed),
@@ -236,19 +236,14 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
     args.settings.set.iter().cloned().chain(given).collect()
 }
 
-/// Checks that each `--set` of a resumed run says what its checkpoint says already.
-fn expect_same(checkpoint: &Checkpoint, path: &Path, args: &TrainArgs) -> Result<()> {
-    for set in args.settings.set.iter().filter(|set| set.key != MODEL) {
-        let stored = Settings::new().file(load::source(checkpoint, path));
-        let own = stored.clone().resolve()?;
-        let with = stored.sets(std::slice::from_ref(set)).resolve();
-        let same = with.is_ok_and(|with| with == own);
-        ensure!(
-            same,
-            "--set {}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
-            set.key
-        );
-    }
+/// Checks that a resumed run has the settings that are `stored` in its checkpoint.
+fn expect_same(stored: &Config, config: &Config) -> Result<()> {
+    let differing = stored.differences(config);
+    ensure!(
+        differing.is_empty(),
+        "{}: a resumed run accepts only {MODEL}, --total-steps and --threads; use --fork for other settings",
+        differing.join("; ")
+    );
     Ok(())
 }
 
@@ -274,19 +269,12 @@ fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig)
     Ok(())
 }
 
-/// Checks that the settings that determine the size of the state or the kind of policy are unchanged.
+/// Checks that a fork keeps the settings that determine the size of the state or the kind of policy.
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
-    let of = |config: &Config| {
-        let PpoConfig { hidden, symmetry, activation, .. } = &config.ppo;
-        [
-            ("env.num_envs", config.env.num_envs.to_string()),
-            ("ppo.hidden", format!("{hidden:?}")),
-            ("ppo.symmetry", format!("{symmetry:?}").to_lowercase()),
-            ("ppo.activation", format!("{activation:?}").to_lowercase()),
-        ]
-    };
-    for ((key, before), (_, now)) in of(parent).into_iter().zip(of(config)) {
-        ensure!(before == now, "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
+    let kept = ["env.num_envs", "ppo.hidden", "ppo.symmetry", "ppo.activation"];
+    for (key, [before, now]) in parent.compared_with(config) {
+        let [before, now] = [before, now].map(|value| short(&value));
+        ensure!(!kept.contains(&&*key), "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
     }
     Ok(())
 }

@@ -127,7 +127,7 @@ fn what_sizes_the_saved_state_cannot_be_changed_by_a_fork() {
         ("ppo.symmetry=none", "ppo.symmetry = none: a fork keeps object"),
         ("ppo.activation=tanh", "ppo.activation = tanh: a fork keeps elu"),
         ("env.model=other.xml", "not the scene of the checkpoint"),
-        ("ppo.hidden=[16,9]", "ppo.hidden = [16, 9]: a fork keeps [16, 8]"),
+        ("ppo.hidden=[16,9]", "ppo.hidden = [16,9]: a fork keeps [16,8]"),
         ("run.total_steps=256", "run.total_steps = 256: the checkpoint is at step 256 already"),
         ("ppo.horizont=4", "did you mean ppo.horizon?"),
     ] {

@@ -283,7 +283,7 @@ fn a_file_tells_scripts_whether_a_training_is_to_be_continued() {
     let same = resume(folder.path(), &["--total-steps", "128", "--set", "env.num_envs=16"]);
     assert!(stderr(&succeeded(same)).contains("is finished"));
     let other = resume(folder.path(), &["--set", "env.num_envs=32"]);
-    assert!(stderr(&other).contains("--set env.num_envs: a resumed run accepts only"), "{}", stderr(&other));
+    assert!(stderr(&other).contains("env.num_envs = 32, not 16: a resumed run accepts only"), "{}", stderr(&other));
 }
 
 #[test]
