@@ -148,6 +148,7 @@ impl Saver {
         self.describe()?;
         self.held.write(&self.held.folder, self.held.keep)?;
         self.held.best_is_saved = true;
+        self.held.wrote = true;
         Ok(())
     }
 
