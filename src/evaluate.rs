@@ -6,6 +6,7 @@
 use std::f64::consts::TAU;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -310,8 +311,19 @@ impl<'a> Lanes<'a> {
     }
 }
 
+impl Actor<'static> {
+    /// The actors that need no policy, by the names that a user gives in place of one.
+    pub const WITHOUT_POLICY: [(&'static str, Self); 3] =
+        [("zero", Self::Zero), ("random", Self::Random), ("wave", Self::Wave)];
+
+    /// The place of this name in [`Self::WITHOUT_POLICY`].
+    pub fn without_policy(name: &Path) -> Option<usize> {
+        Self::WITHOUT_POLICY.iter().position(|(known, _)| name == Path::new(known))
+    }
+}
+
 impl Actor<'_> {
-    /// Returns the actor's name as shown beside its score.
+    /// The actor's name as shown beside its score.
     pub fn name(&self) -> &'static str {
         match self {
             Actor::Mean(_) | Actor::Outside(_) => "policy",

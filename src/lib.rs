@@ -18,20 +18,20 @@
 //! | `processor` | the sentence about a processor that MuJoCo cannot run on; of the program only | - |
 //! | [`mod@train`] | the training loop: collect, learn, evaluate, report, save | agent, cli, config, env, evaluate, load, os, ppo, quat, ranks, repose, rng, run, schedule, sim, tags |
 //! | [`mod@play`] | plays a policy: in a window or a browser, as a film or an HTML file, or for its score as a table or JSON | cli, config, evaluate, goal_times, load, os, ppo, repose, robustness, run, see, sim, trace |
-//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | cli, config, draw, evaluate, load, os, repose |
+//! | [`mod@robustness`] | the score of a policy under changed physics, noise and delays | config, draw, evaluate, os, repose |
 //! | [`mod@view`] | shows the scene without a policy | cli, config, evaluate, os, repose, run, see, sim |
 //! | [`mod@export`] | a policy as an ONNX file | cli, config, evaluate, load, os, ppo, repose, run, spaces |
 //! | [`mod@plot`] | learning curves of runs | cli, draw, os, run, tags |
 //! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
-//! | [`see`] | rendering of the task: window, film, picture, page | cli, draw, env, evaluate, os, repose, sim |
+//! | [`cli`] | the structure of the command line | config, evaluate, os, see, sim |
+//! | [`see`] | rendering of the task: window, film, picture, page | draw, env, evaluate, os, repose, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
 //! | [`agent`] | environments, learner and rollout; one iteration of training | config, env, ppo, ranks, repose, schedule, spaces |
+//! | [`load`] | checkpoints and policies from untrusted files | config, evaluate, os, ppo, repose, run |
 //! | [`mod@evaluate`] | whole episodes under one policy, the basis of scores | env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
-//! | [`load`] | checkpoints and policies from untrusted files | config, os, ppo, repose, run |
-//! | [`cli`] | the structure of the command line | config, sim |
 //! | [`repose`] | the task: hand, observation (one table), reward, changes for training | config, env, os, quat, rng, sim, spaces |
 //! | [`mod@env`] | many environments, in blocks that step without a barrier or all at once; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`fused`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |

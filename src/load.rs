@@ -7,9 +7,10 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, Error, Result};
+use anyhow::{Context, Error, Result, ensure};
 
 use crate::config::{BUILTIN_MODEL, Config, MODEL, NetConfig, Override, Reader, Settings, Source};
+use crate::evaluate::Actor;
 use crate::os;
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
 use crate::repose::{Record, Task};
@@ -53,16 +54,18 @@ pub enum PolicySource {
 }
 
 impl PolicySource {
-    /// The origin that `place` names: `builtin`, `robust` (unless there is such a file or folder), a file, or a run
-    /// folder. A run folder stands for its best checkpoint or, if there is none yet, its latest.
+    /// Finds what `place` names: `builtin`, `robust`, a file, or a run folder. A run folder stands for its best checkpoint or, if
+    /// there is none yet, its latest.
     ///
     /// # Errors
-    /// Fails if there is no such file, run folder or checkpoint.
+    /// Fails if there is no such file, run folder or checkpoint, or if the name is of an actor without a policy.
     pub fn find(place: &Path) -> Result<Self> {
-        match BUILTIN.iter().position(|policy| place == Path::new(policy.name)) {
-            // A run may have the same name as a later built-in policy.
-            Some(i) if i == 0 || !place.exists() => Ok(Self::BuiltIn(&BUILTIN[i])),
-            _ => run::resolve_checkpoint(place).map(Self::File),
+        let name = place.display();
+        let needs_none = Actor::without_policy(place).is_some();
+        ensure!(!needs_none, "`{name}` acts without a policy; a file or folder of that name is ./{name}");
+        match BUILTIN.iter().find(|policy| place == Path::new(policy.name)) {
+            Some(policy) => Ok(Self::BuiltIn(policy)),
+            None => run::resolve_checkpoint(place).map(Self::File),
         }
     }
 

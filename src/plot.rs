@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use crate::cli::{Along, PlotArgs};
-use crate::draw::{self, Chart, Curve, Picture, Subplot};
-use crate::os::{self, OutputFile, similar};
+use crate::draw::{Chart, Curve, Picture, PictureFile, Subplot};
+use crate::os::{self, similar};
 use crate::run::{self, MetricsTable, value_at};
 use crate::tags::tag;
 
@@ -53,9 +53,8 @@ struct RunTable {
 pub fn plot(args: &PlotArgs) -> Result<()> {
     // Opened before anything is read, so that a path that cannot be written to is reported at once.
     let tables: Vec<PathBuf> = args.runs.iter().map(|place| run::table_of(place)).collect();
-    run::expect_output(&args.out, tables.iter().map(PathBuf::as_path), None)?;
-    let output = OutputFile::create(&args.out)?;
-    draw::picture_format(&output)?;
+    run::expect_output(&args.out.path, tables.iter().map(PathBuf::as_path), None)?;
+    let output = PictureFile::create(&args.out)?;
     let asked = args.metric.iter().map(|name| (&name[..], None));
     let metrics: Vec<Metric> = if args.metric.is_empty() { DEFAULT.to_vec() } else { asked.collect() };
     let wanted: Vec<&str> = metrics.iter().flat_map(|(usual, other)| [*usual].into_iter().chain(*other)).collect();
@@ -74,7 +73,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let panels = metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, args)).collect();
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
     let plural = if runs.len() == 1 { "" } else { "s" };
-    os::say(&format!("{}: {} run{plural}", args.out.display(), runs.len()));
+    os::say(&format!("{}: {} run{plural}", args.out.path.display(), runs.len()));
     Ok(())
 }
 

@@ -7,12 +7,10 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
-use crate::cli::PlayArgs;
 use crate::config::{EnvConfig, Override};
-use crate::draw::{self, BarChart, HeatMap, Picture};
+use crate::draw::{self, BarChart, HeatMap, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::load::Loaded;
-use crate::os::{self, OutputFile, Requests, number};
+use crate::os::{self, Destination, Requests, number};
 use crate::repose::{Score, Task, measure};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -61,32 +59,72 @@ struct Row {
     kept: f64,
 }
 
-/// Plays the policy under each condition and prints the table. If interrupted, prints the rows so far. Leaves out a condition that
-/// the task cannot take, such as another size of an object with a mesh, and says so.
+/// What comes out.
+pub struct Report {
+    /// Whether the table is printed as JSON.
+    pub json: bool,
+    /// The picture of the table.
+    pub picture: Option<Destination>,
+}
+
+/// Loads the task with changes.
+pub type Loading<'a> = dyn Fn(&[Override]) -> Result<Arc<Task>> + 'a;
+
+/// Plays the actor at `place` under each condition and prints the table. If interrupted, prints the rows so far.
 ///
 /// # Errors
 /// Fails if the task cannot be loaded without a change, if an episode panics, or if the picture cannot be written.
-pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Requests) -> Result<ExitCode> {
-    let output = args.out.as_deref().map(OutputFile::create).transpose()?;
-    output.as_ref().map(draw::picture_format).transpose()?;
-    let task = |condition: &Condition| {
-        let sets = [&args.set[..], &condition.sets].concat();
-        loaded.task(&sets).with_context(|| format!("row `{}`", condition.name))
-    };
-    // Problems are found now rather than after minutes.
-    let mut playable: Vec<(Condition, Arc<Task>)> = Vec::new();
+pub fn robustness(
+    task: &Loading,
+    actor: &Actor,
+    place: &str,
+    episodes: Episodes,
+    report: &Report,
+    requests: &Requests,
+) -> Result<ExitCode> {
+    let output = report.picture.as_ref().map(PictureFile::create).transpose()?;
+    let Episodes { seed, count, .. } = episodes;
+    let rows = played(playable(task)?, actor, episodes, requests)?;
+    let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
+    match report.json {
+        true => os::print(&format!("{}\n", as_json(&rows, count, seed, place)))?,
+        false => os::print(&table(&rows, count, seed, place))?,
+    }
+    match output {
+        Some(file) if interrupted => {
+            os::say(&format!("{}: interrupted, not written", file.output.path().display()));
+        }
+        Some(file) => picture(&rows, count, place).write(file)?,
+        None => {}
+    }
+    Ok(if interrupted { os::exit_code(requests.signal()) } else { ExitCode::SUCCESS })
+}
+
+/// The conditions with their tasks. Leaves out a condition that the task cannot take, such as another size of an object with a mesh, and
+/// says so. Thus problems are found before anything is played, which takes minutes.
+fn playable(task: &Loading) -> Result<Vec<(Condition, Arc<Task>)>> {
+    let mut playable = Vec::new();
     for condition in conditions() {
-        match task(&condition) {
+        match task(&condition.sets).with_context(|| format!("row `{}`", condition.name)) {
             Ok(task) => playable.push((condition, task)),
             Err(reason) if playable.is_empty() => return Err(reason),
             Err(reason) => os::say(&format!("left out: {reason:#}")),
         }
     }
+    Ok(playable)
+}
+
+/// Plays these conditions, and those with equal settings once. Returns the rows until an interruption.
+fn played(
+    playable: Vec<(Condition, Arc<Task>)>,
+    actor: &Actor,
+    episodes: Episodes,
+    requests: &Requests,
+) -> Result<Vec<Row>> {
     let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config().clone()).collect();
-    let count = args.episodes.unwrap_or(256) as usize;
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
-    let bar = os::progress_bar((different * count) as u64, "episodes", "robustness");
-    let (mut rows, episodes): (Vec<Row>, _) = (Vec::new(), Episodes::scored(args.seed, count));
+    let bar = os::progress_bar((different * episodes.count) as u64, "episodes", "robustness");
+    let mut rows: Vec<Row> = Vec::new();
     for ((condition, task), config) in playable.into_iter().zip(configs) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
         bar.set_message(condition.name.clone());
@@ -103,19 +141,7 @@ pub fn robustness(args: &PlayArgs, loaded: &Loaded, actor: &Actor, requests: &Re
         let kept = if nominal > 0.0 { score["goals"] / nominal } else { f64::NAN };
         rows.push(Row { condition, config, score, kept });
     }
-    drop(bar);
-    let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
-    if args.json {
-        os::print(&format!("{}\n", as_json(&rows, count, args.seed, &loaded.origin.to_string())))?;
-    } else {
-        os::print(&table(&rows, count, args.seed, &loaded.origin.to_string()))?;
-    }
-    match output {
-        Some(output) if interrupted => os::say(&format!("{}: interrupted, not written", output.path().display())),
-        Some(output) => picture(&rows, count, &loaded.origin.to_string()).write(output)?,
-        None => {}
-    }
-    Ok(if interrupted { os::exit_code(requests.signal()) } else { ExitCode::SUCCESS })
+    Ok(rows)
 }
 
 /// Returns all rows: the task itself, the single changes, and the grid.

@@ -4,24 +4,19 @@ use std::path::Path;
 use std::rc::Rc;
 use std::sync::Arc;
 
-#[cfg(not(all(feature = "video", feature = "viewer")))]
-use anyhow::bail;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 
-use crate::cli::{Motion, ViewArgs, usage_error};
+use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
 use crate::evaluate::{Actor, Episodes, Player};
-use crate::os;
+use crate::os::{self, OutputFile};
 use crate::repose::Task;
 use crate::run;
 use crate::see;
+use crate::sim::Camera;
 
-/// The actors, and their names in a window.
-const ACTORS: [(Motion, &str, Actor); 3] = [
-    (Motion::Zero, "zero", Actor::Zero),
-    (Motion::Random, "random", Actor::Random),
-    (Motion::Wave, "wave", Actor::Wave),
-];
+/// What to do where no window can be opened.
+const INSTEAD: &str = "Without a window, --web shows the hand in a browser, and --out hand.png draws it.";
 
 /// Shows the scene in a window or on a page, or writes one picture of it.
 ///
@@ -30,47 +25,32 @@ const ACTORS: [(Motion, &str, Actor); 3] = [
 /// can be opened.
 pub fn view(args: &ViewArgs) -> Result<()> {
     expect_used(&args.settings.set, "view")?;
-    if args.shot.size.is_some() && args.screenshot.is_none() {
-        return Err(usage_error("view", "--size applies only to a picture (--screenshot)").into());
+    let made = match (&args.out, args.web) {
+        (Some(_), _) => Made::Picture,
+        (None, Some(_)) => Made::Web,
+        (None, None) => Made::Window,
+    };
+    expect_together(&[made], &args.given).map_err(|text| usage_error("view", &text))?;
+    let file = args.settings.config.as_deref();
+    let config = Settings::new().user_file(file)?.sets(&args.settings.set).resolve()?;
+    let choice = Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
+    let shot = args.shot.sized(args.size, args.quality);
+    let load = || task_for_display(&config, &shot);
+    match (&args.out, args.web) {
+        (Some(to), _) => {
+            run::expect_output(&to.path, file, config.env.model_file())?;
+            let output = OutputFile::create(&to.path)?;
+            draw(output, &load()?, choice, Episodes::scored(args.seed, 1), args.at)
+        }
+        (None, Some(port)) => show_on_page(port, &load()?, choice, args.seed, shot.camera),
+        (None, None) => show(&load()?, choice, Episodes::scored(args.seed, usize::MAX)),
     }
-    if args.at.is_some() && args.web.is_some() {
-        return Err(usage_error("view", "--at applies only to a picture (--screenshot)").into());
-    }
-    if args.shot.quality.is_some() && args.web.is_some() {
-        return Err(usage_error("view", "--quality applies only to a picture (--screenshot) or a window").into());
-    }
-    args.screenshot.as_deref().map_or(Ok(()), os::expect_folder)?;
-    let config = Settings::new().user_file(args.settings.config.as_deref())?.sets(&args.settings.set).resolve()?;
-    if let Some(path) = &args.screenshot {
-        run::expect_output(path, args.settings.config.as_deref(), config.env.model_file())?;
-    }
-    let first = ACTORS.iter().position(|(motion, ..)| *motion == args.actions).context("an actor for each motion")?;
-    let episodes = Episodes::scored(args.seed, usize::MAX);
-    if let Some(port) = args.web {
-        return show_on_page(port, args, &config, first);
-    }
-    match &args.screenshot {
-        Some(path) => draw(path, args, &config, &ACTORS[first].2, episodes),
-        None => show(args, &config, first, episodes),
-    }
-}
-
-/// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
-fn show_on_page(port: u16, args: &ViewArgs, config: &Config, actor: usize) -> Result<()> {
-    let task = task_for_display(config, args)?;
-    let sliders = see::Sliders::new(&task);
-    let scene = config.env.model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
-    let about = see::About { title: scene, policy: None, seed: Some(args.seed) };
-    let own = sliders.clone();
-    let step = move |player: &mut Player| player.step_changed(&ACTORS[actor].2, |action| own.change(action));
-    let acting = see::LiveActor { step: Rc::new(step), policy: None, task: task.clone() };
-    see::Live::open(port, (&about, args.shot.camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }
 
 /// Loads the task, and prints what the settings replace in the user's scene.
-fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
+fn task_for_display(config: &Config, shot: &see::Shot) -> Result<Arc<Task>> {
     let task = Task::new(&config.env, &config.hand)?;
-    let task = see::task_for_display(&task, &args.shot, [1280, 720], crate::sim::Quality::High)?;
+    let task = see::task_for_display(&task, shot)?;
     if config.env.model_file().is_some() {
         os::say(task.table().trim_end());
     }
@@ -78,28 +58,44 @@ fn task_for_display(config: &Config, args: &ViewArgs) -> Result<Arc<Task>> {
     Ok(task)
 }
 
+/// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
+fn show_on_page(port: u16, task: &Arc<Task>, choice: usize, seed: u64, camera: Option<Camera>) -> Result<()> {
+    let sliders = see::Sliders::new(task);
+    let title = task.config().model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
+    let about = see::About { title, policy: None, seed: Some(seed) };
+    let own = sliders.clone();
+    let step = move |player: &mut Player| {
+        let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+        player.step_changed(actor, |action| own.change(action))
+    };
+    let acting = see::LiveActor { step: Rc::new(step), policy: None, task: task.clone() };
+    see::Live::open(port, (&about, camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
+}
+
 #[cfg(feature = "video")]
-fn draw(path: &Path, args: &ViewArgs, config: &Config, actor: &Actor, episodes: Episodes) -> Result<()> {
-    let task = task_for_display(config, args)?;
-    let [width, height] = see::screenshot(path, &task, actor, episodes, args.at.unwrap_or(0.5))?;
+fn draw(output: OutputFile, task: &Arc<Task>, choice: usize, episodes: Episodes, seconds: f64) -> Result<()> {
+    let path = output.path().to_owned();
+    let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+    let [width, height] = see::screenshot(output, task, actor, episodes, seconds)?;
     os::say(&format!("{}: {width}x{height}", path.display()));
     Ok(())
 }
 
 #[cfg(not(feature = "video"))]
-fn draw(_: &Path, _: &ViewArgs, _: &Config, _: &Actor, _: Episodes) -> Result<()> {
+fn draw(_: OutputFile, _: &Arc<Task>, _: usize, _: Episodes, _: f64) -> Result<()> {
     bail!(see::NO_FILMS)
 }
 
 #[cfg(feature = "viewer")]
-fn show(args: &ViewArgs, config: &Config, first: usize, episodes: Episodes) -> Result<()> {
-    let task = task_for_display(config, args)?;
-    let window = see::Window::open(&task, ACTORS.iter().map(|(_, name, _)| *name).collect(), first)?;
-    os::say(&window.play(&task, &ACTORS.map(|(.., actor)| actor), episodes)?);
+fn show(task: &Arc<Task>, choice: usize, episodes: Episodes) -> Result<()> {
+    match see::Window::open(task, Actor::WITHOUT_POLICY.into(), choice) {
+        Ok(window) => os::say(&window.play(task, episodes)?),
+        Err(error) => bail!("{error:#}\n  {INSTEAD}"),
+    }
     Ok(())
 }
 
 #[cfg(not(feature = "viewer"))]
-fn show(_: &ViewArgs, _: &Config, _: usize, _: Episodes) -> Result<()> {
-    bail!(see::NO_WINDOWS)
+fn show(_: &Arc<Task>, _: usize, _: Episodes) -> Result<()> {
+    bail!("{}. {INSTEAD}", see::NO_WINDOWS)
 }

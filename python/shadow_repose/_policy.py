@@ -139,7 +139,7 @@ def evaluate(
         seed: the seed from which they are drawn.
         set: settings that replace those of its task, e.g. `{"env.friction_scale": 0.8}`. The task of a function has the default settings.
         threads: worker threads. 0 means one per core.
-        trace: a file for the steps of the first episodes. `shadow-repose play --from-trace TRACE --html FILE` shows them in a browser.
+        trace: a file for the steps of the first episodes. `shadow-repose play --from-trace TRACE --out FILE.html` shows them in a browser.
 
     Ctrl-C interrupts it, after the present call of a function. Raises ValueError as `Policy.load` does, and for actions of another shape
     or that are not finite. Raises TypeError for actions that are not numbers, and whatever the function raises.

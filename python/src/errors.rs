@@ -12,9 +12,7 @@ use pyo3::prelude::*;
 pub(crate) fn refused(error: Error) -> PyErr {
     let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     let kind = kinds.map(std::io::Error::kind).next();
-    // The library's messages name options of its command line.
-    let text =
-        format!("{error:#}").replace("--mirror plays", "set={\"env.mirror\": True} plays").replace("--set ", "set ");
+    let text = format!("{error:#}");
     match kind {
         Some(ErrorKind::NotFound) => PyFileNotFoundError::new_err(text),
         Some(ErrorKind::PermissionDenied) => PyPermissionError::new_err(text),

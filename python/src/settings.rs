@@ -32,7 +32,6 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 /// Fails if the settings are invalid, or if the scene cannot be used.
 pub(crate) fn resolve(config: Option<&Path>, overrides: &[Override]) -> Result<(Config, Arc<Task>)> {
     let config = Settings::new().user_file(config)?.sets(overrides).resolve()?;
-    ensure!(!config.env.mirror, "env.mirror: it mirrors for a policy, and here is none");
     let task = Task::new(&config.env, &config.hand)?;
     Ok((Config { env: task.config().clone(), ..config }, task))
 }

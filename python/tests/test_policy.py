@@ -111,7 +111,7 @@ def test_a_function_of_the_user_is_scored_as_a_policy_and_its_steps_are_written(
     header, *steps = traces[0].read_text().splitlines()
     assert json.loads(header)["actor"] == "policy" and steps == traces[1].read_text().splitlines()[1:]
     html = tmp_path / "own.html"
-    subprocess.run([program(), "play", "--from-trace", traces[0], "--html", html], check=True)
+    subprocess.run([program(), "play", "--from-trace", traces[0], "--out", html], check=True)
     assert html.stat().st_size > 100_000
 
 

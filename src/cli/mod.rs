@@ -1,19 +1,26 @@
 //! The command line: its structure and help texts. What the commands do is elsewhere.
 
 mod results;
+mod together;
 mod values;
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::builder::RangedU64ValueParser;
+use clap::builder::{PossibleValuesParser, RangedU64ValueParser};
 use clap::error::ErrorKind;
 use clap::{ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, Override};
+use crate::evaluate::Actor;
+use crate::os::Destination;
+use crate::see;
 use crate::sim::{self, Camera, Quality};
 pub use results::{Along, PlotArgs, RunsArgs};
-use values::{LARGEST, camera, quality, seconds, size, steps, time};
+use together::given;
+pub use together::{Made, expect_together};
+use values::{LARGEST, camera, destination, quality, seconds, size, steps, time};
 
 /// Parses a number of threads, within the limits of `run.threads`.
 fn threads() -> RangedU64ValueParser<usize> {
@@ -104,19 +111,10 @@ pub fn command() -> clap::Command {
 
 /// Builds the command line without the defaults that come from settings, which are slow to load.
 fn without_defaults() -> clap::Command {
-    let (program, commit) = (env!("CARGO_PKG_VERSION"), env!("SHADOW_REPOSE_COMMIT"));
+    let program = env!("CARGO_PKG_VERSION");
+    let commit = env!("SHADOW_REPOSE_COMMIT");
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
-    // `view` makes no films.
-    let of_view = [
-        ("set", "Change one env.* setting, e.g. env.model=my_scene.xml; repeatable, overrides the file"),
-        ("size", "Size of the picture in pixels [default: 1280x720]"),
-        ("quality", "Rendering quality; high adds shadows, reflections and smooth edges [default: high]"),
-    ];
-    let with_helps = |command: clap::Command| match command.get_name() {
-        "view" => of_view.into_iter().fold(command, |view, (arg, help)| view.mut_arg(arg, |arg| arg.help(help))),
-        _ => command,
-    };
-    Cli::command().version(version).mut_subcommands(with_helps)
+    Cli::command().version(version)
 }
 
 /// Parses the command line of this process.
@@ -124,18 +122,27 @@ fn without_defaults() -> clap::Command {
 /// # Errors
 /// Fails if the command line is wrong, or asks for help or the version.
 pub fn parse() -> Result<Cli, clap::Error> {
-    let parsed = without_defaults().try_get_matches().map_err(|answer| match answer.kind() {
-        ErrorKind::DisplayHelp => command().try_get_matches().err().unwrap_or(answer),
+    parse_from(std::env::args_os())
+}
+
+/// Parses a command line, which begins with the name of the program.
+///
+/// # Errors
+/// Fails as [`parse`] does.
+pub fn parse_from<T: Into<OsString> + Clone>(words: impl IntoIterator<Item = T>) -> Result<Cli, clap::Error> {
+    let words: Vec<OsString> = words.into_iter().map(Into::into).collect();
+    let parsed = without_defaults().try_get_matches_from(&words);
+    let matches = parsed.map_err(|answer| match answer.kind() {
+        ErrorKind::DisplayHelp => command().try_get_matches_from(&words).err().unwrap_or(answer),
         _ => answer,
-    });
-    let mut cli = Cli::from_arg_matches(&parsed?).map_err(|error| error.format(&mut command()))?;
-    let (mirror, sets) = match &mut cli.command {
-        Command::Train(args) => (args.mirror, &mut args.settings.set),
-        Command::Play(args) => (args.mirror, &mut args.set),
-        Command::Export(args) => (args.mirror, &mut args.set),
-        _ => return Ok(cli),
-    };
-    sets.extend(mirror.then(|| Override { key: "env.mirror".into(), value: "true".into() }));
+    })?;
+    let mut cli = Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command()))?;
+    let given = given(&matches);
+    match &mut cli.command {
+        Command::Play(args) => args.given = given,
+        Command::View(args) => args.given = given,
+        _ => {}
+    }
     Ok(cli)
 }
 
@@ -145,7 +152,7 @@ pub struct Settings {
     /// TOML file with the settings that differ from the defaults
     #[arg(long, value_name = "FILE", help_heading = SETTINGS)]
     pub config: Option<PathBuf>,
-    /// Change one setting, e.g. ppo.learning_rate=1e-4; repeatable, overrides the file
+    /// Change one setting that the command uses, e.g. env.sim_dt=0.005; repeatable, overrides the file
     #[arg(long, value_name = "KEY=VALUE", help_heading = SETTINGS)]
     pub set: Vec<Override>,
 }
@@ -182,9 +189,6 @@ pub struct TrainArgs {
     /// ramps continue
     #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
-    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
-    #[arg(long, requires = "init", help_heading = START)]
-    pub mirror: bool,
     /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
     #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000), help_heading = RUN_FOLDER)]
     pub keep: Option<usize>,
@@ -202,13 +206,10 @@ pub struct TrainArgs {
 /// The options of `play`.
 #[derive(Args, Debug)]
 pub struct PlayArgs {
-    /// Policy to play: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
-    /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
+    /// Who acts: a checkpoint, a run folder (its best checkpoint, else its latest), a built-in policy (builtin, or robust for other
+    /// physics and delays), or actions without a policy (zero, random, wave) [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
-    #[arg(long, help_heading = POLICY)]
-    pub mirror: bool,
     /// Number of episodes to play, each to its end [default: 256; 1 in a film or an HTML file; no limit in a window]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
@@ -219,16 +220,13 @@ pub struct PlayArgs {
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads())]
     pub threads: usize,
     /// Sample actions from the policy's distribution instead of using its mean
-    #[arg(long, conflicts_with = "policy", help_heading = POLICY)]
+    #[arg(long, help_heading = POLICY)]
     pub stochastic: bool,
     /// Change one env.* or hand.* setting of the task; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,
-    /// Play a baseline instead of a checkpoint: actions of 0, or uniformly random ones
-    #[arg(long, conflicts_with = "ckpt", help_heading = POLICY)]
-    pub policy: Option<Baseline>,
     /// Play in a window in real time [default if there is a display]
-    #[arg(long, conflicts_with_all = ["headless", "json", "trace", "video"], help_heading = OUTPUT)]
+    #[arg(long, help_heading = OUTPUT)]
     pub window: bool,
     /// Play without a window and print the score
     #[arg(long, help_heading = OUTPUT)]
@@ -237,43 +235,39 @@ pub struct PlayArgs {
     #[arg(long, help_heading = OUTPUT)]
     pub json: bool,
     /// Play under changed physics, noise and delays, one change at a time, and print a table of the share of goals retained
-    #[arg(long, conflicts_with_all = ["window", "trace", "video", "policy"], help_heading = OUTPUT)]
+    #[arg(long, help_heading = OUTPUT)]
     pub robustness: bool,
-    /// Write the table of --robustness as a picture, .svg or .png
-    #[arg(long, value_name = "FILE", requires = "robustness", help_heading = OUTPUT)]
-    pub out: Option<PathBuf>,
-    /// Write the first episodes as JSON lines: whole episodes, at least 2000 records
+    /// Write a film (.mp4, .gif), a file for any browser (.html; at most 20 episodes), the first episodes as JSON lines (.jsonl; at
+    /// least 2000 records), or the table of --robustness (.svg, .png); repeatable; jsonl:FILE names the kind of a FILE without an ending
+    #[arg(long, value_name = "FILE", help_heading = OUTPUT, value_parser = destination(&["mp4", "gif", "html", "jsonl", "svg", "png"]))]
+    pub out: Vec<Destination>,
+    /// Write the episodes of this trace as the .html of --out, without playing again
     #[arg(long, value_name = "FILE", help_heading = OUTPUT)]
-    pub trace: Option<PathBuf>,
-    /// Write at most 20 episodes as one HTML file, which any browser shows offline
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["window", "robustness"], help_heading = OUTPUT)]
-    pub html: Option<PathBuf>,
-    /// Write the episodes of this trace to the HTML file, without playing again
-    #[arg(long, value_name = "FILE", requires = "html", help_heading = OUTPUT,
-        conflicts_with_all = [
-            "trace", "video", "json", "headless", "episodes", "policy", "ckpt", "mirror", "stochastic", "seed", "threads", "fps", "out",
-        ])]
     pub from_trace: Option<PathBuf>,
     /// Show the hand in a browser while it plays, at this port of 127.0.0.1 (0: any free port) [default port: 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT,
-        conflicts_with_all = ["window", "headless", "json", "trace", "html", "video", "robustness", "episodes"])]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = OUTPUT)]
     pub web: Option<u16>,
-    /// Number of hands on the page of --web, at most 16 [default: 1]
-    #[arg(long, value_name = "N", requires = "web", help_heading = OUTPUT,
-        value_parser = clap::value_parser!(u64).range(1..=16))]
-    pub hands: Option<u64>,
-    /// Follow a training run: its newest policy plays each episode
-    #[arg(long, requires = "web", conflicts_with = "policy", help_heading = OUTPUT)]
+    /// Number of hands on the page of --web, at most 16
+    #[arg(long, value_name = "N", default_value_t = 1, help_heading = OUTPUT, value_parser = clap::value_parser!(u64).range(1..=16))]
+    pub hands: u64,
+    /// Follow a training run with --web: its newest policy plays each episode
+    #[arg(long, help_heading = OUTPUT)]
     pub follow: bool,
-    /// Film the episodes one after another, as .mp4 or .gif; needs no display
-    #[arg(long, value_name = "FILE", help_heading = PICTURE)]
-    pub video: Option<PathBuf>,
-    /// Frames of the film per second of simulated time [default: 50]
-    #[arg(long, requires = "video", value_parser = clap::value_parser!(u32).range(1..=120), help_heading = PICTURE)]
-    pub fps: Option<u32>,
-    /// Size, camera and rendering.
+    /// Frames of the film per second of simulated time
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=120), help_heading = PICTURE)]
+    pub fps: u32,
+    /// Size of the film in pixels [default: 640x480]
+    #[arg(long, value_name = "WxH", value_parser = size, help_heading = PICTURE)]
+    pub size: Option<[u32; 2]>,
+    /// Rendering quality; high adds shadows, reflections and smooth edges [default: fast for a film, else high]
+    #[arg(long, value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
+    pub quality: Option<Quality>,
+    /// Camera and meshes.
     #[command(flatten)]
     pub shot: Shot,
+    /// The options that were given, for [`expect_together`].
+    #[arg(skip)]
+    pub given: Vec<String>,
 }
 
 /// The options of `export`.
@@ -283,9 +277,6 @@ pub struct ExportArgs {
     /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
     #[arg(long, value_name = "FILE|RUN|NAME", help_heading = POLICY)]
     pub ckpt: Option<PathBuf>,
-    /// Use a policy of the opposite hand (left or right), which is the mirror image of this hand
-    #[arg(long, help_heading = POLICY)]
-    pub mirror: bool,
     /// Change one env.* setting that the file records, e.g. env.model=my_scene.xml; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = TASK)]
     pub set: Vec<Override>,
@@ -300,55 +291,59 @@ pub struct ViewArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
     pub settings: Settings,
-    /// Motion of the hand: still, random, or a slow swing of each actuator
-    #[arg(long, value_enum, default_value_t = Motion::Zero, help_heading = SETTINGS)]
-    pub actions: Motion,
+    /// Motion of the hand: zero (still), random, or wave (a slow swing of each actuator)
+    #[arg(long, default_value = "zero", value_parser = PossibleValuesParser::new(Actor::WITHOUT_POLICY.map(|(name, _)| name)),
+        help_heading = SETTINGS)]
+    pub actions: String,
     /// Random seed; episode k is drawn from (seed, k)
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
     pub seed: u64,
-    /// Write one PNG picture and exit, without opening a window; needs no display
-    #[arg(long, value_name = "FILE", help_heading = PICTURE)]
-    pub screenshot: Option<PathBuf>,
+    /// Write one picture (.png) and exit, without opening a window; needs no display
+    #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = PICTURE)]
+    pub out: Option<Destination>,
     /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free port) [default port:
     /// 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", conflicts_with = "screenshot",
-        help_heading = PICTURE)]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = PICTURE)]
     pub web: Option<u16>,
-    /// Time of the picture in the episode, in seconds [default: 0.5]
-    #[arg(long, value_name = "SECONDS", requires = "screenshot", value_parser = seconds, help_heading = PICTURE)]
-    pub at: Option<f64>,
-    /// Size, camera and rendering.
+    /// Time of the picture in the episode, in seconds
+    #[arg(long, value_name = "SECONDS", default_value = "0.5", value_parser = seconds, help_heading = PICTURE)]
+    pub at: f64,
+    /// Size of the picture in pixels
+    #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size, help_heading = PICTURE)]
+    pub size: [u32; 2],
+    /// Rendering quality; high adds shadows, reflections and smooth edges
+    #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
+    pub quality: Quality,
+    /// Camera and meshes.
     #[command(flatten)]
     pub shot: Shot,
+    /// The options that were given, for [`expect_together`].
+    #[arg(skip)]
+    pub given: Vec<String>,
 }
 
-/// The options for size, camera and rendering.
+/// The options for what is seen.
 #[derive(Args, Clone, Debug)]
 pub struct Shot {
-    /// Size of the film in pixels [default: 640x480]
-    #[arg(long, value_name = "WxH", value_parser = size, help_heading = PICTURE)]
-    pub size: Option<[u32; 2]>,
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
     pub camera: Option<Camera>,
-    /// Rendering quality; high adds shadows, reflections and smooth edges [default: fast for a film, else high]
-    #[arg(long, value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
-    pub quality: Option<Quality>,
     /// Show the primitives used for collisions instead of the hand's meshes
     #[arg(long, help_heading = PICTURE)]
     pub plain: bool,
 }
 
 impl Shot {
-    /// Returns the name of the first of these options that was given.
-    pub fn given(&self) -> Option<&'static str> {
-        let given = [
-            ("--size", self.size.is_some()),
-            ("--camera", self.camera.is_some()),
-            ("--quality", self.quality.is_some()),
-            ("--plain", self.plain),
-        ];
-        given.into_iter().find(|(_, given)| *given).map(|(option, _)| option)
+    /// What to show, with this size and quality.
+    pub fn sized(&self, size: [u32; 2], quality: Quality) -> see::Shot {
+        see::Shot { size, camera: self.camera, quality, plain: self.plain }
+    }
+}
+
+impl PlayArgs {
+    /// Whether a score or a file is asked for.
+    pub fn wants_result(&self) -> bool {
+        self.headless || self.json || !self.out.is_empty()
     }
 }
 
@@ -357,26 +352,6 @@ pub fn usage_error(name: &str, text: &str) -> clap::Error {
     let mut command = command();
     command.build();
     command.find_subcommand_mut(name).expect("a command").error(ErrorKind::ArgumentConflict, text)
-}
-
-/// The motion of the hand in `view`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Motion {
-    /// Every actuator stays in the middle of its range
-    Zero,
-    /// Uniformly random actions
-    Random,
-    /// Each actuator swings slowly around the middle of its range, slightly after the previous one
-    Wave,
-}
-
-/// Policies that need no checkpoint.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Baseline {
-    /// Actions are always 0: every actuator stays in the middle of its range
-    Zero,
-    /// Uniformly random actions
-    Random,
 }
 
 /// The options of `bench`.

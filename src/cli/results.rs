@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 
-use super::values::size;
+use super::values::{destination, size};
+use crate::os::Destination;
 
 /// The options of `plot`.
 #[derive(Args, Debug)]
@@ -14,8 +15,8 @@ pub struct PlotArgs {
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
     /// Picture to write, as .svg or .png
-    #[arg(long, value_name = "FILE", default_value = "learning.svg")]
-    pub out: PathBuf,
+    #[arg(long, value_name = "FILE", default_value = "learning.svg", value_parser = destination(&["svg", "png"]))]
+    pub out: Destination,
     /// Column of metrics.csv to plot in its own panel; repeatable [default: goals in evaluations; goals, turning and
     /// drop rate in training]
     #[arg(long, value_name = "COLUMN")]

@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::builder::{OsStringValueParser, PossibleValuesParser, TypedValueParser};
 
+use crate::os::Destination;
 use crate::sim::{Camera, Quality};
 
 /// The largest integer in a TOML file.
@@ -46,6 +47,10 @@ pub(super) fn time(text: &str) -> Result<Duration, String> {
 pub(super) fn quality() -> impl TypedValueParser<Value = Quality> {
     // Shells complete them.
     PossibleValuesParser::new(["fast", "high"]).map(|text| if text == "fast" { Quality::Fast } else { Quality::High })
+}
+
+pub(super) fn destination(endings: &'static [&'static str]) -> impl TypedValueParser<Value = Destination> {
+    OsStringValueParser::new().try_map(|name| Destination::parse(name, endings))
 }
 
 pub(super) fn seconds(text: &str) -> Result<f64, String> {

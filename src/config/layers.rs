@@ -104,10 +104,14 @@ fn model(table: &Table) -> &str {
     lookup(table, MODEL).and_then(Value::as_str).unwrap_or(BUILTIN_MODEL)
 }
 
+/// The setting that names this scene, for a shell.
+fn scene_setting(model: &str) -> String {
+    os::quoted(&format!("{MODEL}={model}"))
+}
+
 /// The option that names the scene of these settings, with a space before it, or nothing for the built-in scene.
 pub fn scene_option(env: &EnvConfig) -> String {
-    let set = env.model_file().map(|model| os::quoted(&format!("{MODEL}={}", model.display())));
-    set.map_or(String::new(), |set| format!(" --set {set}"))
+    env.model_file().map_or(String::new(), |_| format!(" --set {}", scene_setting(&env.model)))
 }
 
 /// Where settings come from: the base, over it what a run has written, then the user's file, then single settings.
@@ -188,8 +192,8 @@ impl Settings {
         let stored = self.stored.map(|(source, _)| source).filter(|_| self.sets.is_empty());
         let mut config = layers.resolve(self.file.or(stored))?;
         if scene != BUILTIN_MODEL && !is_named {
-            let option = scene_option(&config.env);
-            bail!("it uses a custom scene, and no path in a file is followed: add{option} to use that scene");
+            let set = scene_setting(&config.env.model);
+            bail!("it uses a custom scene, and no path in a file is followed: set {set} to use that scene");
         }
         if config.run.shards == 0 && kept.is_power_of_two() && config.divides(kept) {
             config.run.shards = kept;
@@ -329,7 +333,7 @@ mod tests {
             config.map(|config| (config.env.model, config.run.shards)).map_err(|error| error.to_string())
         };
         let refused = fork(&[]).unwrap_err();
-        assert!(refused.ends_with("add --set \'env.model=/its own.xml\' to use that scene"), "{refused}");
+        assert!(refused.ends_with("set \'env.model=/its own.xml\' to use that scene"), "{refused}");
         assert_eq!(fork(&["env.model=builtin"]), Ok(("builtin".into(), 4)));
         assert_eq!(fork(&["env.model=x.xml", "ppo.minibatches=8192"]), Ok(("x.xml".into(), 0)));
         assert_eq!(fork(&["env.model=x.xml", "run.shards=2"]), Ok(("x.xml".into(), 2)));

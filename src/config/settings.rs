@@ -55,7 +55,6 @@ pub struct EnvConfig {
     pub max_episode_seconds: f64,
     pub goal_position: OfScene<[f64; 3]>,
     pub target_height: f64,
-    pub mirror: bool,
     pub act_moving_average: Ramp,
     pub rot_reward_scale: f64,
     pub rot_eps: f64,

@@ -130,7 +130,15 @@ fn blended(share: f64) -> RGBColor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::os::OutputFile;
+    use crate::draw::PictureFile;
+    use crate::os::Destination;
+
+    fn svg(chart: &BarChart) -> String {
+        let place = tempfile::tempdir().unwrap();
+        let to = Destination { ending: "svg", path: place.path().join("bars.svg") };
+        chart.write(PictureFile::create(&to).unwrap()).unwrap();
+        crate::os::read_text(&to.path).unwrap()
+    }
 
     #[test]
     fn a_bar_is_as_long_as_its_value_and_unknown_ones_are_drawn_too() {
@@ -142,10 +150,7 @@ mod tests {
         };
         let map = HeatMap { columns: vec!["a".into()], rows: vec!["b".into()], cells: vec![vec![0.5]] };
         let bars = vec![bar("whole", 1.0), bar("half", 0.5), bar("unknown", f64::NAN)];
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("bars.svg");
-        BarChart { title: "title".into(), bars, map }.write(OutputFile::create(&path).unwrap()).unwrap();
-        let svg = crate::os::read_text(&path).unwrap();
+        let svg = svg(&BarChart { title: "title".into(), bars, map });
         let colour = format!("fill=\"#{:02X}{:02X}{:02X}\"", BAR.0, BAR.1, BAR.2);
         let width =
             |line: &str| line.split("width=\"").nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();
@@ -163,10 +168,7 @@ mod tests {
         let odd = || "a\u{1}\u{ffff}<".to_owned();
         let bars = vec![NamedBar { name: odd(), value: 1.0, interval: [1.0; 2], note: odd() }];
         let map = HeatMap { columns: vec![odd()], rows: vec![odd()], cells: vec![vec![0.5]] };
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("bars.svg");
-        BarChart { title: odd(), bars, map }.write(OutputFile::create(&path).unwrap()).unwrap();
-        let svg = crate::os::read_text(&path).unwrap();
+        let svg = svg(&BarChart { title: odd(), bars, map });
         assert_eq!(svg.matches("a\u{fffd}\u{fffd}&lt;").count(), 5, "{svg}");
     }
 }

@@ -7,7 +7,7 @@ use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use crate::os::OutputFile;
+use crate::os::{Destination, OutputFile};
 
 /// Curves of one quantity.
 pub struct Subplot {
@@ -82,16 +82,16 @@ pub trait Picture {
     /// Fails if the font cannot be used.
     fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()>;
 
-    /// Writes the picture in the format given by the extension of its name.
+    /// Writes the picture.
     ///
     /// # Errors
-    /// Fails for any other format than SVG and PNG, if the file cannot be written, or as [`Picture::size`] does.
-    fn write(&self, output: OutputFile) -> Result<()> {
+    /// Fails if the file cannot be written, or as [`Picture::size`] does.
+    fn write(&self, PictureFile { output, ending }: PictureFile) -> Result<()> {
         // With the feature `video`, text is measured for SVG too, which needs the font. A second call has no effect.
         #[cfg(feature = "video")]
         let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
         let [width, height] = self.size()?;
-        match picture_format(&output)? {
+        match ending {
             #[cfg(feature = "video")]
             "png" => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
@@ -109,17 +109,25 @@ pub trait Picture {
     }
 }
 
-/// Returns the format of a chart that is to be written, svg or png, so that a wrong name is noticed before the work.
-///
-/// # Errors
-/// Fails if the name does not end in .svg or .png, and for PNG without the feature `video`.
-pub fn picture_format(output: &OutputFile) -> Result<&str> {
-    match output.path().extension().and_then(|extension| extension.to_str()) {
-        Some("png") if !cfg!(feature = "video") => {
-            bail!("{}: PNG needs the cargo feature `video`; .svg does not", output.path().display())
+/// The file of a picture that is drawn later.
+pub struct PictureFile {
+    /// The file.
+    pub output: OutputFile,
+    ending: &'static str,
+}
+
+impl PictureFile {
+    /// Opens the file.
+    ///
+    /// # Errors
+    /// Fails if it is neither an SVG nor a PNG, for a PNG without the feature `video`, or if it cannot be written to.
+    pub fn create(to: &Destination) -> Result<Self> {
+        let path = to.path.display();
+        match to.ending {
+            "png" if !cfg!(feature = "video") => bail!("{path}: PNG needs the cargo feature `video`; .svg does not"),
+            "svg" | "png" => Ok(Self { output: OutputFile::create(&to.path)?, ending: to.ending }),
+            other => bail!("{path}: a chart is an .svg or a .png, not a .{other}"),
         }
-        Some(format @ ("svg" | "png")) => Ok(format),
-        _ => bail!("{}: the name of a chart must end in .svg or .png", output.path().display()),
     }
 }
 
@@ -147,7 +155,7 @@ impl Picture for Chart {
         let [width, height] = self.size.unwrap_or_else(|| [WIDTH, legend(WIDTH) + PANEL * panels]);
         ensure!(
             legend(width) + LEAST_PANEL * panels <= height,
-            "{panels} panels and the names of {} curves do not fit into {height} pixels: use a larger --size",
+            "{panels} panels and the names of {} curves do not fit into {height} pixels",
             self.legend.len(),
         );
         Ok([width, height])
@@ -318,7 +326,8 @@ mod tests {
         let chart = Chart { legend, along: "steps".into(), panels, size: None };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
-        chart.write(OutputFile::create(&path).unwrap()).unwrap();
+        let to = Destination { ending: "svg", path: path.clone() };
+        chart.write(PictureFile::create(&to).unwrap()).unwrap();
         crate::os::read_text(&path).unwrap()
     }
 

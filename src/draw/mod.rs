@@ -7,7 +7,7 @@ mod film;
 mod page;
 
 pub use bar_chart::{BarChart, HeatMap, NamedBar};
-pub use chart::{Chart, Curve, Picture, Subplot, picture_format};
+pub use chart::{Chart, Curve, Picture, PictureFile, Subplot};
 #[cfg(feature = "video")]
 pub use film::{CaptionedFrame, FilmFormat, FilmWriter, write_png};
 pub use page::{Mesh, Page};

@@ -26,6 +26,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = loaded.task(&args.set).context("the file needs the actuator ranges of the scene")?;
     task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), task.config().model_file())?;
     let parts = &task.hand().parts;

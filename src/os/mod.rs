@@ -1,5 +1,6 @@
 //! The system around the program: files, the terminal, signals, locks, threads, pip, and a server for a page.
 
+mod destination;
 mod file;
 mod http;
 mod interrupt;
@@ -15,14 +16,14 @@ mod similar;
 mod terminal;
 mod threads;
 
+pub use destination::Destination;
 pub use file::{Cannot, Stamp, expect_named, read_bytes, read_bytes_if, read_text, same_file};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OUR_PARTIAL, OutputFile, expect_folder, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder,
-    write_whole,
+    OUR_PARTIAL, OutputFile, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder, write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};

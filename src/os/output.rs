@@ -136,7 +136,14 @@ impl OutputFile {
     }
 
     fn named(path: &Path, target: PathBuf) -> Result<Self> {
-        expect_folder(&target)?;
+        let folder = folder_of(&target);
+        ensure!(
+            folder.is_dir(),
+            "cannot write {}: the folder {} does not exist; create it with\n  mkdir -p {}",
+            path.display(),
+            folder.display(),
+            quoted_path(folder)
+        );
         let unfinished = Unfinished::beside(&target);
         let file = File::create_new(&unfinished.path).cannot("write", path)?;
         // Held as long as the file is open: others see that somebody writes it.
@@ -171,11 +178,6 @@ impl OutputFile {
     /// The path as the user gave it.
     pub fn path(&self) -> &Path {
         &self.path
-    }
-
-    /// Whether the path `other` leads to the same file.
-    pub fn is_of(&self, other: &Path) -> bool {
-        final_path(&self.path).is_some_and(|path| Some(path) == final_path(other))
     }
 }
 
@@ -247,22 +249,6 @@ pub fn make_own(path: &Path) -> io::Result<()> {
         File::open(&copy.path)?.sync_all()?;
         fs::rename(&copy.path, path)?;
     }
-    Ok(())
-}
-
-/// Checks that the folder of a file that is written later exists.
-///
-/// # Errors
-/// Fails if it does not. The message says how to create it.
-pub fn expect_folder(path: &Path) -> Result<()> {
-    let folder = folder_of(path);
-    let make = quoted_path(folder);
-    ensure!(
-        folder.is_dir(),
-        "cannot write {}: the folder {} does not exist; create it with\n  mkdir -p {make}",
-        path.display(),
-        folder.display()
-    );
     Ok(())
 }
 
@@ -414,9 +400,10 @@ mod tests {
     #[test]
     fn two_names_of_one_file_are_known() {
         let place = tempfile::tempdir().unwrap();
-        let file = OutputFile::create(&place.path().join("trace")).unwrap();
-        assert!(file.is_of(&place.path().join("../").join(place.path().file_name().unwrap()).join("trace")));
-        assert!(!file.is_of(&place.path().join("other")));
+        let [one, other] = ["trace", "other"].map(|name| final_path(&place.path().join(name)).unwrap());
+        let around = place.path().join("../").join(place.path().file_name().unwrap()).join("trace");
+        assert_eq!(final_path(&around), Some(one));
+        assert_ne!(final_path(&around), Some(other));
     }
 
     #[test]

@@ -22,7 +22,7 @@ const KEPT: usize = 64;
 const QUIET: Duration = Duration::from_secs(1);
 
 /// What a user can do about a port that cannot be opened.
-const OTHER_PORT: &str = "choose another one, e.g. --web 7171, or --web 0 for any free port";
+const OTHER_PORT: &str = "choose another one, or 0 for any free port";
 
 /// What happens with the body of a POST to `controls`. An error is a sentence about it.
 pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;

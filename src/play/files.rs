@@ -1,15 +1,13 @@
 //! The files written while playing: a trace, and an HTML file.
 
-use std::path::Path;
+use anyhow::Result;
 
-use anyhow::{Result, ensure};
-
-use crate::cli::PlayArgs;
-use crate::evaluate::Moment;
-use crate::os::{self, OutputFile};
+use super::plan::Outputs;
+use super::stage::Stage;
+use crate::evaluate::{Episodes, Moment};
+use crate::os::{self, Destination, OutputFile};
 use crate::repose::Task;
-use crate::see::{self, About, Replay};
-use crate::sim::Quality;
+use crate::see::{self, About, Replay, Shot};
 use crate::trace::Trace;
 
 /// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.
@@ -19,22 +17,17 @@ pub(super) struct Files {
 }
 
 impl Files {
-    /// Begins the files of episodes of this task, played by the `actor` of this name and the policy in `checkpoint`.
+    /// Begins the files of these episodes.
     ///
     /// # Errors
     /// Fails if one of them cannot be written.
-    pub(super) fn begin(task: &Task, actor: &str, checkpoint: Option<&str>, args: &PlayArgs) -> Result<Self> {
-        let trace = args.trace.as_deref().map(OutputFile::create).transpose()?;
-        for (option, other) in [("--video", &args.video), ("--html", &args.html)] {
-            if let (Some(trace), Some(other)) = (&trace, other) {
-                ensure!(!trace.is_of(other), "--trace {0} {option} {0}: one file cannot be both", other.display());
-            }
-        }
-        let page = args.html.as_deref().map(|path| PageFile::begin(path, task, args)).transpose()?;
-        if let (Some(page), Some(video)) = (&page, &args.video) {
-            ensure!(!page.output.is_of(video), "--html {0} --video {0}: one file cannot be both", video.display());
-        }
-        Ok(Self { trace: trace.map(|output| (output, Trace::new(task, actor, checkpoint, args.seed))), page })
+    pub(super) fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
+        let task = &stage.task;
+        let trace = outputs.trace.as_ref().map(|to| OutputFile::create(&to.path)).transpose()?;
+        let place = stage.loaded().map(|loaded| loaded.origin.to_string());
+        let new = || Trace::new(task, stage.actor().name(), place.as_deref(), episodes.seed);
+        let page = outputs.page.as_ref().map(|to| PageFile::begin(to, task, &outputs.shot, episodes.count));
+        Ok(Self { trace: trace.map(|output| (output, new())), page: page.transpose()? })
     }
 
     pub(super) fn observe(&mut self, moment: &Moment) {
@@ -56,6 +49,14 @@ impl Files {
         }
         self.page.map_or(Ok(()), |page| page.finish(about))
     }
+
+    /// Says that the files are not written, since playing was interrupted.
+    pub(super) fn give_up(self) {
+        let trace = self.trace.map(|(output, _)| output);
+        for output in trace.into_iter().chain(self.page.map(|page| page.output)) {
+            os::say(&format!("{}: interrupted, not written", output.path().display()));
+        }
+    }
 }
 
 /// An HTML file that is being made.
@@ -65,16 +66,14 @@ pub(super) struct PageFile {
 }
 
 impl PageFile {
-    /// Begins a file of episodes of this task.
+    /// Begins a file of so many episodes of this task.
     ///
     /// # Errors
-    /// Fails if it cannot be written, or if the episodes are too long for it.
-    pub(super) fn begin(path: &Path, task: &Task, args: &PlayArgs) -> Result<Self> {
-        let output = OutputFile::create(path)?;
-        // The size of a film. A page has none.
-        let task = see::task_for_display(task, &args.shot, [1280, 720], Quality::Fast)?;
-        let episodes = if args.from_trace.is_some() { 0 } else { args.episodes.unwrap_or(1) as usize };
-        Ok(Self { output, replay: Replay::new(&task, args.shot.camera, episodes)? })
+    /// Fails if it cannot be written, or if the episodes are too many or too long for it.
+    pub(super) fn begin(to: &Destination, task: &Task, shot: &Shot, episodes: usize) -> Result<Self> {
+        let output = OutputFile::create(&to.path)?;
+        let task = see::task_for_display(task, shot)?;
+        Ok(Self { output, replay: Replay::new(&task, shot.camera, episodes)? })
     }
 
     /// Takes the episodes from a trace, and returns how many did not fit.

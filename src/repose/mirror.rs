@@ -58,6 +58,14 @@ impl Mirror {
         Ok(Self { signs: layout.mirrored(), tips })
     }
 
+    /// The mirror between hands whose names do not tell that they are on different sides, if the fingertips are in the same places only in
+    /// the mirror.
+    pub(super) fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
+        let is_near = |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
+        let is_same = here.tips.iter().zip(&policy.tips).all(is_near);
+        if is_same { None } else { Self::new(here, policy, layout).ok() }
+    }
+
     /// Mirrors an observation in place.
     pub(super) fn apply(&self, observation: &mut [f32]) {
         self.signs.iter().for_each(|&i| observation[i] = -observation[i]);

@@ -1,6 +1,6 @@
 //! What a policy's file says about the hand and the object that it was trained with.
 
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Result, anyhow, ensure};
 use serde::{Deserialize, Serialize};
 
 use super::hand::Hand;
@@ -86,14 +86,14 @@ impl Record {
         Layout::new(self.joints.len(), self.fingertips.len(), self.actuators.len()).spaces(&self.symmetry)
     }
 
-    /// Checks that a policy for this hand can act with the hand `there` of a scene, perhaps in the mirror. Returns a warning if an
-    /// action means another angle there.
+    /// Checks by the names that a policy for this hand can act with the hand `there` of a scene, and says whether they tell that it is the
+    /// hand on the other side.
     ///
     /// # Errors
     /// Fails with the names that differ.
-    pub(super) fn expect_fits(&self, there: &Self, mirrors: bool, scene: &str) -> Result<Option<String>> {
+    pub(super) fn expect_fits(&self, there: &Self, scene: &str) -> Result<bool> {
         let mut differ = Vec::new();
-        let mut is_other_hand = true;
+        let mut is_other_hand = false;
         for (what, own, found) in [
             ("joint", &self.joints, &there.joints),
             ("actuator", &self.actuators, &there.actuators),
@@ -101,40 +101,42 @@ impl Record {
         ] {
             if own.len() != found.len() {
                 differ.push(format!("{} {what}s, not {}", found.len(), own.len()));
-                is_other_hand = false;
                 continue;
             }
-            for (own, found) in own.iter().zip(found) {
-                let other_side = is_other_side(found, own);
-                let fits = is_named(found, own) || mirrors && other_side;
-                if !fits {
+            for (own, found) in own.iter().zip(found).filter(|(own, found)| !is_named(found, own)) {
+                if is_other_side(found, own) {
+                    is_other_hand = true;
+                } else {
                     differ.push(format!("the {what} `{found}` for `{own}`"));
-                    is_other_hand &= other_side;
                 }
             }
         }
-        if !differ.is_empty() {
-            let hint = if is_other_hand { "; --mirror plays the policy of the opposite hand" } else { "" };
-            bail!("the policy is for another hand: {scene} has {}{hint}", shortened(&differ.join(", ")));
-        }
-        let apart = |i: usize| {
-            let sum = |of: &Self| of.driven[i].iter().map(|(_, coefficient)| *coefficient).collect::<Vec<_>>();
-            (0..2).any(|end| (self.ranges[i][end] - there.ranges[i][end]).abs() > 1e-4) || sum(self) != sum(there)
+        let names = shortened(&differ.join(", "));
+        ensure!(differ.is_empty(), "the policy is for another hand: {scene} has {names}");
+        Ok(is_other_hand)
+    }
+
+    /// A warning if an action means another angle with the hand `there`.
+    pub(super) fn warning(&self, there: &Self) -> Option<String> {
+        let sum = |of: &Self, i: usize| of.driven[i].iter().map(|(_, coefficient)| *coefficient).collect::<Vec<_>>();
+        let apart = |i: &usize| {
+            let ends = self.ranges[*i].iter().zip(there.ranges[*i]);
+            ends.into_iter().any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
         };
-        let others: Vec<&str> = (0..self.ranges.len()).filter(|&i| apart(i)).map(|i| &*there.actuators[i]).collect();
-        Ok((!others.is_empty()).then(|| {
+        let others: Vec<&str> = (0..self.ranges.len()).filter(apart).map(|i| &*there.actuators[i]).collect();
+        (!others.is_empty()).then(|| {
             let names = shortened(&others.join(" "));
             format!("an action means another angle than in training: the ranges or the tendons of {names} differ")
-        }))
+        })
     }
 }
 
-/// Returns whether a name in a scene is the name in a policy, perhaps with an additional prefix.
+/// Whether a name in a scene is the name in a policy, perhaps with an additional prefix.
 fn is_named(found: &str, own: &str) -> bool {
     found.strip_suffix(own).is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(['/', '_', '-', '.', ':']))
 }
 
-/// Returns whether a name differs only in the letter of the side: `lh_` and `rh_`, `left` and `right`.
+/// Whether a name differs only in the letter of the side: `lh_` and `rh_`, `left` and `right`.
 fn is_other_side(found: &str, own: &str) -> bool {
     [("lh_", "rh_"), ("rh_", "lh_"), ("left", "right"), ("right", "left")]
         .iter()

@@ -115,16 +115,18 @@ impl Task {
         &self.scene
     }
 
-    /// Returns notes on a user's scene: what the settings replace in it, and whether the goal and the start of its cube come
-    /// from it.
+    /// Notes on the side of the hand and on a user's scene: what the settings replace in it, and whether the goal and the start of its
+    /// cube come from it.
     pub fn notes(&self) -> Vec<String> {
-        let Some(file) = self.config.model_file() else { return Vec::new() };
+        let mirrored =
+            self.mirror.iter().map(|_| "the policy is for the hand on the other side: it plays mirrored".to_owned());
+        let mut notes: Vec<String> = mirrored.collect();
+        let Some(file) = self.config.model_file() else { return notes };
         let place = self.config.goal_position.value;
         let own = self.hand.place();
         let scene = file.display();
         let timestep = self.scene.own_timestep();
         let sim_dt = self.config.sim_dt;
-        let mut notes = Vec::new();
         if timestep != sim_dt {
             notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
         }
@@ -176,14 +178,20 @@ impl Task {
         .concat()
     }
 
-    /// Prepares the task for a policy with this record. Its [`Self::warnings`] say where the policy does not fit well.
+    /// Prepares the task for a policy with this record. Its [`Self::warnings`] say where the policy does not fit well. A policy for the hand
+    /// on the other side observes in the mirror.
     ///
     /// # Errors
     /// Fails if the policy is for another hand.
-    pub fn for_policy(mut self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
+    pub fn for_policy(self: Arc<Self>, policy: &Record) -> Result<Arc<Self>> {
         let here = self.record();
         let place = origin(self.config.model_file());
-        let mut warnings = Vec::from_iter(policy.expect_fits(&here, self.config.mirror, &place)?);
+        let layout = &self.hand.layout;
+        let mirror = match policy.expect_fits(&here, &place)? {
+            true => Some(Mirror::new(&here, policy, layout).context(place.clone())?),
+            false => Mirror::by_fingertips(&here, policy, layout),
+        };
+        let mut warnings = Vec::from_iter(policy.warning(&here));
         if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
             warnings.push(format!(
                 "the policy treats {} orientations of an object as alike, but `{}` of {place} has only {} that are alike",
@@ -192,13 +200,8 @@ impl Task {
                 here.symmetry.len()
             ));
         }
-        let task = Arc::get_mut(&mut self).expect("a task that nobody uses yet");
-        if task.config.mirror {
-            task.mirror = Some(Mirror::new(&here, policy, &task.hand.layout).context(place)?);
-        }
-        task.symmetry.clone_from(&policy.symmetry);
-        task.warnings = warnings;
-        Ok(self)
+        let symmetry = policy.symmetry.clone();
+        Ok(Arc::new(Self { mirror, symmetry, warnings, ..Arc::unwrap_or_clone(self) }))
     }
 
     /// Returns where the policy that it is prepared for does not fit well.

@@ -82,7 +82,7 @@ impl RunFolder {
         let name = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but));
         if let Some(name) = name.filter(|_| !half_begun) {
             bail!(
-                "{} already holds a run, or part of one ({}); resume it with --resume, or choose another folder",
+                "{} already holds a run, or part of one ({}); resume it, or choose another folder",
                 self.path.display(),
                 name.to_string_lossy()
             );
@@ -311,7 +311,7 @@ pub fn newest_run() -> Option<PathBuf> {
 fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     let plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     let name = name.unwrap_or_default();
-    ensure!(name.chars().all(plain), "--name {name}: may contain only letters, digits, `-`, `_` and `.`");
+    ensure!(name.chars().all(plain), "the name {name} of a run may contain only letters, digits, `-`, `_` and `.`");
     fs::create_dir_all(RUNS).cannot("create the folder of runs", Path::new(RUNS))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
     let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
@@ -439,6 +439,6 @@ mod tests {
     #[test]
     fn names_of_runs_cannot_leave_the_folder_of_runs() {
         let refusal = create_unused(Some("../elsewhere")).unwrap_err().to_string();
-        assert!(refusal.contains("--name ../elsewhere"), "{refusal}");
+        assert!(refusal.contains("the name ../elsewhere"), "{refusal}");
     }
 }

@@ -57,6 +57,6 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
 pub fn expect_other_policy(folder: &Path, init: &Path) -> Result<()> {
     let own = RunFolder::at(folder.to_owned()).policy();
     let replaces = same_file(&own, init);
-    ensure!(!replaces, "{}: would replace the policy that --init reads; choose another --run-dir", own.display());
+    ensure!(!replaces, "{}: would replace the policy that the run starts from; choose another folder", own.display());
     Ok(())
 }

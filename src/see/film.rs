@@ -1,6 +1,5 @@
 //! Films of consecutive episodes, and single pictures, without a display.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -9,7 +8,7 @@ use anyhow::{Result, ensure};
 use crate::draw::{FilmFormat, FilmWriter, write_png};
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Moment, Player};
-use crate::os::{Bar, OutputFile, progress_bar};
+use crate::os::{Bar, Destination, OutputFile, progress_bar};
 use crate::repose::{Repose, Task};
 use crate::sim::Renderer;
 
@@ -28,17 +27,17 @@ pub struct Film {
 }
 
 impl Film {
-    /// Starts the film `path` of up to `episodes` episodes of `task`, which must have been loaded for display.
+    /// Starts a film of up to `episodes` episodes of `task`, which must have been loaded for display.
     ///
     /// # Errors
-    /// Fails if there is no EGL, the name does not end in .mp4 or .gif, or the path cannot be written to.
-    pub fn create(path: &Path, task: &Task, fps: u32, episodes: u64) -> Result<Self> {
+    /// Fails if there is no EGL, if it is no kind of film, or if the path cannot be written to.
+    pub fn create(to: &Destination, task: &Task, fps: u32, episodes: u64) -> Result<Self> {
         let config = task.config();
         let seconds = f64::from(config.max_episode_steps()) * config.ctrl_dt;
         let longest = ((seconds * f64::from(fps)).ceil() as u64).saturating_add(1);
         let all = episodes.saturating_mul(longest);
         let renderer = Renderer::new(task.scene())?;
-        let writer = FilmWriter::create(path, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
+        let writer = FilmWriter::create(to, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
         let bar = progress_bar(all, "frames", "film");
         Ok(Self { renderer, writer, fps, longest, drawn: 0, all_frames: 0, bar, begun: Instant::now() })
     }
@@ -99,12 +98,18 @@ fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
     ]
 }
 
-/// Draws one picture of `task`, which must have been loaded for display, after `seconds` of the first of `episodes`.
+/// Draws one picture of `task`, which must have been loaded for display, after `seconds` of the first of `episodes`. Returns its width
+/// and height in pixels.
 ///
 /// # Errors
-/// Fails if there is no EGL, the name does not end in .png, or the path cannot be written to.
-pub fn screenshot(path: &Path, task: &Arc<Task>, actor: &Actor, episodes: Episodes, seconds: f64) -> Result<[u32; 2]> {
-    let output = OutputFile::create(path)?;
+/// Fails if there is no EGL, or if the file cannot be written.
+pub fn screenshot(
+    output: OutputFile,
+    task: &Arc<Task>,
+    actor: &Actor,
+    episodes: Episodes,
+    seconds: f64,
+) -> Result<[u32; 2]> {
     let mut renderer = Renderer::new(task.scene())?;
     let mut player = Player::new(task, episodes);
     for _ in 0..(seconds / task.config().ctrl_dt).round() as u64 {

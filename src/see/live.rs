@@ -124,7 +124,7 @@ impl Live {
                     }
                 }
                 steps += 1;
-                if steps % self.every == 0 {
+                if steps.is_multiple_of(self.every) {
                     let row = self.row();
                     self.server.send(&format!("id: {}\ndata: {row}\n\n", start.elapsed().as_millis()));
                 }

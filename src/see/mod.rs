@@ -16,12 +16,12 @@ mod sliders;
 mod window;
 
 pub use columns::About;
-pub use display::task_for_display;
+pub use display::{Shot, task_for_display};
 pub use dress::{dress, mesh_files};
 #[cfg(feature = "video")]
 pub use film::{Film, screenshot};
 pub use live::{Live, LiveActor};
-pub use replay::{MOST_EPISODES, Replay};
+pub use replay::Replay;
 pub use sliders::Sliders;
 #[cfg(feature = "viewer")]
 pub use window::Window;
@@ -30,5 +30,4 @@ pub use window::Window;
 pub const NO_FILMS: &str = "this build cannot make films or pictures: it was built without the feature `video`";
 
 /// The message of a build without windows.
-pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`; use `--web` for a browser, \
-    `play --headless` to score, `play --video film.mp4` to film, `view --screenshot picture.png` to draw";
+pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`";

@@ -14,7 +14,7 @@ use crate::repose::{Task, TaskReward};
 use crate::sim::Camera;
 
 /// The most episodes of a file, and the most steps of all of them. A browser reads the file at once, and 1000 steps add 57 kB.
-pub const MOST_EPISODES: usize = 20;
+const MOST_EPISODES: usize = 20;
 const MOST_STEPS: usize = 60_000;
 
 /// Episodes that become a file.
@@ -40,8 +40,9 @@ impl Replay {
         let steps = task.config().max_episode_steps();
         let longest = steps <= MOST;
         let all = steps as usize * episodes;
+        ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
         ensure!(longest, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
-        ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: use fewer --episodes");
+        ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes");
         Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
     }
 

@@ -22,27 +22,29 @@ const KEYS: &str = "window: Space pauses, Right steps, Up and Down change the sp
 const HISTORY: usize = 800;
 
 /// An open window.
-pub struct Window {
+pub struct Window<'a> {
     viewer: Viewer,
+    actors: Vec<Actor<'a>>,
 }
 
-impl Window {
-    /// Opens a window on `task`, which must have been loaded for display. The user chooses between `actors`, initially
-    /// `actors[first]`.
+impl<'a> Window<'a> {
+    /// Opens a window on `task`, which must have been loaded for display. The user chooses between `actors`, by their names, and
+    /// begins with `actors[first]`.
     ///
     /// # Errors
     /// Fails if there is no display or a library is missing. The message names the packages that provide it.
-    pub fn open(task: &Task, actors: Vec<&'static str>, first: usize) -> Result<Self> {
-        let viewer = Viewer::open(task.scene(), "shadow-repose", actors, first)?;
+    pub fn open(task: &Task, actors: Vec<(&'static str, Actor<'a>)>, first: usize) -> Result<Self> {
+        let (names, actors) = actors.into_iter().unzip();
+        let viewer = Viewer::open(task.scene(), "shadow-repose", names, first)?;
         os::say(KEYS);
-        Ok(Self { viewer })
+        Ok(Self { viewer, actors })
     }
 
     /// Plays the episodes, possibly without end, until they are over or the window is closed. Returns a summary to print.
     ///
     /// # Errors
     /// Fails if OpenGL does.
-    pub fn play(mut self, task: &Arc<Task>, actors: &[Actor], episodes: Episodes) -> Result<String> {
+    pub fn play(mut self, task: &Arc<Task>, episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
         let mut tally = Tally::default();
         let mut curves = curves(task);
@@ -74,7 +76,7 @@ impl Window {
                 false => clock.steps_due(asked.speed),
             };
             for _ in 0..due {
-                let end = player.step(&actors[asked.choice]);
+                let end = player.step(&self.actors[asked.choice]);
                 tally.steps += 1;
                 extend(&mut curves, player.env(), tally.steps);
                 if end.is_some() && !next(&mut player, &mut tally, true) {

@@ -12,8 +12,7 @@ use super::{Scene, Simulation};
 /// The advice printed if there is no renderer.
 const HELP: &str = "
   Pictures are drawn with EGL, which needs neither a display nor a graphics card.
-  On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri
-  Without pictures: `play --headless` to score.";
+  On Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri";
 
 /// A renderer for simulations of one scene. It belongs to the thread that created it.
 pub struct Renderer {

@@ -13,9 +13,7 @@ use super::{Controls, Readout, Scene, Simulation};
 /// The advice printed if no window can be opened.
 const HELP: &str = "
   A window needs a display (DISPLAY or WAYLAND_DISPLAY) with OpenGL.
-  On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0
-  Without a window: `--web` for a browser, `play --headless` to score, `play --video film.mp4` to film, \
-     `view --screenshot picture.png` to draw.";
+  On Debian and Ubuntu: apt install libgl1 libxcursor1 libxi6 libx11-xcb1 libxkbcommon-x11-0";
 
 /// An open window.
 pub struct Viewer {

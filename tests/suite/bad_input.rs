@@ -196,9 +196,9 @@ fn a_training_that_fails_names_the_iteration_and_leaves_the_last_checkpoint_inta
 #[test]
 fn a_trace_that_cannot_be_written_is_refused_before_playing_and_a_device_is_written_to() {
     let folder = tempfile::tempdir().unwrap();
-    let play = |trace: &'static str| ["play", "--policy", "zero", "--episodes", "1", "--trace", trace];
+    let play = |trace: &'static str| ["play", "--ckpt", "zero", "--episodes", "1", "--out", trace];
     refused(folder.path(), &play("absent/t.jsonl"), 1, &["cannot write absent/t.jsonl"]);
-    succeeded(program(folder.path(), &play("/dev/null")));
+    succeeded(program(folder.path(), &play("jsonl:/dev/null")));
     assert!(!fs::metadata("/dev/null").unwrap().is_file());
 }
 
@@ -229,8 +229,10 @@ fn usage_errors_exit_with_2() {
         &["train", "--stop-after", "soon"],
         &["train", "--stop-after", "0s"],
         &["train", "--name", "a", "--run-dir", "b"],
-        &["play", "--policy", "clever"],
-        &["play", "--policy", "zero", "--ckpt", "x"],
+        &["play", "--out", "x.pdf"],
+        &["play", "--ckpt", "zero", "--out", "x.html", "--out", "y.html"],
+        &["view", "--out", "x.html"],
+        &["plot", "run", "--out", "x.gif"],
         &["play", "--episodes", "0"],
         &["play", "--threads", "5000"],
         &["train", "--seed", "18446744073709551615"],
@@ -240,19 +242,32 @@ fn usage_errors_exit_with_2() {
     // Options that would have no effect.
     refused(
         folder.path(),
-        &["play", "--policy", "zero", "--headless", "--size", "64x64"],
+        &["play", "--ckpt", "zero", "--headless", "--size", "64x64"],
         2,
-        &["--size applies only to a film"],
+        &["--size cannot be used with a score", "only to a film"],
     );
-    refused(folder.path(), &["play", "--policy", "zero", "--json", "--plain"], 2, &["--plain applies only to a film"]);
     refused(
         folder.path(),
-        &["play", "--policy", "zero", "--set", "ppo.gamma=0.5"],
+        &["play", "--ckpt", "zero", "--json", "--plain"],
+        2,
+        &["--plain cannot be used with a score", "an HTML file"],
+    );
+    refused(
+        folder.path(),
+        &["play", "--ckpt", "zero", "--set", "ppo.gamma=0.5"],
         1,
         &["`play` does not use ppo.gamma"],
     );
     refused(folder.path(), &["train", "--resume", "run", "--set", "ppo.gamma=1"], 1, &["no such run folder"]);
-    refused(folder.path(), &["train", "--name", "../x"], 1, &["--name ../x"]);
+    refused(folder.path(), &["train", "--name", "../x"], 1, &["the name ../x of a run"]);
+    // Who needs no policy is none.
+    let none = "`zero` acts without a policy; a file or folder of that name is ./zero";
+    for args in [&["export"][..], &["play", "--web", "0", "--follow"]] {
+        refused(folder.path(), &[args, &["--ckpt", "zero"]].concat(), 1, &[none]);
+    }
+    refused(folder.path(), &["train", "--init", "zero"], 1, &[none]);
+    refused(folder.path(), &["play", "--ckpt", "random", "--stochastic"], 1, &["--stochastic samples from a policy"]);
+    refused(folder.path(), &["play", "--ckpt", "./zero"], 1, &["./zero"]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
@@ -347,7 +362,7 @@ fn the_policy_that_a_training_begins_with_is_not_replaced_by_its_own() {
     std::os::unix::fs::symlink("half/policy.safetensors", folder.join("link")).unwrap();
     for init in ["half/policy.safetensors", "link"] {
         let args = train(&["--init", init, "--run-dir", "half", "--total-steps", "128"]);
-        refused(folder, &args, 1, &["half/policy.safetensors: would replace the policy that --init reads"]);
+        refused(folder, &args, 1, &["half/policy.safetensors: would replace the policy that the run starts from"]);
     }
     assert_eq!(names(&folder.join("half")), ["policy.safetensors", "run.lock"]);
     succeeded(program(folder, &train(&["--init", "run", "--run-dir", "half", "--total-steps", "128"])));
@@ -410,7 +425,7 @@ fn what_a_policy_or_a_scene_says_is_cut_to_a_hundred_characters() {
     let scene =
         crate::support::SCENE.replacen("name=\"cube\" type=\"box\"", &format!("name=\"{long}\" type=\"box\""), 1);
     fs::write(folder.join("s.xml"), scene.replacen("friction=\"1.2\"", "friction=\"nan\"", 1)).unwrap();
-    brief(&["play", "--policy", "zero", "--set", "env.model=s.xml", "--headless"], "s.xml: geom_friction of geom `999");
+    brief(&["play", "--ckpt", "zero", "--set", "env.model=s.xml", "--headless"], "s.xml: geom_friction of geom `999");
     // The path that a user names stays whole.
-    brief(&["play", "--policy", "zero", "--set", &named, "--headless"], &named[10..]);
+    brief(&["play", "--ckpt", "zero", "--set", &named, "--headless"], &named[10..]);
 }

@@ -143,7 +143,7 @@ fn scores_do_not_depend_on_threads_or_on_how_many_episodes_are_asked_for() {
     let play = |threads: &str, episodes: &str, more: &[&str]| {
         let trace = format!("trace-{threads}-{episodes}.jsonl");
         let mut args = vec!["play", "--ckpt", "run", "--json", "--threads", threads, "--episodes", episodes];
-        args.extend(["--trace", &trace]);
+        args.extend(["--out", &trace]);
         args.extend(more);
         let score = json(&succeeded(program(folder.path(), &args)));
         (score, fs::read_to_string(folder.path().join(trace)).unwrap())
@@ -163,7 +163,7 @@ fn scores_do_not_depend_on_threads_or_on_how_many_episodes_are_asked_for() {
 #[test]
 fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
     let folder = trained(&[]);
-    let args = ["play", "--ckpt", "run", "--episodes", "150", "--json", "--trace", "t.jsonl"];
+    let args = ["play", "--ckpt", "run", "--episodes", "150", "--json", "--out", "t.jsonl"];
     succeeded(program(folder.path(), &args));
     let text = fs::read_to_string(folder.path().join("t.jsonl")).unwrap();
     let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
@@ -210,8 +210,8 @@ fn the_trace_holds_whole_episodes_in_order_until_there_are_enough_records() {
 #[test]
 fn baselines_need_no_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
-    for policy in ["zero", "random"] {
-        let args = ["play", "--policy", policy, "--episodes", "4", "--json", "--set", "env.max_episode_seconds=0.1"];
+    for policy in ["zero", "random", "wave"] {
+        let args = ["play", "--ckpt", policy, "--episodes", "4", "--json", "--set", "env.max_episode_seconds=0.1"];
         let score = json(&succeeded(program(folder.path(), &args)));
         assert!(score["checkpoint"].is_null());
         assert_eq!(score["episode_length"], 10.0, "--set changes the task");
@@ -360,7 +360,7 @@ fn an_own_scene_is_trained_on_and_used_again_only_when_it_is_named() {
     ] {
         let refused = program(elsewhere.path(), args);
         assert_eq!(refused.status.code(), Some(1));
-        assert!(stderr(&refused).contains(&format!("add --set {model} to")), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains(&format!("set {model} to")), "{}", stderr(&refused));
         let named = succeeded(program(elsewhere.path(), &[args, &["--set", &model]].concat()));
         assert!(!stderr(&named).contains("warning"), "{}", stderr(&named));
     }
@@ -401,7 +401,6 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
     assert!(refused.status.code() == Some(1) && stderr(&refused).contains("error: begun"), "{}", stderr(&refused));
     for (more, part) in [
         (["--metric", "loss/vaule"], "error: no run has a column loss/vaule; did you mean loss/value?"),
-        (["--out", "x.pdf"], "must end in .svg or .png"),
         (["--out", "absent/x.svg"], "cannot write absent/x.svg"),
     ] {
         let refused = plot(&more);
@@ -409,6 +408,8 @@ fn learning_curves_are_drawn_of_any_columns_and_runs() {
         assert!(stderr(&refused).contains(part), "{}", stderr(&refused));
         assert!(!stderr(&refused).contains("warning"), "it is said once: {}", stderr(&refused));
     }
+    let refused = plot(&["--out", "x.pdf"]);
+    assert!(refused.status.code() == Some(2) && stderr(&refused).contains("must end in .svg or .png"));
     // One run by two names is one run, and a table that is no file is not waited for.
     std::os::unix::fs::symlink("run", folder.path().join("latest")).unwrap();
     let said = stderr(&succeeded(program(folder.path(), &["plot", "run", "latest", "run/metrics.csv"])));

@@ -41,7 +41,7 @@ fn an_exported_policy_sees_and_does_in_python_what_it_does_here() {
     let deploy = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/deploy/deploy.py");
     for policy in ["builtin", "run"] {
         succeeded(program(folder, &["export", "--ckpt", policy]));
-        succeeded(program(folder, &["play", "--ckpt", policy, "--json", "--episodes", "2", "--trace", "trace.jsonl"]));
+        succeeded(program(folder, &["play", "--ckpt", policy, "--json", "--episodes", "2", "--out", "trace.jsonl"]));
         let check = "import onnx, sys; onnx.checker.check_model(onnx.load(sys.argv[1]), full_check=True)";
         runs(&python, folder, &["-c", check, "policy.onnx"]);
         runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--check", "trace.jsonl"]);
@@ -87,7 +87,7 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
     ];
     let sets: Vec<&str> = varied.iter().flat_map(|set| ["--set", set]).collect();
     succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
-    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--out", "trace.jsonl"];
     succeeded(program(folder.path(), &[&play[..], &sets].concat()));
     runs(&python, folder.path(), &["-c", REPLAY, examples]);
     let check = ["policy.onnx", "--check", "trace.jsonl"];
@@ -124,7 +124,7 @@ fn an_own_object_is_resized_in_python_as_it_is_here() {
         std::fs::write(folder.path().join("own.xml"), SCENE.replace(cube, object)).unwrap();
         let sets = ["--set", "env.model=own.xml", "--set", "env.cube_size_scale=1.2"];
         succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
-        let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+        let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--out", "trace.jsonl"];
         succeeded(program(folder.path(), &[&play[..], &sets].concat()));
         runs(&python, folder.path(), &["-c", &replay, examples]);
     }
@@ -155,7 +155,7 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.5"];
-    succeeded(program(folder, &[&play[..], &["--trace", "trace.jsonl"]].concat()));
+    succeeded(program(folder, &[&play[..], &["--out", "trace.jsonl"]].concat()));
     succeeded(program(folder, &["export", "--ckpt", "builtin", "--set", "env.max_episode_seconds=0.5"]));
     runs(&python, folder, &["-c", SPOIL]);
     let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
@@ -211,7 +211,7 @@ fn the_example_in_python_refuses_garbled_policies_and_traces_in_a_sentence() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let short = ["--ckpt", "builtin", "--set", "env.max_episode_seconds=0.1"];
-    let play = ["play", "--json", "--episodes", "1", "--trace", "trace.jsonl"];
+    let play = ["play", "--json", "--episodes", "1", "--out", "trace.jsonl"];
     succeeded(program(folder, &[&play[..], &short].concat()));
     succeeded(program(folder, &[&["export"], &short[..]].concat()));
     runs(&python, folder, &["-c", GARBLE]);

@@ -19,7 +19,7 @@ fn write_script(path: &Path, text: &str) {
 /// Draws a picture, for which the meshes are fetched, and returns what the program says. What the folder and the variables contain
 /// is hostile.
 fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) -> String {
-    let args = ["view", "--screenshot", "hand.png", "--size", "64x64", "--quality", "fast"];
+    let args = ["view", "--out", "hand.png", "--size", "64x64", "--quality", "fast"];
     let mut command = command(folder, &args);
     command.env("XDG_CACHE_HOME", cache).envs(variables.iter().copied());
     stderr(&command.output().unwrap())
@@ -142,7 +142,7 @@ fn a_signal_ends_python_without_executing_a_file_named_kill() {
         &format!("echo $$ > '{0}.new'; mv '{0}.new' '{0}'; exec sleep 100", log.display()),
     );
     let path = format!(".:{}:{}", folder.join("bin").display(), std::env::var("PATH").unwrap());
-    let args = ["view", "--screenshot", "hand.png", "--size", "64x64", "--quality", "fast"];
+    let args = ["view", "--out", "hand.png", "--size", "64x64", "--quality", "fast"];
     let mut child = command(folder, &args).env("XDG_CACHE_HOME", cache.path()).env("PATH", path).spawn().unwrap();
     let begun = Instant::now();
     let within = |time: u64| begun.elapsed() < Duration::from_secs(time);

@@ -10,7 +10,7 @@ use crate::support::{program, succeeded, task};
 #[test]
 fn how_long_goals_take_is_what_the_trace_shows() {
     let place = tempfile::tempdir().unwrap();
-    let mut args = vec!["play", "--ckpt", "builtin", "--episodes", "12", "--json", "--trace", "trace.jsonl"];
+    let mut args = vec!["play", "--ckpt", "builtin", "--episodes", "12", "--json", "--out", "trace.jsonl"];
     let task_settings = ["env.max_episode_seconds=1.6", "env.max_consecutive_successes=5", "env.fall_dist=0.105"];
     task_settings.iter().for_each(|set| args.extend(["--set", set]));
     let score: Value = serde_json::from_slice(&succeeded(program(place.path(), &args)).stdout).unwrap();

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use crate::support::{SCENE, command, must_be_possible, names, program, stderr, succeeded, train};
 
 /// The arguments for very short episodes.
-const SHORT: [&str; 6] = ["play", "--policy", "zero", "--set", "env.max_episode_seconds=0.1", "--headless"];
+const SHORT: [&str; 6] = ["play", "--ckpt", "zero", "--set", "env.max_episode_seconds=0.1", "--headless"];
 
 /// Runs the program in a shell, with `before` and `after` around its command line.
 fn shell(folder: &Path, before: &str, args: &[&str], after: &str) -> Output {
@@ -27,13 +27,13 @@ fn what_a_link_leads_to_is_written_and_the_link_stays() {
     let folder = place.path();
     fs::write(folder.join("target"), "old").unwrap();
     std::os::unix::fs::symlink("target", folder.join("link")).unwrap();
-    succeeded(program(folder, &[&SHORT[..], &["--episodes", "1", "--trace", "link"]].concat()));
+    succeeded(program(folder, &[&SHORT[..], &["--episodes", "1", "--out", "jsonl:link"]].concat()));
     assert!(folder.join("link").is_symlink());
     assert!(fs::read_to_string(folder.join("target")).unwrap().starts_with("{\"sim_dt\""));
     // A link to stdout, as /dev/stdout is: it gets the trace, then the table.
     let to_stdout = folder.join("stdout");
     std::os::unix::fs::symlink("/proc/self/fd/1", &to_stdout).unwrap();
-    let args = [&SHORT[..], &["--episodes", "1", "--trace", "stdout"]].concat();
+    let args = [&SHORT[..], &["--episodes", "1", "--out", "jsonl:stdout"]].concat();
     succeeded(shell(folder, "", &args, "> both"));
     let both = fs::read_to_string(folder.join("both")).unwrap();
     assert!(both.starts_with("{\"sim_dt\"") && both.contains("goals per episode"), "{both}");
@@ -62,7 +62,7 @@ fn a_result_that_cannot_be_printed_is_an_error() {
 fn a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
-    let args = [&SHORT[..], &["--episodes", "30", "--trace", "trace"]].concat();
+    let args = [&SHORT[..], &["--episodes", "30", "--out", "jsonl:trace"]].concat();
     let output = shell(folder, "ulimit -f 1;", &args, "");
     assert_eq!(output.status.code(), Some(1), "{:?}", output.status);
     assert!(stderr(&output).contains("File too large"), "{}", stderr(&output));
@@ -70,7 +70,7 @@ fn a_file_that_grows_beyond_its_limit_is_an_error_like_a_full_disk() {
 }
 
 #[test]
-fn one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
+fn one_file_cannot_be_trace_and_page_and_a_folder_must_be_there() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     let refused = |args: &[&str], reason: &str| {
@@ -79,14 +79,12 @@ fn one_file_cannot_be_trace_and_film_and_a_folder_must_be_there() {
         assert!(stderr(&output).contains(reason), "{args:?}: {}", stderr(&output));
         assert_eq!(names(folder), [""; 0], "{args:?}");
     };
-    let play = ["play", "--policy", "zero", "--plain"];
+    let play = ["play", "--ckpt", "zero", "--plain"];
+    refused(&[&play[..], &["--out", "a.html", "--out", "jsonl:./a.html"]].concat(), "one file cannot be both");
+    refused(&["play", "--ckpt", "zero", "--out", "jsonl:not there/a"], "mkdir -p 'not there'");
     #[cfg(feature = "video")]
-    refused(&[&play[..], &["--trace", "a.gif", "--video", "./a.gif"]].concat(), "one file cannot be both");
-    refused(&["play", "--policy", "zero", "--trace", "not there/a"], "mkdir -p 'not there'");
-    #[cfg(feature = "video")]
-    refused(&[&play[..], &["--video", "films/a.gif"]].concat(), "mkdir -p films");
-    let _ = play;
-    refused(&["view", "--screenshot", "pictures/a.png"], "mkdir -p pictures");
+    refused(&[&play[..], &["--out", "films/a.gif"]].concat(), "mkdir -p films");
+    refused(&["view", "--out", "pictures/a.png"], "mkdir -p pictures");
     refused(&["plot", "runs/*", "--out", "charts/a.svg"], "mkdir -p charts");
 }
 
@@ -95,7 +93,7 @@ fn a_trace_that_is_interrupted_leaves_nothing_behind() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     for (signal, number) in [("TERM", 15), ("INT", 2), ("HUP", 1)] {
-        let args = ["play", "--policy", "random", "--headless", "--episodes", "100000", "--trace", "trace"];
+        let args = ["play", "--ckpt", "random", "--headless", "--episodes", "100000", "--out", "jsonl:trace"];
         let mut child = command(folder, &args).stderr(Stdio::null()).spawn().unwrap();
         let begun = Instant::now();
         while names(folder).is_empty() && begun.elapsed() < Duration::from_secs(60) {
@@ -122,16 +120,8 @@ fn as_the_first_process_of_a_container_it_ends_with_128_and_the_number_of_the_si
     let folder = place.path();
     for (signal, code) in [("TERM", 143), ("INT", 130), ("HUP", 129)] {
         let mut unshare = Command::new("unshare");
-        unshare.args([
-            flags,
-            "--fork",
-            env!("CARGO_BIN_EXE_shadow-repose"),
-            "play",
-            "--policy",
-            "random",
-            "--headless",
-        ]);
-        unshare.args(["--episodes", "100000", "--trace", "trace"]).current_dir(folder).stderr(Stdio::null());
+        unshare.args([flags, "--fork", env!("CARGO_BIN_EXE_shadow-repose"), "play", "--ckpt", "random", "--headless"]);
+        unshare.args(["--episodes", "100000", "--out", "jsonl:trace"]).current_dir(folder).stderr(Stdio::null());
         let mut unshare = unshare.spawn().unwrap();
         let begun = Instant::now();
         while names(folder).is_empty() && begun.elapsed() < Duration::from_secs(60) {
@@ -343,7 +333,7 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
     });
     let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let own = ["--ckpt", "p.safetensors"];
-    let refused: [(&[&str], &[&str], &str); 15] = [
+    let refused: [(&[&str], &[&str], &str); 14] = [
         (&["export"], &["--ckpt", "p.safetensors", "--out", "p.safetensors"], "the input"),
         (&["export"], &["--ckpt", "p.safetensors", "--out", "./run/../p.safetensors"], "the input"),
         (&["export"], &["--ckpt", "p.safetensors", "--out", "hard.svg"], "the input"),
@@ -352,13 +342,12 @@ fn no_output_replaces_what_is_read_or_what_a_run_keeps() {
         (&["export"], &["--ckpt", "run", "--out", "run/checkpoints/latest.safetensors"], "reserves"),
         (&["export"], &["--ckpt", "run", "--out", "other/config.toml"], "reserves"),
         (&["export"], &["--ckpt", "builtin", "--out", "run/policy.safetensors"], "reserves"),
-        (&play, &["--trace", "p.safetensors", "--ckpt", "p.safetensors"], "the input"),
-        (&play, &["--trace", "run/metrics.csv", "--ckpt", "builtin"], "reserves"),
-        (&play, &["--trace", "run/finished", "--ckpt", "builtin"], "reserves"),
-        (&play, &["--trace", "scene.xml", "--policy", "zero", "--set", "env.model=scene.xml"], "the input"),
+        (&play, &["--out", "jsonl:p.safetensors", "--ckpt", "p.safetensors"], "the input"),
+        (&play, &["--out", "jsonl:run/metrics.csv", "--ckpt", "builtin"], "reserves"),
+        (&play, &["--out", "jsonl:run/finished", "--ckpt", "builtin"], "reserves"),
+        (&play, &["--out", "jsonl:scene.xml", "--ckpt", "zero", "--set", "env.model=scene.xml"], "the input"),
         (&["play", "--robustness", "--out", "hard.svg"], &own, "the input"),
         (&["plot", "table.svg"], &["--out", "table.svg"], "the input"),
-        (&["bench", "--only", "iteration", "--out", "soft.svg"], &own, "the input"),
     ];
     for (command, more, reason) in refused {
         let output = program(folder, &[command, more].concat());
@@ -385,23 +374,18 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
         "autolimits=\"true\" meshdir = 'meshes'/><include file='parts/more.svg'/>",
         1,
     );
-    for name in ["scenes/s.xml", "scenes/s.svg"] {
-        fs::write(folder.join(name), &scene).unwrap();
-    }
+    fs::write(folder.join("scenes/s.xml"), &scene).unwrap();
     let more = "<mujoco><asset><mesh name=\"m\"\n file = \"m.obj\"/></asset></mujoco>";
     fs::write(folder.join("scenes/parts/more.svg"), more).unwrap();
     let corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
     fs::write(folder.join("scenes/meshes/m.obj"), corners).unwrap();
     std::os::unix::fs::symlink("scenes/meshes/m.obj", folder.join("link")).unwrap();
     let play = ["play", "--headless", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
-    let bench = ["bench", "--only", "iteration", "--set", "env.num_envs=16", "--set", "ppo.hidden=[8]"];
-    let refused: [(&[&str], &[&str], &str); 6] = [
+    let refused: [(&[&str], &[&str], &str); 4] = [
         (&["export", "--ckpt", "builtin"], &["--out", "scenes/parts/more.svg"], "s.xml"),
         (&["export", "--ckpt", "builtin"], &["--out", "link"], "s.xml"),
-        (&play, &["--trace", "scenes/meshes/m.obj", "--policy", "zero"], "s.xml"),
+        (&play, &["--out", "html:scenes/meshes/m.obj", "--ckpt", "zero"], "s.xml"),
         (&play, &["--robustness", "--out", "scenes/parts/more.svg", "--ckpt", "builtin"], "s.xml"),
-        (&bench, &["--out", "scenes/parts/more.svg"], "s.xml"),
-        (&bench, &["--out", "scenes/s.svg"], "s.svg"),
     ];
     for (command, more, scene) in refused {
         let model = format!("env.model=scenes/{scene}");
@@ -411,7 +395,6 @@ fn no_output_replaces_a_file_that_a_scene_reads() {
     }
     assert_eq!(fs::read_to_string(folder.join("scenes/meshes/m.obj")).unwrap(), corners);
     assert_eq!(fs::read_to_string(folder.join("scenes/parts/more.svg")).unwrap(), more);
-    assert_eq!(fs::read_to_string(folder.join("scenes/s.svg")).unwrap(), scene);
     // What the scene does not read is free.
     let model = ["--ckpt", "builtin", "--set", "env.model=scenes/s.xml"];
     succeeded(program(folder, &[&["export", "--out", "scenes/meshes/other.obj"], &model[..]].concat()));
@@ -467,7 +450,7 @@ fn foreign_words_neither_steer_the_terminal_nor_begin_lines() {
     lock.lock().unwrap();
     fs::write(folder.join("run/run.lock"), "\n\nerror: all lost\u{202e}").unwrap();
     for args in [
-        &["play", "--policy", "zero", "--set", "env.model=s.xml", "--headless"][..],
+        &["play", "--ckpt", "zero", "--set", "env.model=s.xml", "--headless"][..],
         &["train", "--config", "own.toml"],
         &["play", "--ckpt", "p.safetensors", "--headless"],
         &["train", "--resume", "run", "--total-steps", "256"],

@@ -65,7 +65,7 @@ fn a_hand_of_another_kind_is_trained_resumed_played_and_exported() {
         assert!(config.contains(line), "{line}: {config}");
     }
     succeeded(program(folder, &["train", "--resume", "run", "--set", &model, "--total-steps", "384"]));
-    let play = ["play", "--ckpt", "run", "--set", &model, "--json", "--episodes", "2", "--trace", "t.jsonl"];
+    let play = ["play", "--ckpt", "run", "--set", &model, "--json", "--episodes", "2", "--out", "t.jsonl"];
     succeeded(program(folder, &play));
     let header = header(&folder.join("t.jsonl"));
     assert_eq!(header["joint_names"].as_array().unwrap().len(), 9);
@@ -84,7 +84,6 @@ fn a_policy_of_another_hand_is_refused_by_the_names_that_differ() {
     let folder = folder.path();
     let said = stderr(&program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", &model]));
     assert!(said.contains("for another hand") && said.contains("has 9 joints, not 24, 6 actuators, not 20"), "{said}");
-    assert!(!said.contains("--mirror"), "{said}");
     succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
     let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", "env.model=builtin"]));
     assert!(said.contains("for another hand") && said.contains("has 24 joints, not 9"), "{said}");
@@ -106,7 +105,7 @@ fn the_joint_that_another_scene_calls_otherwise_is_named() {
 fn names_that_no_scene_can_hold_are_refused() {
     let output = program(
         &std::env::temp_dir(),
-        &["play", "--policy", "zero", "--headless", "--set", "hand.joints=[\"a\\u0000b\"]"],
+        &["play", "--ckpt", "zero", "--headless", "--set", "hand.joints=[\"a\\u0000b\"]"],
     );
     assert!(
         stderr(&output).contains("hand.joints") && stderr(&output).contains("without control characters"),
@@ -239,28 +238,44 @@ fn a_scene_that_shows_no_goal_gets_one_that_touches_nothing() {
 fn the_mirror_image_of_the_hand_sees_and_does_in_the_mirror_what_the_hand_does() {
     let (folder, model) = placed(&left_scene());
     let folder = folder.path();
-    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "4", "--set", &model];
-    let said = stderr(&program(folder, &play));
-    assert!(said.contains("for another hand") && said.contains("--mirror"), "{said}");
+    let play = ["play", "--ckpt", "builtin", "--episodes", "4", "--set", &model];
     let goals = |args: &[&str]| -> f64 {
         let score: Value = serde_json::from_slice(&succeeded(program(folder, args)).stdout).unwrap();
         score["goals_per_episode"].as_f64().unwrap()
     };
-    assert!(goals(&[&play[..], &["--mirror"]].concat()) > 6.0, "the right hand reaches more than nine");
-    let trace =
-        ["play", "--ckpt", "builtin", "--mirror", "--json", "--episodes", "2", "--trace", "t.jsonl", "--set", &model];
-    succeeded(program(folder, &trace));
-    succeeded(program(folder, &["export", "--ckpt", "builtin", "--mirror", "--set", &model]));
+    assert!(goals(&[&play[..], &["--json"]].concat()) > 6.0, "the right hand reaches more than nine");
+    let output = succeeded(program(folder, &[&play[..], &["--out", "t.jsonl"]].concat()));
+    assert_eq!(stderr(&output).matches("plays mirrored").count(), 1, "{}", stderr(&output));
+    let exported = succeeded(program(folder, &["export", "--ckpt", "builtin", "--set", &model]));
+    assert!(stderr(&exported).contains("plays mirrored"), "{}", stderr(&exported));
     let scene = folder.join("scene.xml");
     crate::export::check_in_python(folder, &["policy.onnx", "--scene", scene.to_str().unwrap(), "--check", "t.jsonl"]);
-    let run = ["--init", "builtin", "--mirror", "--total-steps", "128", "--run-dir", "run", "--set", &model];
+    let run = ["--init", "builtin", "--total-steps", "128", "--run-dir", "run", "--set", &model];
     let small = ["env.num_envs=16", "ppo.horizon=8", "run.eval_episodes=2", "randomization.share=0"];
     let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
-    succeeded(program(folder, &[&["train"], &run[..], &small].concat()));
-    assert!(
-        goals(&["play", "--ckpt", "run", "--json", "--episodes", "4", "--set", &model]) > 4.0,
-        "it knows that it mirrors"
-    );
-    let wrong = program(folder, &["play", "--ckpt", "builtin", "--mirror", "--headless"]);
+    let said = stderr(&succeeded(program(folder, &[&["train"], &run[..], &small].concat())));
+    assert!(said.contains("plays mirrored"), "{said}");
+    let trained = ["play", "--ckpt", "run", "--json", "--episodes", "4", "--set"];
+    assert!(goals(&[&trained[..], &[&model]].concat()) > 4.0, "it plays the left hand in the mirror");
+    assert!(goals(&[&trained[..], &["env.model=builtin"]].concat()) > 4.0, "its own hand is still the right one");
+    // Names of a left hand in a scene that is none.
+    fs::write(folder.join("named.xml"), SCENE.replace("rh_", "lh_")).unwrap();
+    let wrong = program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", "env.model=named.xml"]);
     assert!(stderr(&wrong).contains("not the mirror image"), "{}", stderr(&wrong));
+}
+
+#[test]
+fn where_names_do_not_tell_the_side_of_a_hand_its_fingertips_do() {
+    let (folder, right) = placed(&SCENE.replace("rh_", ""));
+    let folder = folder.path();
+    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &right])));
+    fs::write(folder.join("left.xml"), left_scene().replace("lh_", "")).unwrap();
+    // Neither where the policy's hand has its fingertips, nor in the mirror.
+    let moved = SCENE.replace("rh_", "").replacen("pos=\"0 0 .034\"", "pos=\"0 0 .044\"", 1);
+    fs::write(folder.join("moved.xml"), moved).unwrap();
+    for (model, mirrored) in [(&*right, false), ("env.model=left.xml", true), ("env.model=moved.xml", false)] {
+        let play = ["play", "--ckpt", "run", "--headless", "--episodes", "1", "--set", model];
+        let said = stderr(&succeeded(program(folder, &play)));
+        assert_eq!(said.contains("plays mirrored"), mirrored, "{model}: {said}");
+    }
 }

@@ -24,7 +24,7 @@ fn moved_scene() -> tempfile::TempDir {
 /// Plays with these arguments, and returns `env.goal_position` in the header of the trace, and stderr.
 fn played(folder: &Path, args: &[&str]) -> (String, String) {
     let brief =
-        ["play", "--headless", "--episodes", "1", "--trace", "trace.jsonl", "--set", "env.max_episode_seconds=0.1"];
+        ["play", "--headless", "--episodes", "1", "--out", "trace.jsonl", "--set", "env.max_episode_seconds=0.1"];
     let output = succeeded(program(folder, &[&brief, args].concat()));
     let trace = fs::read_to_string(folder.join("trace.jsonl")).unwrap();
     let header: serde_json::Value = serde_json::from_str(trace.lines().next().unwrap()).unwrap();
@@ -47,13 +47,13 @@ fn the_cube_starts_where_a_users_scene_has_it_unless_the_user_names_a_place() {
     let folder = folder.path();
     let (place, _) = played(folder, &["--ckpt", "builtin", "--set", MOVED]);
     assert_eq!(place, "[1.33,0.0,0.295]", "the policy's file only repeats the default");
-    let (place, said) = played(folder, &["--policy", "zero", "--set", MOVED]);
+    let (place, said) = played(folder, &["--ckpt", "zero", "--set", MOVED]);
     assert_eq!(place, "[1.33,0.0,0.295]");
     assert!(said.contains("`cube` starts where moved.xml has it: env.goal_position = [1.33, 0.0, 0.295]"), "{said}");
-    let (place, said) = played(folder, &["--policy", "zero", "--set", MOVED, "--set", DEFAULT_PLACE]);
+    let (place, said) = played(folder, &["--ckpt", "zero", "--set", MOVED, "--set", DEFAULT_PLACE]);
     assert_eq!(place, "[0.33,0.0,0.295]");
     assert!(said.contains("replaces the place of `cube` in moved.xml, [1.33, 0.0, 0.295]"), "{said}");
-    assert_eq!(played(folder, &["--policy", "zero"]).0, "[0.33,0.0,0.295]", "the built-in scene has the default");
+    assert_eq!(played(folder, &["--ckpt", "zero"]).0, "[0.33,0.0,0.295]", "the built-in scene has the default");
 }
 
 #[test]
@@ -101,13 +101,13 @@ fn what_is_replaced_of_a_users_scene_is_said_at_the_start() {
     let folder = moved_scene();
     let folder = folder.path();
     let timestep = "env.sim_dt = 0.01 s replaces the timestep of ";
-    for said in [played(folder, &["--policy", "zero", "--set", MOVED]).1, trained(folder, "r", &["--set", MOVED])] {
+    for said in [played(folder, &["--ckpt", "zero", "--set", MOVED]).1, trained(folder, "r", &["--set", MOVED])] {
         assert!(
             said.contains(timestep) && said.contains("0.002 s") && said.contains("start in the keyframe `home`"),
             "{said}"
         );
     }
-    let own = ["--policy", "zero", "--set", MOVED, "--set", "env.sim_dt=0.002"];
+    let own = ["--ckpt", "zero", "--set", MOVED, "--set", "env.sim_dt=0.002"];
     assert!(!played(folder, &own).1.contains(timestep), "it is the same");
     assert!(!trained(folder, "b", &[]).contains(timestep), "the built-in scene is ours");
     assert!(!trained(folder, "q", &["--set", MOVED, "--quiet"]).contains(timestep));
@@ -124,7 +124,7 @@ fn an_object_with_less_symmetry_than_the_policy_assumes_is_warned_of() {
     let play = |policy: [&str; 2], scene: &str| played(folder, &[&policy[..], &["--set", scene]].concat()).1;
     assert!(play(["--ckpt", "builtin"], "env.model=box.xml").contains(alike));
     assert!(!play(["--ckpt", "builtin"], "env.model=cube.xml").contains("alike"));
-    assert!(!play(["--policy", "zero"], "env.model=box.xml").contains("alike"), "no policy, no symmetry");
+    assert!(!play(["--ckpt", "zero"], "env.model=box.xml").contains("alike"), "no policy, no symmetry");
     let train_with = |run: &str, symmetry: &str| {
         let symmetry = format!("ppo.symmetry={symmetry}");
         trained(folder, run, &["--set", "env.model=box.xml", "--set", &symmetry])

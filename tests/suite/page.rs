@@ -154,9 +154,9 @@ fn a_file_holds_what_the_trace_holds_and_the_page_makes_the_poses_of_mujoco_of_i
     let builtin = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/shadow_hand/scene.xml").to_owned();
     for (scene, sets, policy) in [
         (builtin, &[][..], &["--ckpt", "builtin"][..]),
-        (folder.join("joints.xml").display().to_string(), &["--set", "env.model=joints.xml"], &["--policy", "random"]),
+        (folder.join("joints.xml").display().to_string(), &["--set", "env.model=joints.xml"], &["--ckpt", "random"]),
     ] {
-        let play = [&["play", "--episodes", "2", "--plain", "--trace", "t.jsonl", "--html", "x.html"], policy];
+        let play = [&["play", "--episodes", "2", "--plain", "--out", "t.jsonl", "--out", "x.html"], policy];
         succeeded(program(folder, &[&play.concat()[..], sets, &SHORT].concat()));
         let file = File::read(&folder.join("x.html"));
         file.expect_trace(&folder.join("t.jsonl"));
@@ -167,7 +167,7 @@ fn a_file_holds_what_the_trace_holds_and_the_page_makes_the_poses_of_mujoco_of_i
             (&json!(0), &json!(0.01), &json!(false))
         );
         // The same from the trace alone, which knows all settings but the place of the scene.
-        let again = ["play", "--plain", "--from-trace", "t.jsonl", "--html", "y.html"];
+        let again = ["play", "--plain", "--from-trace", "t.jsonl", "--out", "y.html"];
         succeeded(program(folder, &[&again[..], sets].concat()));
         let from_trace = File::read(&folder.join("y.html"));
         from_trace.expect_trace(&folder.join("t.jsonl"));
@@ -216,7 +216,7 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     fs::write(folder.join("joints.xml"), with_all_joints()).unwrap();
-    let random = ["play", "--policy", "random", "--headless", "--episodes", "1", "--trace"];
+    let random = ["play", "--ckpt", "random", "--headless", "--episodes", "1", "--out"];
     succeeded(program(folder, &[&random[..], &["t.jsonl"], &SHORT].concat()));
     succeeded(program(folder, &[&random[..], &["own.jsonl", "--set", "env.model=joints.xml"], &SHORT].concat()));
     let text = fs::read_to_string(folder.join("t.jsonl")).unwrap();
@@ -241,11 +241,11 @@ fn a_trace_that_cannot_be_shown_is_refused_by_its_line() {
         (changed(&[(3, &steps)]), &[], "line 3: `step` is not a count up to 32767"),
         (changed(&[(1, &older)]), &[], "it has no settings"),
         (text.clone(), &["--set", "env.ctrl_dt=0.02"], "a trace has its own settings"),
-        (fs::read_to_string(folder.join("own.jsonl")).unwrap(), &[], "add --set env.model=joints.xml"),
+        (fs::read_to_string(folder.join("own.jsonl")).unwrap(), &[], "set env.model=joints.xml to use"),
         (text.clone(), &["--set", "env.model=joints.xml"], "it was recorded with another hand, which has other joints"),
     ] {
         fs::write(folder.join("bad.jsonl"), text).unwrap();
-        let output = program(folder, &[&["play", "--html", "x.html", "--from-trace", "bad.jsonl"], sets].concat());
+        let output = program(folder, &[&["play", "--out", "x.html", "--from-trace", "bad.jsonl"], sets].concat());
         let said = stderr(&output);
         assert!(output.status.code() == Some(1) && said.contains(part), "{part:?} is not in\n{said}");
         assert!(!folder.join("x.html").exists());
@@ -277,7 +277,7 @@ fn a_browser_draws_the_file_with_and_without_webgl_and_has_nothing_to_complain_o
     fs::create_dir(folder.join("<")).unwrap();
     fs::copy(concat!(env!("CARGO_MANIFEST_DIR"), "/assets/policies/repose.safetensors"), folder.join(policy)).unwrap();
     // With this seed, two faces of the cube are large in the picture.
-    let play = ["play", "--ckpt", policy, "--html", "x.html", "--plain", "--seed", "1"];
+    let play = ["play", "--ckpt", policy, "--out", "x.html", "--plain", "--seed", "1"];
     succeeded(program(folder, &[&play, &SHORT[..]].concat()));
     let page = format!("file://{}#t=0.2", folder.join("x.html").display());
     let software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
@@ -398,7 +398,7 @@ fn status(answer: &str) -> &str {
 #[test]
 fn a_live_page_is_fed_by_the_hands_that_play_and_says_what_a_file_says() {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--policy", "random", "--web", "0", "--hands", "2", "--plain", "--seed", "5"];
+    let args = ["play", "--ckpt", "random", "--web", "0", "--hands", "2", "--plain", "--seed", "5"];
     let live = Live::start(folder.path(), &[&args[..], &SHORT].concat());
     let page = live.get("/");
     assert!(status(&page) == "200" && page.contains("connect-src 'self'"));
@@ -471,7 +471,7 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
     assert_eq!(events.next("controls")[3].as_f64().unwrap(), high, "it is kept in its range");
     assert_eq!(live.events().next("hello")["controls"][3].as_f64().unwrap(), high);
     // Nothing that `play` shows can be changed.
-    let play = Live::start(folder.path(), &["play", "--policy", "zero", "--web", "0", "--plain"]);
+    let play = Live::start(folder.path(), &["play", "--ckpt", "zero", "--web", "0", "--plain"]);
     let request = format!("POST /controls HTTP/1.1\r\nHost: localhost\r\n{own}Content-Length: 7\r\n\r\n[[3,9]]");
     assert_eq!(status(&play.ask(request.as_bytes())), "404");
 }
@@ -479,9 +479,9 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
 #[test]
 fn a_server_answers_what_is_no_request_of_its_page_and_serves_others_meanwhile() {
     let folder = tempfile::tempdir().unwrap();
-    let live = Live::start(folder.path(), &["play", "--policy", "zero", "--web", "0", "--plain"]);
+    let live = Live::start(folder.path(), &["play", "--ckpt", "zero", "--web", "0", "--plain"]);
     let port = live.port;
-    let taken = program(folder.path(), &["play", "--policy", "zero", "--web", &port.to_string()]);
+    let taken = program(folder.path(), &["play", "--ckpt", "zero", "--web", &port.to_string()]);
     assert!(taken.status.code() == Some(1) && stderr(&taken).contains("choose another one"), "{}", stderr(&taken));
     // Half a request, and one that never reads.
     let half: Vec<TcpStream> = (0..3)
@@ -565,21 +565,21 @@ fn a_training_is_followed_by_its_newest_policy_and_is_not_changed() {
 fn options_of_a_page_that_do_not_go_together_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     for (args, part) in [
-        (&["play", "--html", "x.html", "--episodes", "21"][..], "--html shows at most 20 episodes"),
+        (&["play", "--out", "x.html", "--episodes", "21"][..], "an HTML file shows at most 20 episodes, not 21"),
         (
-            &["play", "--html", "x.html", "--episodes", "20", "--set", "env.max_episode_seconds=100"],
+            &["play", "--out", "x.html", "--episodes", "20", "--set", "env.max_episode_seconds=100"],
             "at most 60000 steps",
         ),
-        (&["play", "--html", "x.html", "--set", "env.max_episode_seconds=1000"], "episodes of at most 32767 steps"),
-        (&["play", "--html", "x.html", "--hands", "4"], "--hands applies only with --web"),
-        (&["play", "--html", "x.html", "--follow"], "--follow applies only with --web"),
-        (&["play", "--html", "x.html", "--quality", "high"], "--quality applies only to a film"),
-        (&["play", "--web", "--fps", "20"], "--fps applies only with --video"),
+        (&["play", "--out", "x.html", "--set", "env.max_episode_seconds=1000"], "episodes of at most 32767 steps"),
+        (&["play", "--out", "x.html", "--hands", "4"], "it applies only to a page in a browser (--web)"),
+        (&["play", "--out", "x.html", "--follow"], "--follow cannot be used with a score and an HTML file"),
+        (&["play", "--out", "x.html", "--quality", "high"], "--quality cannot be used with"),
+        (&["play", "--web", "--fps", "20"], "it applies only to a film or a picture (--out)"),
         (&["play", "--web", "--json"], "cannot be used with"),
-        (&["play", "--from-trace", "t.jsonl"], "--html"),
-        (&["play", "--from-trace", "t.jsonl", "--html", "x.html", "--seed", "3"], "cannot be used with"),
-        (&["view", "--web", "--at", "3"], "--at applies only to a picture"),
-        (&["view", "--web", "--screenshot", "x.png"], "cannot be used with"),
+        (&["play", "--from-trace", "t.jsonl"], "--out"),
+        (&["play", "--from-trace", "t.jsonl", "--out", "x.html", "--seed", "3"], "cannot be used with"),
+        (&["view", "--web", "--at", "3"], "--at cannot be used with a page in a browser"),
+        (&["view", "--web", "--out", "x.png"], "cannot be used with"),
     ] {
         let output = program(folder.path(), args);
         let said = stderr(&output);

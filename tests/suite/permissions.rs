@@ -71,7 +71,7 @@ fn a_file_that_may_not_be_written_is_not_replaced() {
     set_mode(&own, 0o444);
     for args in [
         &["export", "--ckpt", "builtin", "--out", "own"][..],
-        &["play", "--policy", "zero", "--episodes", "1", "--trace", "own"],
+        &["play", "--ckpt", "zero", "--episodes", "1", "--out", "jsonl:own"],
     ] {
         refused_to_a_user(folder, args, "cannot write own: Permission denied");
         assert_eq!(fs::read_to_string(&own).unwrap(), "mine");

@@ -22,7 +22,7 @@ use crate::support::{colours_of_the_cube, command, must_be_possible, program, st
 /// Returns whether pictures can be drawn here. Without EGL it prints a note, or fails if CI has installed EGL.
 fn can_draw() -> bool {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--screenshot", "x.png"];
+    let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--out", "x.png"];
     let output = program(folder.path(), &args);
     let said = stderr(&output);
     assert!(output.status.success() || said.contains("apt install libegl1"), "{said}");
@@ -40,8 +40,7 @@ pub(crate) fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
 
 /// Films an episode of two seconds, with `more` arguments.
 fn film(folder: &Path, more: &[&str]) {
-    let mut args =
-        vec!["play", "--policy", "zero", "--set", "env.max_episode_seconds=2", "--plain", "--size", "160x120"];
+    let mut args = vec!["play", "--ckpt", "zero", "--set", "env.max_episode_seconds=2", "--plain", "--size", "160x120"];
     args.extend(more);
     let output = succeeded(program(folder, &args));
     let leftovers =
@@ -87,7 +86,7 @@ fn a_picture_needs_no_display_and_shows_the_cube_in_its_colours() {
     for quality in ["fast", "high"] {
         // A hand that closes slowly would hide two of the sides.
         let args = ["view", "--plain", "--set=env.act_moving_average=1", "--size=320x240"];
-        let args = [&args[..], &["--quality", quality, "--screenshot"]].concat();
+        let args = [&args[..], &["--quality", quality, "--out"]].concat();
         succeeded(program(folder.path(), &[&args[..], &["near.png"]].concat()));
         succeeded(program(folder.path(), &[&args[..], &["far.png", "--camera", "150,-27,10"]].concat()));
         let (size, near) = picture(&folder.path().join("near.png"));
@@ -105,11 +104,11 @@ fn an_mp4_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    film(folder.path(), &["--video", "film.mp4"]);
+    film(folder.path(), &["--out", "film.mp4"]);
     let (frames, size, duration) = decode_mp4(&folder.path().join("film.mp4"));
     assert_eq!((frames.len(), size, duration), (100, [160, 120], 2.0));
     assert_ne!(frames[0], frames[40], "something moves");
-    film(folder.path(), &["--video", "slow.mp4", "--fps", "30", "--episodes", "2"]);
+    film(folder.path(), &["--out", "slow.mp4", "--fps", "30", "--episodes", "2"]);
     let (frames, _, duration) = decode_mp4(&folder.path().join("slow.mp4"));
     assert_eq!((frames.len(), duration), (120, 4.0));
 }
@@ -120,7 +119,7 @@ fn a_gif_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    film(folder.path(), &["--video", "film.gif", "--fps", "30"]);
+    film(folder.path(), &["--out", "film.gif", "--fps", "30"]);
     let mut options = gif::DecodeOptions::new();
     options.set_color_output(gif::ColorOutput::RGBA);
     let mut decoder = options.read_info(File::open(folder.path().join("film.gif")).unwrap()).unwrap();
@@ -145,9 +144,9 @@ fn a_film_shows_the_episodes_that_are_scored() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--policy", "random", "--episodes", "3", "--seed", "5", "--json", "--trace"];
-    let scored = succeeded(program(folder.path(), &[&args[..], &["scored"]].concat()));
-    let filmed = ["filmed", "--plain", "--video", "film.mp4", "--size", "64x64"];
+    let args = ["play", "--ckpt", "random", "--episodes", "3", "--seed", "5", "--json", "--out"];
+    let scored = succeeded(program(folder.path(), &[&args[..], &["jsonl:scored"]].concat()));
+    let filmed = ["jsonl:filmed", "--plain", "--out", "film.mp4", "--size", "64x64"];
     let filmed = succeeded(program(folder.path(), &[&args[..], &filmed].concat()));
     assert_eq!(scored.stdout, filmed.stdout);
     let read = |name| fs::read(folder.path().join(name)).unwrap();
@@ -160,7 +159,7 @@ fn an_interrupted_film_shows_what_was_played() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--policy", "random", "--plain", "--video", "film.mp4", "--size", "64x64", "--episodes", "200"];
+    let args = ["play", "--ckpt", "random", "--plain", "--out", "film.mp4", "--size", "64x64", "--episodes", "200"];
     let child = command(folder.path(), &args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let unfinished = || {
         let files = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
@@ -226,7 +225,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
     same_physics(&plain, &furnished);
     if can_draw() {
-        let args = ["view", "--quality", "fast", "--size", "320x240", "--screenshot", "x.png", "--set"];
+        let args = ["view", "--quality", "fast", "--size", "320x240", "--out", "x.png", "--set"];
         succeeded(program(folder.path(), &[&args[..], &[&format!("env.model={}", path.display())]].concat()));
         let (_, rgb) = picture(&folder.path().join("x.png"));
         assert!(colours_of_the_cube(&rgb) >= 2, "the faces of the cube can be told apart");
@@ -260,7 +259,7 @@ fn without_the_network_the_primitives_are_shown_and_it_is_said() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["view", "--quality", "fast", "--size", "64x64", "--screenshot", "x.png"];
+    let args = ["view", "--quality", "fast", "--size", "64x64", "--out", "x.png"];
     let mut command = command(folder.path(), &args);
     // Without a program named python3 nothing can be fetched.
     let output =
@@ -275,12 +274,12 @@ fn without_the_network_the_primitives_are_shown_and_it_is_said() {
 #[test]
 fn without_egl_the_packages_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    for args in [["view", "--plain", "--screenshot", "x.png"], ["play", "--policy=zero", "--plain", "--video=x.mp4"]] {
+    for args in [["view", "--plain", "--out", "x.png"], ["play", "--ckpt=zero", "--plain", "--out=x.mp4"]] {
         let mut command = command(folder.path(), &args);
         let output = command.env("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent").output().unwrap();
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
-        for part in ["cannot draw", "apt install libegl1 libgl1-mesa-dri", "play --headless"] {
+        for part in ["cannot draw", "apt install libegl1 libgl1-mesa-dri"] {
             assert!(said.contains(part), "{said}");
         }
         assert!(!said.contains("panicked"), "{said}");
@@ -316,28 +315,29 @@ fn pictures_and_films_that_cannot_be_are_refused() {
         assert_eq!(output.status.code(), Some(code), "{args:?} {said}");
         assert!(said.contains(part) && !said.contains("panicked"), "{args:?} {said}");
     };
-    refused(&["view", "--screenshot", "x.png", "--size", "640"], 2, "e.g. 640x480");
-    refused(&["view", "--screenshot", "x.png", "--size", "8x8"], 2, "from 16 to 3840");
-    refused(&["view", "--screenshot", "x.png", "--camera", "1,2"], 2, "three numbers");
-    refused(&["view", "--screenshot", "x.png", "--camera", "1,2,-3"], 2, "from 0.05 to 10");
-    refused(&["view", "--screenshot", "x.png", "--quality", "best"], 2, "possible values: fast, high");
-    refused(&["play", "--fps", "20"], 2, "--video");
-    refused(&["play", "--window", "--video", "x.mp4"], 2, "--window");
+    refused(&["view", "--out", "x.png", "--size", "640"], 2, "e.g. 640x480");
+    refused(&["view", "--out", "x.png", "--size", "8x8"], 2, "from 16 to 3840");
+    refused(&["view", "--out", "x.png", "--camera", "1,2"], 2, "three numbers");
+    refused(&["view", "--out", "x.png", "--camera", "1,2,-3"], 2, "from 0.05 to 10");
+    refused(&["view", "--out", "x.png", "--quality", "best"], 2, "possible values: fast, high");
+    refused(&["play", "--fps", "20"], 2, "it applies only to a film");
+    refused(&["play", "--window", "--out", "x.mp4"], 2, "--window");
     if !can_draw() {
         return;
     }
-    let film = ["play", "--policy", "zero", "--plain", "--set", "env.max_episode_seconds=0.1", "--video"];
+    let film = ["play", "--ckpt", "zero", "--plain", "--set", "env.max_episode_seconds=0.1", "--out"];
     let refused_film = |more: &[&str], part: &str| refused(&[&film[..], more].concat(), 1, part);
-    refused_film(&["x.avi"], "must end in .mp4 or .gif");
-    refused_film(&["x"], "must end in .mp4 or .gif");
+    for name in ["x.avi", "x", "avi:x", ".gif"] {
+        refused(&[&film[..], &[name]].concat(), 2, "must end in .mp4 or .gif");
+    }
     refused_film(&["x.mp4", "--size", "65x64"], "must be even");
     refused_film(&["x.mp4", "--episodes", "1000000"], "at most 2000000");
     refused_film(&["x.gif", "--fps", "60"], "at most 50");
     refused_film(&["missing/x.mp4"], "missing/x.mp4");
     symlink("/dev/full", folder.path().join("full.mp4")).unwrap();
     refused_film(&["full.mp4"], "full.mp4");
-    refused(&["view", "--plain", "--screenshot", "x.jpg"], 1, "must end in .png");
-    refused(&["view", "--plain", "--screenshot", "missing/x.png"], 1, "missing/x.png");
+    refused(&["view", "--plain", "--out", "x.jpg"], 2, "must end in .png");
+    refused(&["view", "--plain", "--out", "missing/x.png"], 1, "missing/x.png");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "only the link");
 }
 
@@ -350,7 +350,7 @@ fn the_camera_is_where_it_was_asked_to_be_with_another_mass_too() {
     // The upper half shows the goal and the sky. The cube, below, moves according to its mass.
     let upper_half = |camera: &str, more: &[&str]| {
         let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--camera", camera];
-        succeeded(program(folder.path(), &[&args[..], &["--screenshot", "x.png"], more].concat()));
+        succeeded(program(folder.path(), &[&args[..], &["--out", "x.png"], more].concat()));
         let (_, rgb) = picture(&folder.path().join("x.png"));
         rgb[..rgb.len() / 2].to_vec()
     };

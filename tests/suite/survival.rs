@@ -363,7 +363,7 @@ fn diverged_physics_is_counted_and_leaves_what_is_needed_for_a_replay() {
 fn a_fatal_error_of_mujoco_in_an_evaluation_names_the_episode() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("small.xml"), SCENE.replace("memory=\"2M\"", "memory=\"80K\"")).unwrap();
-    let args = ["play", "--policy", "random", "--episodes", "64", "--set", "env.model=small.xml"];
+    let args = ["play", "--ckpt", "random", "--episodes", "64", "--set", "env.model=small.xml"];
     let output = program(folder.path(), &args);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");

@@ -175,7 +175,7 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
 fn where_there_is_a_display_play_opens_a_window_that_closes_after_its_episodes() {
     let Some(display) = Display::open() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let mut args = vec!["play", "--policy", "zero", "--plain", "--quality", "fast", "--episodes", "2"];
+    let mut args = vec!["play", "--ckpt", "zero", "--plain", "--quality", "fast", "--episodes", "2"];
     args.extend(["--set", "env.max_episode_seconds=0.5"]);
     let output = display.start(folder.path(), &args).wait_with_output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
@@ -193,11 +193,11 @@ fn where_there_is_a_display_play_opens_a_window_that_closes_after_its_episodes()
 #[test]
 fn without_a_display_the_packages_and_the_ways_without_a_window_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    for args in [&["view", "--plain"][..], &["play", "--policy", "zero", "--plain", "--window"]] {
+    for args in [&["view", "--plain"][..], &["play", "--ckpt", "zero", "--plain", "--window"]] {
         let output = program(folder.path(), args);
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
-        for part in ["cannot open a window", "DISPLAY", "apt install libgl1 libxcursor1", "play --headless"] {
+        for part in ["cannot open a window", "DISPLAY", "apt install libgl1 libxcursor1", "--web shows the hand"] {
             assert!(said.contains(part), "{said}");
         }
         assert!(!said.contains("panicked"), "{said}");
@@ -207,7 +207,7 @@ fn without_a_display_the_packages_and_the_ways_without_a_window_are_named() {
 #[test]
 fn a_display_that_does_not_answer_costs_a_word_and_not_the_score() {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--policy", "zero", "--plain", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
+    let args = ["play", "--ckpt", "zero", "--plain", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
     let output = command(folder.path(), &args).env("DISPLAY", ":4242").output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(stderr(&output).contains("cannot open a window"), "{}", stderr(&output));

@@ -7,14 +7,14 @@ mod format;
 mod gif;
 mod mp4;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use anyhow::{Context, Result, bail, ensure};
 
 use self::format::Frames;
-use crate::os::OutputFile;
+use crate::os::{Destination, OutputFile};
 
 pub use self::format::FilmFormat;
 
@@ -35,29 +35,28 @@ pub struct FilmWriter {
 }
 
 impl FilmWriter {
-    /// Starts a film: MP4 or GIF, by the extension of `path`.
+    /// Starts a film.
     ///
     /// # Errors
-    /// Fails for any other extension, for a format that the kind of file does not support, or if the file cannot be written.
-    pub fn create(path: &Path, format: FilmFormat) -> Result<Self> {
-        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-        let encode: fn(OutputFile, FilmFormat, Frames) -> Result<OutputFile> = match extension.as_str() {
+    /// Fails if the file is neither an MP4 nor a GIF, for a format that the kind of file does not support, or if it cannot be written.
+    pub fn create(to: &Destination, format: FilmFormat) -> Result<Self> {
+        let encode: fn(OutputFile, FilmFormat, Frames) -> Result<OutputFile> = match to.ending {
             "mp4" => mp4::encode,
             "gif" => gif::encode,
-            _ => bail!("{}: the name of a film must end in .mp4 or .gif", path.display()),
+            other => bail!("{}: a film is an .mp4 or a .gif, not a .{other}", to.path.display()),
         };
         let [width, height] = format.size;
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
-        ensure!(extension == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
+        ensure!(to.ending == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
         let steady = format.fps <= 50;
-        ensure!(extension == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        ensure!(to.ending == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
         let fits = format.longest <= MOST_FRAMES;
         ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes", format.longest);
-        let file = OutputFile::create(path)?;
+        let file = OutputFile::create(&to.path)?;
         let (frames, incoming) = sync_channel(WAITING);
         let encode = move || encode(file, format, &mut captioned(incoming, format));
         let encoder = thread::Builder::new().name("film".into()).spawn(encode).context("cannot start a thread")?;
-        Ok(Self { path: path.to_owned(), frames, encoder })
+        Ok(Self { path: to.path.clone(), frames, encoder })
     }
 
     /// Adds a frame. Does nothing if the encoder has failed: [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`]
@@ -93,10 +92,8 @@ fn captioned(frames: Receiver<CaptionedFrame>, format: FilmFormat) -> impl Itera
 /// Writes a picture `[height, width, 3]` as PNG.
 ///
 /// # Errors
-/// Fails if the name does not end in .png, or if the file cannot be written.
+/// Fails if the file cannot be written.
 pub fn write_png(output: OutputFile, [width, height]: [u32; 2], rgb: &[u8]) -> Result<()> {
-    let named = output.path().extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
-    ensure!(named, "{}: the name of a picture must end in .png", output.path().display());
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(png::ColorType::Rgb);

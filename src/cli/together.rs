@@ -1,0 +1,103 @@
+//! Which options of `play` and `view` go together: each goes with something that is made.
+
+use clap::ArgMatches;
+use clap::parser::ValueSource;
+
+/// Something that `play` or `view` makes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Made {
+    /// A window.
+    Window,
+    /// A page in a browser.
+    Web,
+    /// A score over whole episodes, and a trace of them.
+    Score,
+    /// The table of scores under changes.
+    Robustness,
+    /// A film or a picture.
+    Picture,
+    /// An HTML file.
+    Page,
+}
+
+/// What is made, its name, and the options that go with it. An option in no row goes with everything.
+const GO_WITH: [Row; 6] = [
+    (
+        Made::Window,
+        "a window",
+        &[
+            "--window",
+            "--ckpt",
+            "--stochastic",
+            "--episodes",
+            "--seed",
+            "--threads",
+            "--camera",
+            "--quality",
+            "--plain",
+        ],
+    ),
+    (
+        Made::Web,
+        "a page in a browser (--web)",
+        &["--web", "--hands", "--follow", "--ckpt", "--stochastic", "--seed", "--threads", "--camera", "--plain"],
+    ),
+    (
+        Made::Score,
+        "a score",
+        &["--headless", "--json", "--out FILE.jsonl", "--ckpt", "--stochastic", "--episodes", "--seed", "--threads"],
+    ),
+    (
+        Made::Robustness,
+        "--robustness",
+        &[
+            "--robustness",
+            "--headless",
+            "--json",
+            "--out FILE.svg",
+            "--out FILE.png",
+            "--ckpt",
+            "--stochastic",
+            "--episodes",
+            "--seed",
+            "--threads",
+        ],
+    ),
+    (
+        Made::Picture,
+        "a film or a picture (--out)",
+        &["--out FILE.mp4", "--out FILE.gif", "--fps", "--at", "--seed", "--size", "--camera", "--quality", "--plain"],
+    ),
+    (Made::Page, "an HTML file (--out)", &["--out FILE.html", "--from-trace", "--camera", "--plain"]),
+];
+
+type Row = (Made, &'static str, &'static [&'static str]);
+
+/// Checks that each of the options `given` goes with something that is `made`.
+///
+/// # Errors
+/// Fails with a sentence that says what the option goes with.
+pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
+    let names = |of: &dyn Fn(&Row) -> bool, between: &str| {
+        let rows = GO_WITH.iter().filter(|row| of(row));
+        rows.map(|(_, name, _)| *name).collect::<Vec<_>>().join(between)
+    };
+    let is_made = |(row, ..): &Row| made.contains(row);
+    for option in given {
+        let takes = |(.., options): &Row| options.contains(&&**option);
+        if GO_WITH.iter().any(takes) && !GO_WITH.iter().any(|row| is_made(row) && takes(row)) {
+            let here = names(&is_made, " and ");
+            let needed = names(&takes, " or ");
+            return Err(format!("{option} cannot be used with {here}; it applies only to {needed}"));
+        }
+    }
+    Ok(())
+}
+
+/// The options of the command that stand on the command line, without those that have their defaults.
+pub(super) fn given(matches: &ArgMatches) -> Vec<String> {
+    let Some((_, of_command)) = matches.subcommand() else { return Vec::new() };
+    let ids = of_command.ids().map(clap::Id::as_str);
+    let given = ids.filter(|id| of_command.value_source(id) == Some(ValueSource::CommandLine));
+    given.map(|id| format!("--{}", id.replace('_', "-"))).collect()
+}

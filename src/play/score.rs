@@ -1,0 +1,101 @@
+//! Playing for a score, and for files.
+
+use std::process::ExitCode;
+
+#[cfg(not(feature = "video"))]
+use anyhow::bail;
+use anyhow::{Context, Result};
+
+use super::browser::about;
+use super::figures::{json_score, table};
+use super::files::Files;
+use super::plan::Outputs;
+use super::stage::Stage;
+use crate::evaluate::{Actor, Episodes, Moment, Trial};
+use crate::goal_times::GoalTimes;
+#[cfg(feature = "video")]
+use crate::os::Destination;
+use crate::os::{self, Requests};
+use crate::repose::Score;
+use crate::see;
+
+/// Plays the episodes without a window, writes the outputs, and prints the score. Returns the exit code of the program.
+///
+/// # Errors
+/// Fails if an output cannot be written, if an action is not finite, or if an episode panics.
+pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Requests) -> Result<ExitCode> {
+    let task = &stage.task;
+    let actor = &stage.actor();
+    let place = stage.loaded().map(|loaded| loaded.origin.to_string());
+    let mut files = Files::begin(stage, episodes, outputs)?;
+    let mut goal_times = GoalTimes::new(task.config());
+    let mut observe = |moment: &Moment| {
+        goal_times.observe(moment);
+        files.observe(moment);
+    };
+    let trial = Trial { task, actor, episodes, stop: requests.stop() };
+    let played = match &outputs.film {
+        #[cfg(not(feature = "video"))]
+        Some(_) => bail!(see::NO_FILMS),
+        #[cfg(feature = "video")]
+        Some(to) => film(to, outputs, trial, requests, &mut observe)?,
+        None => scored(trial, &mut observe)?,
+    };
+    let Some(played) = played else {
+        files.give_up();
+        return Ok(os::exit_code(requests.signal()));
+    };
+    files.finish(&about(stage, episodes.seed))?;
+    played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    if outputs.json {
+        os::print(&format!("{}\n", json_score(&played, &goal_times, place.as_deref(), episodes.seed)))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut columns = vec![(actor.name(), played)];
+    if let Some(place) = place {
+        os::print(&format!("checkpoint {place}\n"))?;
+        if outputs.film.is_none() && outputs.page.is_none() {
+            let zero = scored(Trial { actor: &Actor::Zero, ..trial }, &mut |_| {})?;
+            columns.push((Actor::Zero.name(), zero.context("these episodes cannot be interrupted")?));
+        }
+    }
+    os::print(&table(&columns))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Plays the episodes, several at a time. Without a score, they were interrupted.
+fn scored(trial: Trial, observe: &mut dyn FnMut(&Moment)) -> Result<Option<Score>> {
+    let bar = os::progress_bar(trial.episodes.count as u64, "episodes", trial.actor.name());
+    trial.score(&bar, observe)
+}
+
+/// Plays the episodes one after another and films them. If interrupted, it leaves a film of what was played.
+#[cfg(feature = "video")]
+fn film(
+    to: &Destination,
+    Outputs { shot, fps, .. }: &Outputs,
+    trial: Trial,
+    requests: &Requests,
+    observe: &mut dyn FnMut(&Moment),
+) -> Result<Option<Score>> {
+    let task = &see::task_for_display(trial.task, shot)?;
+    let Episodes { first, count, .. } = trial.episodes;
+    let mut film = see::Film::create(to, task, *fps, count as u64)?;
+    // Unlike the other outputs, a film is worth keeping if it is interrupted.
+    requests.wait_for_end();
+    let mut played = Vec::new();
+    for first in first..first + count {
+        let one = Trial { task, episodes: Episodes { first, count: 1, ..trial.episodes }, ..trial };
+        let result = one.play(&mut |moment| {
+            observe(&moment);
+            film.observe(&moment)
+        });
+        match result {
+            Ok(Some(stats)) => played.extend(stats),
+            Ok(None) => break,
+            Err(error) => return Err(film.abandon().unwrap_or(error)),
+        }
+    }
+    os::say(&format!("{}: {}", to.path.display(), film.finish()?));
+    Ok((played.len() == count).then(|| Score::of(&played, task.config().ctrl_dt)))
+}

@@ -1,0 +1,117 @@
+//! Who acts, and the task.
+
+use std::path::Path;
+use std::rc::Rc;
+use std::sync::Arc;
+
+use anyhow::{Result, ensure};
+
+use crate::cli::PlayArgs;
+use crate::config::{Override, Settings};
+use crate::evaluate::Actor;
+use crate::load::Loaded;
+use crate::os::{self, Destination};
+use crate::ppo::FixedPolicy;
+use crate::repose::Task;
+use crate::run;
+use crate::see::LiveActor;
+
+/// Who acts, and the task.
+pub(super) struct Stage {
+    /// The policy, unless the actor needs none.
+    pub policy: Option<(Loaded, FixedPolicy)>,
+    /// The number of the actor among [`Stage::actors`].
+    pub choice: usize,
+    pub task: Arc<Task>,
+}
+
+impl Stage {
+    /// Prepares what these options say, and tells the user about it. The actor is at `place`.
+    ///
+    /// # Errors
+    /// Fails as [`Stage::find`] does, or if an output replaces something.
+    pub(super) fn set(place: Option<&Path>, args: &PlayArgs) -> Result<Self> {
+        let mut stage = Self::find(place, &args.set)?;
+        if args.stochastic {
+            ensure!(stage.policy.is_some(), "--stochastic samples from a policy: --ckpt names none");
+            stage.choice = 1;
+        }
+        let file = stage.loaded().and_then(|loaded| loaded.origin.file());
+        expect_outputs(&args.out, file, stage.task.config().model_file())?;
+        os::start_threads(args.threads)?;
+        if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
+            os::say(&format!("playing {}", loaded.name));
+        }
+        stage.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+        if !args.json {
+            stage.task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+        }
+        Ok(stage)
+    }
+
+    /// Finds who acts at `place`, and loads the task with these settings.
+    ///
+    /// # Errors
+    /// Fails as [`Loaded::find`] and [`Loaded::task`] do.
+    pub(super) fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
+        if let Some(choice) = place.and_then(Actor::without_policy) {
+            return Ok(Self { policy: None, choice, task: task(None, set)? });
+        }
+        let loaded = Loaded::find(place, set)?;
+        let task = task(Some(&loaded), set)?;
+        let fixed = FixedPolicy::new(loaded.policy.clone());
+        Ok(Self { policy: Some((loaded, fixed)), choice: 0, task })
+    }
+
+    /// The kinds of actions between which a user may choose, by name.
+    pub(super) fn actors(&self) -> Vec<(&'static str, Actor<'_>)> {
+        match &self.policy {
+            Some((_, fixed)) => {
+                vec![("deterministic", Actor::Mean(fixed.frozen())), ("stochastic", Actor::Stochastic(fixed.frozen()))]
+            }
+            None => Actor::WITHOUT_POLICY.into(),
+        }
+    }
+
+    pub(super) fn actor(&self) -> Actor<'_> {
+        self.actors().swap_remove(self.choice).1
+    }
+
+    /// The policy in its file.
+    pub(super) fn loaded(&self) -> Option<&Loaded> {
+        self.policy.as_ref().map(|(loaded, _)| loaded)
+    }
+
+    /// Where the policy comes from, or the name of the actor.
+    pub(super) fn place(&self) -> String {
+        self.loaded().map_or_else(|| self.actor().name().to_owned(), |loaded| loaded.origin.to_string())
+    }
+
+    /// The actor of a page that shows this task.
+    pub(super) fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
+        let policy = self.loaded().map(|loaded| loaded.name.clone());
+        LiveActor { step: Rc::new(move |player| player.step(&self.actor())), policy, task }
+    }
+}
+
+/// Loads the task of a policy, or the one that these settings define.
+///
+/// # Errors
+/// Fails as [`Loaded::task`] does.
+pub(super) fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
+    match loaded {
+        Some(loaded) => loaded.task(set),
+        None => Settings::new().sets(set).resolve().and_then(|config| Task::new(&config.env, &config.hand)),
+    }
+}
+
+/// Checks that each output has a file of its own, which holds nothing that is read.
+fn expect_outputs(out: &[Destination], policy: Option<&Path>, scene: Option<&Path>) -> Result<()> {
+    for (i, Destination { path, .. }) in out.iter().enumerate() {
+        run::expect_output(path, policy, scene)?;
+        let end = os::final_path(path);
+        let is_taken = end.is_some() && out[..i].iter().any(|other| os::final_path(&other.path) == end);
+        ensure!(!is_taken, "--out {}: one file cannot be both", path.display());
+    }
+    Ok(())
+}
