@@ -42,8 +42,7 @@ impl GoalTimes {
     /// Adds a reset or step. The steps of one episode must come in order.
     pub fn observe(&mut self, moment: &Moment) {
         let stats = moment.env.episode();
-        let angle = moment.env.rot_dist();
-        let next = Goal { steps: stats.length, angle };
+        let next = Goal { steps: stats.length, angle: moment.env.rot_dist() };
         let Some((_, end)) = moment.step else {
             self.under_way.insert(moment.episode, (0, next));
             return;
@@ -61,7 +60,7 @@ impl GoalTimes {
         }
     }
 
-    /// Three values, each null where unknown. `steps_to_goal` holds mean and percentiles, in control steps including
+    /// Three values by name, each null where unknown. `steps_to_goal` holds mean and percentiles, in control steps including
     /// the hold. `drops_first_second` is a fraction of the episodes. `steps_fit` is the line of the steps without the hold over
     /// the angle: its offset, and its slope in steps per rad.
     pub fn named(&self) -> [(&'static str, Value); 3] {
@@ -87,10 +86,8 @@ impl GoalTimes {
 fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     let place = fraction * sorted.len().saturating_sub(1) as f64;
     let below = place as usize;
-    let part = place.fract();
-
     let [low, high] = [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
-    low + part * (high - low)
+    low + place.fract() * (high - low)
 }
 
 /// Fits the least-squares line y(x), and returns its offset and slope, or `NaN` for fewer than two distinct x.

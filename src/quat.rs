@@ -46,19 +46,19 @@ pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
 }
 
-/// `q` with length 1.
+/// `q`, scaled to length 1.
 pub fn normalized(q: Quat) -> Quat {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     q.map(|x| x / length)
 }
 
-/// `v` rotated by `q`.
+/// `v`, rotated by `q`.
 pub fn rotate(q: Quat, [x, y, z]: [f64; 3]) -> [f64; 3] {
     let [_, x, y, z] = mul(mul(q, [0.0, x, y, z]), conj(q));
     [x, y, z]
 }
 
-/// `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
+/// Either `q` or `-q`, whichever has w ≥ 0, so that each rotation has one sign.
 pub fn canonical(q: Quat) -> Quat {
     if q[0] < 0.0 { q.map(|x| -x) } else { q }
 }
@@ -83,7 +83,6 @@ pub fn rotation_vector(q: Quat) -> [f64; 3] {
 pub fn uniform([u, v, w]: [f64; 3]) -> Quat {
     let inner = (1.0 - u).sqrt();
     let outer = u.sqrt();
-
     let (sin_v, cos_v) = (std::f64::consts::TAU * v).sin_cos();
     let (sin_w, cos_w) = (std::f64::consts::TAU * w).sin_cos();
     [outer * cos_w, inner * sin_v, inner * cos_v, outer * sin_w]

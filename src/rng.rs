@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 /// The only generator of the program. Its values are the same in every version of its crate.
 pub type Rng = ChaCha8Rng;
 
-/// Returns the generator of stream `index` for `purpose` (at most 24 bytes) under `seed`. Different identifiers never
+/// The generator of stream `index` for `purpose` (at most 24 bytes) under `seed`. Different identifiers never
 /// share numbers.
 pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     let mut key = [0; 32];
@@ -21,13 +21,13 @@ pub fn stream(seed: u64, purpose: &str, index: u64) -> Rng {
     rng
 }
 
-/// Returns the generator for another purpose under the seed and index of `rng`.
+/// The generator for another purpose under the seed and index of `rng`.
 pub fn beside(rng: &Rng, purpose: &str) -> Rng {
     let [seed, ..] = position(rng);
     stream(seed, purpose, rng.get_stream())
 }
 
-/// Returns the generator for another purpose and one of its places. Generators of different places share no numbers as long as
+/// The generator for another purpose and one of its places. Generators of different places share no numbers as long as
 /// fewer than 2¹⁶ words are drawn.
 pub fn beside_at(rng: &Rng, purpose: &str, place: u32) -> Rng {
     let mut beside = beside(rng, purpose);
@@ -38,7 +38,7 @@ pub fn beside_at(rng: &Rng, purpose: &str, place: u32) -> Rng {
 /// The key, stream and position of a generator: its complete state.
 pub type Position = [u64; 6];
 
-/// Returns the state of a generator that is less than 2⁶⁴ words from its start.
+/// The state of a generator that is less than 2⁶⁴ words from its start.
 pub fn position(rng: &Rng) -> Position {
     let seed = rng.get_seed();
     let (words, _) = seed.as_chunks::<8>();
@@ -46,7 +46,7 @@ pub fn position(rng: &Rng) -> Position {
     [a, b, c, d, rng.get_stream(), rng.get_word_pos() as u64]
 }
 
-/// Returns the generator in this state.
+/// The generator in this state.
 pub fn at([key @ .., stream, word]: Position) -> Rng {
     let mut seed = [0; 32];
     for (bytes, word) in seed.chunks_exact_mut(8).zip(key) {

@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shadow_repose::repose::EpisodeStats;
 
-/// Returns the episodes that ended as columns `[N]`, and resets their sums of rewards.
+/// Puts the episodes that ended into columns `[N]`, and resets their sums of rewards.
 pub(crate) fn columns<'py>(
     py: Python<'py>,
     count: usize,

@@ -78,7 +78,7 @@ type Stepped<'py> = (
 );
 
 impl Hands {
-    /// Returns the locked state. Fails if it is in use or gone.
+    /// The locked state. Fails if it is in use or gone.
     fn locked(&self) -> PyResult<MutexGuard<'_, Option<State>>> {
         let guard = match self.state.try_lock() {
             Ok(guard) => guard,
@@ -98,7 +98,7 @@ impl Hands {
         rows.into_pyarray(py).reshape([self.count, self.observation_size()])
     }
 
-    /// Returns the lesson after `env_steps`. Every goal that is reached ends with a redirection, which the caller may ignore.
+    /// The lesson after `env_steps`. Every goal that is reached ends with a redirection, which the caller may ignore.
     fn lesson(&self, env_steps: u64) -> Lesson {
         let mut lesson = match self.training {
             true => Lesson::at(env_steps, &self.config),
@@ -117,7 +117,7 @@ impl Hands {
         }
     }
 
-    /// Returns the last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
+    /// The last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
     fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let (size, blocks) = (self.observation_size(), &state.pool.blocks);
         let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
@@ -132,7 +132,7 @@ impl Hands {
         self.rows(py, finals).map(Some)
     }
 
-    /// Returns the terms of the last step, and zeros where a new episode took the place of the step.
+    /// The terms of the last step, and zeros where a new episode took the place of the step.
     fn step_terms<'py>(&self, py: Python<'py>, state: &mut State, restarted: &[bool]) -> PyResult<Terms<'py>> {
         let weight = state.lesson_from.map_or(1.0, |from| self.lesson(from).task_reward);
         let steps = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
@@ -160,13 +160,13 @@ impl Hands {
 }
 
 impl State {
-    /// Returns the ends `[N]` of the last step as numbers.
+    /// The ends `[N]` of the last step as numbers.
     fn ends(&self) -> Vec<u8> {
         let number = |end: &Option<End>| ENDS.iter().position(|one| one == end).expect("an end") as u8;
         self.pool.blocks.iter().flat_map(|block| &block.ends).map(number).collect()
     }
 
-    /// Returns which environments have finished an episode and have not begun the next one.
+    /// Which environments have finished an episode and have not begun the next one.
     fn waiting(&self) -> Vec<bool> {
         let ends = self.pool.blocks.iter().flat_map(|block| &block.ends);
         ends.map(|end| matches!(end, Some(End::Terminated | End::Truncated))).collect()

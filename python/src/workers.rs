@@ -28,7 +28,7 @@ impl Workers {
         Self { threads, pool: None }
     }
 
-    /// Returns the pool of this process, which is started if need be.
+    /// The pool of this process, which is started if need be.
     ///
     /// # Errors
     /// Fails if there are too many threads, or if the system refuses them.

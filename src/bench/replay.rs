@@ -10,14 +10,14 @@ use crate::env::{Env, EnvPool, Transition};
 use crate::repose::{EpisodePhysics, EpisodeStats, Lesson, Randomization, Repose, Task};
 use crate::rng::Rng;
 use crate::schedule::in_rounds;
-use crate::sim::{Scene, Simulation, SimulationState};
+use crate::sim::{Scene, Simulation};
 use crate::spaces::Spaces;
 
 /// A state from which the physics continues: at the beginning of a burst, or of an episode in it.
 struct Start {
     /// The number of recorded steps before it.
     after: usize,
-    state: SimulationState,
+    state: Box<[f64]>,
     /// What its episode has drawn.
     draw: Option<EpisodePhysics>,
 }

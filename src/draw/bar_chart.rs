@@ -68,60 +68,58 @@ impl Picture for BarChart {
         area.fill(&WHITE)?;
         draw_text(&area, &self.title, (WIDTH / 2, TITLE / 2), (HPos::Center, 16, BLACK))?;
         let bottom = TITLE + ROW * self.bars.len() as i32;
-        self.draw_bars(&area, bottom)?;
+        for value in LINES {
+            area.draw(&PathElement::new([(along(value), TITLE), (along(value), bottom)], GRID))?;
+            draw_text(&area, &value.to_string(), (along(value), bottom + ROW / 2), (HPos::Center, 12, BLACK))?;
+        }
+        for (bar, row) in self.bars.iter().zip(0..) {
+            bar.draw(&area, TITLE + ROW * row + ROW / 2)?;
+        }
         self.map.draw(&area, bottom + ROW + GAP)?;
         Ok(area.present()?)
     }
 }
 
-impl BarChart {
-    fn draw_bars<B: DrawingBackend<ErrorType: 'static>>(
-        &self,
-        area: &DrawingArea<B, Shift>,
-        bottom: i32,
-    ) -> Result<()> {
-        let text = |content: &str, at, across, size| draw_text(area, content, at, (across, size, BLACK));
-        let x = |value: f64| NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32;
-        for value in LINES {
-            area.draw(&PathElement::new([(x(value), TITLE), (x(value), bottom)], GRID))?;
-            text(&format!("{value}"), (x(value), bottom + ROW / 2), HPos::Center, 12)?;
-        }
-        for (i, bar) in self.bars.iter().enumerate() {
-            let middle = TITLE + ROW * i as i32 + ROW / 2;
-            text(&bar.name, (NAMES - 8, middle), HPos::Right, 13)?;
-            text(&bar.note, (WIDTH - NOTES + 8, middle), HPos::Left, 12)?;
-            let corners = [(x(0.0), middle - 7), (x(bar.value), middle + 7)];
-            area.draw(&Rectangle::new(corners, BAR.filled()))?;
-            area.draw(&PathElement::new(bar.interval.map(|value| (x(value), middle)), BLACK))?;
-        }
+/// The place of a value on the bars' axis.
+fn along(value: f64) -> i32 {
+    NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32
+}
+
+impl NamedBar {
+    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: &DrawingArea<B, Shift>, middle: i32) -> Result<()> {
+        draw_text(area, &self.name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
+        draw_text(area, &self.note, (WIDTH - NOTES + 8, middle), (HPos::Left, 12, BLACK))?;
+        let corners = [(along(0.0), middle - 7), (along(self.value), middle + 7)];
+        area.draw(&Rectangle::new(corners, BAR.filled()))?;
+        area.draw(&PathElement::new(self.interval.map(|value| (along(value), middle)), BLACK))?;
         Ok(())
     }
 }
 
 impl HeatMap {
     fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: &DrawingArea<B, Shift>, top: i32) -> Result<()> {
-        let text = |content: &str, at, across, colour| draw_text(area, content, at, (across, 13, colour));
         let width = (WIDTH - NAMES - NOTES) / self.columns.len() as i32;
-        for (i, name) in self.columns.iter().enumerate() {
-            text(name, (NAMES + width * i as i32 + width / 2, top + CELL / 2), HPos::Center, BLACK)?;
+        let left = |column: i32| NAMES + width * column;
+        for (name, column) in self.columns.iter().zip(0..) {
+            draw_text(area, name, (left(column) + width / 2, top + CELL / 2), (HPos::Center, 13, BLACK))?;
         }
-        for (i, (name, cells)) in self.rows.iter().zip(&self.cells).enumerate() {
-            let upper = top + CELL * (1 + i as i32);
-            text(name, (NAMES - 8, upper + CELL / 2), HPos::Right, BLACK)?;
-            for (j, &value) in cells.iter().enumerate() {
-                let left = NAMES + width * j as i32;
+        for ((name, cells), row) in self.rows.iter().zip(&self.cells).zip(1..) {
+            let upper = top + CELL * row;
+            let middle = upper + CELL / 2;
+            draw_text(area, name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
+            for (&value, column) in cells.iter().zip(0..) {
                 let share = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
-                let corners = [(left, upper), (left + width - 2, upper + CELL - 2)];
+                let corners = [(left(column), upper), (left(column + 1) - 2, upper + CELL - 2)];
                 area.draw(&Rectangle::new(corners, blended(share).filled()))?;
                 let colour = if share > 0.6 { WHITE } else { BLACK };
-                text(&number(value, 2), (left + width / 2, upper + CELL / 2), HPos::Center, colour)?;
+                draw_text(area, &number(value, 2), (left(column) + width / 2, middle), (HPos::Center, 13, colour))?;
             }
         }
         Ok(())
     }
 }
 
-/// Returns the colour for a value from 0 (grey) to 1 (the colour of the bars).
+/// The colour for a value from 0 (grey) to 1 (the colour of the bars).
 fn blended(share: f64) -> RGBColor {
     let mix = |from: u8, to: u8| (f64::from(from) * (1.0 - share) + f64::from(to) * share) as u8;
     RGBColor(mix(240, BAR.0), mix(240, BAR.1), mix(240, BAR.2))

@@ -65,7 +65,8 @@ impl Page {
         let (scale, rows) = packed_rows(&self.rows, &self.counts);
         self.meta["rows"] = self.rows.len().into();
         self.meta["scale"] = scale.into();
-        let (code, style) = (format!("\"use strict\";\n{}", CODE.map(lean).concat()), lean(STYLE));
+        let code = format!("\"use strict\";\n{}", CODE.map(lean).concat());
+        let style = lean(STYLE);
         let policy = format!(
             "default-src 'none'; script-src {}; style-src {}; img-src data:; connect-src '{}'; base-uri 'none'; form-action 'none'",
             hash(&code),
@@ -94,13 +95,10 @@ impl Page {
     }
 }
 
-/// Text without indents, empty lines and lines of comment.
+/// A text without indents, empty lines and lines of comment.
 fn lean(text: &str) -> String {
-    let lines = text
-        .lines()
-        .map(str::trim)
-        .filter(|line| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*"));
-    lines.map(|line| format!("{line}\n")).collect()
+    let is_code = |line: &&str| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*");
+    text.lines().map(str::trim).filter(is_code).map(|line| format!("{line}\n")).collect()
 }
 
 /// The hash by which a content security policy names a text.
@@ -121,8 +119,7 @@ fn table(rows: usize, columns: usize, value: impl Fn(usize, usize) -> i64) -> Ve
         let before = if row == 0 { 0 } else { value(row - 1, column) };
         (value(row, column) - before) as u16
     });
-    let (low, high): (Vec<u8>, Vec<u8>) =
-        differences.map(|difference| (difference as u8, (difference >> 8) as u8)).unzip();
+    let (low, high): (Vec<u8>, Vec<u8>) = differences.map(u16::to_le_bytes).map(Into::into).unzip();
     [low, high].concat()
 }
 
@@ -144,7 +141,6 @@ fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     };
     let low = bounds(f32::min, f32::INFINITY);
     let high = bounds(f32::max, f32::NEG_INFINITY);
-
     let step = [0, 1, 2].map(|axis| f64::from(high[axis] - low[axis]).max(1e-9) / 65535.0);
     let point = |corner: usize, axis: usize| {
         (f64::from(corners[corner].0[axis] - low[axis]) / step[axis]).round() as i64 - 32768

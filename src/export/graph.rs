@@ -28,13 +28,13 @@ pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     graph.floats("factor", &[size], &factor);
     let centred = graph.node("Sub", &[&seen, "mean"], "centred", &[]);
     let scaled = graph.node("Mul", &[&centred, "factor"], "scaled", &[]);
-    let row = clip(&mut graph, &scaled, CLIP, "normalised");
-    let row = actor(&mut graph, policy, row);
-    clip(&mut graph, &row, 1.0, "actions");
+    let normalised = clip(&mut graph, &scaled, CLIP, "normalised");
+    let means = actor(&mut graph, policy, normalised);
+    clip(&mut graph, &means, 1.0, "actions");
     graph
 }
 
-/// The layers of the actor.
+/// Computes the mean actions, before they are clipped.
 fn actor(graph: &mut Graph, policy: &Policy, mut row: String) -> String {
     for (i, layer) in policy.layout.actor.iter().enumerate() {
         let weight = format!("actor.{i}.weight");
@@ -61,8 +61,7 @@ fn clip(graph: &mut Graph, row: &str, limit: f32, output: &str) -> String {
     graph.node("Clip", &[row, &low, &high], output, &[])
 }
 
-/// Turns cube and goal by a rotation that the policy treats as the same: by the one that brings the cube closest to its unrotated
-/// orientation.
+/// Turns cube and goal by the rotation, of those that the policy treats as the same, that brings the cube closest to its unrotated orientation.
 fn canonicalize(
     graph: &mut Graph,
     size: usize,
@@ -70,7 +69,7 @@ fn canonicalize(
     (ObjectAndGoal { object, goal, .. }, rotations): (ObjectAndGoal, &[[f32; 4]]),
 ) -> String {
     assert!(object + 4 <= goal, "the goal follows the cube");
-    tabulate(graph, rotations);
+    add_rotations(graph, rotations);
     for (name, sign) in [("zero", 0.0), ("plus", 1.0), ("minus", -1.0)] {
         graph.floats(name, &[1], &[sign]);
     }
@@ -94,14 +93,16 @@ fn canonicalize(
     graph.node("Concat", &["before", &object, "between", &goal, "after"], "seen", &[("axis", Int(1))])
 }
 
-/// Adds what belongs to each of the rotations.
-fn tabulate(graph: &mut Graph, rotations: &[[f32; 4]]) {
+/// Adds what finds the nearest of these rotations, and what multiplies by it.
+fn add_rotations(graph: &mut Graph, rotations: &[[f32; 4]]) {
     // [4, 24]: the cosine of half the angle between a cube's orientation and each rotation's inverse.
     let mut cosines = [0.0; 4 * 24];
     // [24, 4, 4]: a quaternion as a row times this matrix is its product with the rotation.
     let mut products = Vec::new();
     for (j, &[w, x, y, z]) in rotations.iter().enumerate() {
-        [w, -x, -y, -z].into_iter().enumerate().for_each(|(k, value)| cosines[k * 24 + j] = value);
+        for (k, value) in [w, -x, -y, -z].into_iter().enumerate() {
+            cosines[k * 24 + j] = value;
+        }
         products.extend([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w]);
     }
     graph.floats("cosines", &[4, 24], &cosines);

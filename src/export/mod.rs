@@ -41,17 +41,17 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns what a program must know to run the policy: lists are comma-separated, numbers can be read back exactly.
+/// What a program must know to run the policy: lists are comma-separated, numbers can be read back exactly.
 ///
 /// The names follow mjlab's runners where they define one. `joint_names` are what an action drives, here the actuators. Their
 /// target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
 fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
     let config = task.config();
     let hand = task.hand();
-    let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
-    let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
     let parts = &hand.parts;
     let groups = &hand.layout.groups;
+    let ranges = || hand.actuators.iter().map(|actuator| actuator.range);
+    let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
     let mut facts = vec![
         ("action_offset", offsets.clone()),
         ("action_scale", list(ranges().map(|[low, high]| (high - low) / 2.0))),
@@ -74,17 +74,17 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
-    facts.extend(history(&loaded.checkpoint));
+    facts.extend(of_training(&loaded.checkpoint));
     facts
 }
 
-/// What is known of how the policy was trained.
-fn history(checkpoint: &Checkpoint) -> impl Iterator<Item = (&'static str, String)> {
-    let steps = Some(checkpoint.progress.env_steps).filter(|steps| *steps > 0);
-    let steps = steps.map(|steps| ("env_steps", steps.to_string()));
-    let best = checkpoint.progress.best.map(|best| ("goals_per_episode", best.goals.to_string()));
+/// What is known of the training run that made the policy.
+fn of_training(checkpoint: &Checkpoint) -> Vec<(&'static str, String)> {
+    let progress = &checkpoint.progress;
+    let steps = (progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string()));
+    let goals = progress.best.map(|best| ("goals_per_episode", best.goals.to_string()));
     let provenance = checkpoint.provenance.clone().map(|text| ("provenance", text));
-    [steps, best, provenance].into_iter().flatten()
+    [steps, goals, provenance].into_iter().flatten().collect()
 }
 
 fn described(hand: &Hand) -> String {
@@ -96,7 +96,7 @@ fn described(hand: &Hand) -> String {
     format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())
 }
 
-/// Returns all settings of the training as TOML, with the task as it is exported.
+/// All settings of the training run as TOML, with the task as it is exported.
 fn settings(loaded: &Loaded, config: &EnvConfig) -> String {
     let mut table: Table = loaded.checkpoint.config.parse().expect("it was read when the policy was loaded");
     table.insert("env".into(), Value::try_from(config).expect("settings are a table"));

@@ -1,6 +1,6 @@
 //! Reading whole files, and checking which file a path names.
 
-use std::fs::{self, File};
+use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -91,16 +91,21 @@ impl Stamp {
 /// # Errors
 /// Fails if it does not.
 pub fn expect_named(path: &Path, file: &File) -> Result<()> {
-    let [named, held] = [fs::metadata(path).cannot("find", path)?, file.metadata().cannot("find", path)?];
-    let same = (named.dev(), named.ino()) == (held.dev(), held.ino());
-    ensure!(same, "{} has been replaced", path.display());
+    let named = fs::metadata(path).cannot("find", path)?;
+    let held = file.metadata().cannot("find", path)?;
+    ensure!(identity(&named) == identity(&held), "{} has been replaced", path.display());
     Ok(())
 }
 
 /// Whether two paths name the same file.
 pub fn same_file(a: &Path, b: &Path) -> bool {
-    let identity = |path| fs::metadata(path).ok().map(|facts| (facts.dev(), facts.ino()));
-    identity(a).is_some() && identity(a) == identity(b)
+    let named = |path| fs::metadata(path).ok().map(|facts| identity(&facts));
+    named(a).is_some() && named(a) == named(b)
+}
+
+/// The device and the number of a file on it.
+fn identity(facts: &Metadata) -> (u64, u64) {
+    (facts.dev(), facts.ino())
 }
 
 #[cfg(test)]

@@ -25,17 +25,22 @@ pub(super) struct Request {
     pub(super) body: Vec<u8>,
 }
 
-/// A status line without the protocol, and a sentence.
-pub(super) type Refusal = (&'static str, &'static str);
+/// A status line without the protocol, a sentence, and the headers that belong to them.
+pub(super) type Refusal = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
 
-const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.");
-const TOO_LONG: Refusal = ("431 Request Header Fields Too Large", "The request is too long.");
-const LATE: Refusal = ("408 Request Timeout", "The request took too long.");
-const NO_LENGTH: Refusal = ("411 Length Required", "The length of the body is not given.");
-const TOO_LARGE: Refusal = ("413 Content Too Large", "The body is too long.");
-const ELSEWHERE: Refusal =
-    ("403 Forbidden", "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.");
-const FOREIGN: Refusal = ("403 Forbidden", "Only the page itself may send this.");
+const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.", &[]);
+const TOO_LONG: Refusal = ("431 Request Header Fields Too Large", "The request is too long.", &[]);
+const LATE: Refusal = ("408 Request Timeout", "The request took too long.", &[]);
+const NO_LENGTH: Refusal = ("411 Length Required", "The length of the body is not given.", &[]);
+const TOO_LARGE: Refusal = ("413 Content Too Large", "The body is too long.", &[]);
+const ELSEWHERE: Refusal = (
+    "403 Forbidden",
+    "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.",
+    &[],
+);
+const NOT_GET: Refusal = ("405 Method Not Allowed", "This method is not allowed here.", &[("Allow", "GET")]);
+const NOT_POST: Refusal = ("405 Method Not Allowed", "This method is not allowed here.", &[("Allow", "POST")]);
+const FOREIGN: Refusal = ("403 Forbidden", "Only the page itself may send this.", &[]);
 
 impl Request {
     /// Reads a request. Returns `None` if the other side has gone.
@@ -45,27 +50,28 @@ impl Request {
     pub(super) fn read(stream: &mut TcpStream) -> Result<Option<Self>, Refusal> {
         let deadline = Instant::now() + PATIENCE;
         let mut bytes = Vec::new();
-        let mut end = None;
-        while end.is_none() {
+        let end = loop {
             if !read_some(stream, &mut bytes, LONGEST_HEAD, deadline)? {
                 return Ok(None);
             }
-            end = bytes.windows(4).position(|four| four == b"\r\n\r\n");
-            if end.is_none() && bytes.len() >= LONGEST_HEAD {
+            if let Some(end) = bytes.windows(4).position(|four| four == b"\r\n\r\n") {
+                break end + 4;
+            }
+            if bytes.len() >= LONGEST_HEAD {
                 return Err(TOO_LONG);
             }
-        }
-        let mut body = bytes.split_off(end.unwrap_or_default() + 4);
+        };
+        let body = bytes.split_off(end);
         let mut request = Self::parse(&bytes).ok_or(MALFORMED)?;
         if request.method == "POST" {
+            request.body = body;
             let length = request.length()?;
-            while body.len() < length {
-                if !read_some(stream, &mut body, length, deadline)? {
+            while request.body.len() < length {
+                if !read_some(stream, &mut request.body, length, deadline)? {
                     return Ok(None);
                 }
             }
-            body.truncate(length);
-            request.body = body;
+            request.body.truncate(length);
         }
         Ok(Some(request))
     }
@@ -74,15 +80,14 @@ impl Request {
         let mut lines = std::str::from_utf8(head).ok()?.trim_end_matches("\r\n").split("\r\n");
         let [method, target, version] = Vec::from_iter(lines.next()?.split(' ')).try_into().ok()?;
         let path = target.split('?').next()?;
-        let headers: Option<Vec<_>> = lines
-            .map(|line| {
-                let (name, value) = line.split_once(':')?;
-                let is_name = !name.is_empty() && name.bytes().all(|c| c.is_ascii_graphic());
-                is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))
-            })
-            .collect();
+        let mut headers = Vec::new();
+        for line in lines {
+            let (name, value) = line.split_once(':')?;
+            let is_name = !name.is_empty() && name.bytes().all(|c| c.is_ascii_graphic());
+            headers.push(is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))?);
+        }
         let fits = path.starts_with('/') && version.starts_with("HTTP/1.");
-        fits.then_some(Self { method: method.into(), path: path.into(), headers: headers?, body: Vec::new() })
+        fits.then(|| Self { method: method.into(), path: path.into(), headers, body: Vec::new() })
     }
 
     /// The value of a header, unless it is there more than once.
@@ -92,11 +97,21 @@ impl Request {
         found.next().is_none().then_some(value)
     }
 
+    /// The length of the body in bytes.
     fn length(&self) -> Result<usize, Refusal> {
-        let digits = self.header("content-length");
-        let digits = digits.filter(|text| !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit()));
-        let length = digits.filter(|_| self.header("transfer-encoding").is_none()).ok_or(NO_LENGTH)?;
-        length.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
+        let is_number = |text: &&str| !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit());
+        let digits = self.header("content-length").filter(is_number);
+        let digits = digits.filter(|_| self.header("transfer-encoding").is_none()).ok_or(NO_LENGTH)?;
+        digits.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
+    }
+
+    /// Checks that the method is the one that is allowed for the path.
+    ///
+    /// # Errors
+    /// Fails with the answer to send.
+    pub(super) fn expect_method(&self, allowed: &str) -> Result<(), Refusal> {
+        let refusal = if allowed == "GET" { NOT_GET } else { NOT_POST };
+        if self.method == allowed { Ok(()) } else { Err(refusal) }
     }
 
     /// Checks that the address in the browser belongs to this machine: another host name may have been made to lead here.
@@ -169,16 +184,17 @@ pub(super) fn head(status: &str, more: &[(&str, &str)]) -> String {
 /// Fails if the other side does not read it.
 pub(super) fn answer(stream: &mut TcpStream, status: &str, more: &[(&str, &str)], text: &str) -> io::Result<()> {
     let length = text.len().to_string();
-    let of_text = [("Content-Length", &*length)];
-    let mut all = head(status, &[more, if text.is_empty() { &[] } else { &of_text }].concat()).into_bytes();
-    all.extend(text.as_bytes());
-    stream.write_all(&all)
+    let mut headers = more.to_vec();
+    if !text.is_empty() {
+        headers.push(("Content-Length", &length));
+    }
+    stream.write_all((head(status, &headers) + text).as_bytes())
 }
 
 /// Answers with a refusal. What the other side still sends is read, up to a limit, since a closed connection would lose the answer.
-pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal, more: &[(&str, &str)]) {
-    let more = [more, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
-    let sent = answer(stream, status, &more, &format!("{sentence}\n"));
+pub(super) fn refuse(stream: &mut TcpStream, (status, sentence, headers): Refusal) {
+    let headers = [headers, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
+    let sent = answer(stream, status, &headers, &format!("{sentence}\n"));
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
         let deadline = Instant::now() + LINGER;
         let mut rest = Vec::new();

@@ -62,21 +62,15 @@ impl Locked {
         let path = folder.join(LOCK);
         let open = |()| OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
         let file = fs::create_dir_all(folder).and_then(open).cannot("write", &path)?;
-        let taken = |tried: &Result<(), TryLockError>| matches!(tried, Err(TryLockError::WouldBlock));
-        let mut tried = file.try_lock();
-        for _ in 0..PAUSES {
-            if taken(&tried) {
-                thread::sleep(PAUSE);
-                tried = file.try_lock();
+        let mut pauses = 0..PAUSES;
+        let renewal = loop {
+            match file.try_lock() {
+                Ok(()) => break None,
+                Err(TryLockError::WouldBlock) if pauses.next().is_some() => thread::sleep(PAUSE),
+                Err(TryLockError::WouldBlock) => bail!(in_use(folder, &path)),
+                // Some network file systems do not support locks.
+                Err(TryLockError::Error(_)) => break Some(Renewal::begin(folder, path.clone())?),
             }
-        }
-        let renewal = match tried {
-            Ok(()) => None,
-            Err(TryLockError::WouldBlock) => {
-                bail!("{} is in use by another program{}", folder.display(), holder(&path));
-            }
-            // Some network file systems do not support locks.
-            Err(TryLockError::Error(_)) => Some(Renewal::begin(folder, path.clone())?),
         };
         Ok(Self { path, file, _renewal: renewal })
     }
@@ -100,7 +94,7 @@ impl Locked {
         Ok(self)
     }
 
-    /// Releases the lock and removes the name of this program, after a training run that ended normally.
+    /// Releases the lock and removes the name of this program, after a training that ended normally.
     pub fn release(self) {
         // The file may belong to another program by now.
         if holder(&self.path) == name() {
@@ -127,28 +121,25 @@ impl Renewal {
     /// # Errors
     /// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
     fn begin(folder: &Path, path: PathBuf) -> Result<Self> {
-        let age =
-            fs::metadata(&path).and_then(|facts| facts.modified()).cannot("read", &path)?.elapsed().unwrap_or_default();
-        let other = holder(&path);
+        let renewed = fs::metadata(&path).and_then(|facts| facts.modified()).cannot("read", &path)?;
+        let age = renewed.elapsed().unwrap_or_default();
         ensure!(
-            other.is_empty() || age > LAPSED,
-            "{} is in use by another program{other}, or was {} s ago; there are no file locks here, so try again when \
-             {LOCK} is a minute old",
-            folder.display(),
+            holder(&path).is_empty() || age > LAPSED,
+            "{}, or was {} s ago; there are no file locks here, so try again when {LOCK} is a minute old",
+            in_use(folder, &path),
             age.as_secs()
         );
         let own = name();
         fs::write(&path, &own).cannot("write", &path)?;
         thread::sleep(SETTLED);
-        ensure!(holder(&path) == own, "{} is in use by another program{}", folder.display(), holder(&path));
+        ensure!(holder(&path) == own, in_use(folder, &path));
         say(&format!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display()));
-        let renewed = path.clone();
+        let file = path.clone();
         let lives = Arc::new(());
         let alive = Arc::downgrade(&lives);
         let renew = move || {
             while alive.strong_count() > 0 {
-                let _ =
-                    File::options().write(true).open(&renewed).and_then(|file| file.set_modified(SystemTime::now()));
+                set_time(&file, SystemTime::now());
                 thread::sleep(RENEWED_EVERY);
             }
         };
@@ -162,7 +153,7 @@ impl Drop for Renewal {
         // The next training need not wait, unless the file belongs to another one by now. The name stays, as in a file
         // that was locked.
         if holder(&self.path) == name() {
-            let _ = File::options().write(true).open(&self.path).and_then(|file| file.set_modified(UNIX_EPOCH));
+            set_time(&self.path, UNIX_EPOCH);
         }
     }
 }
@@ -170,7 +161,7 @@ impl Drop for Renewal {
 /// What the lock file of a run folder shows to a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hold {
-    /// A training run holds it.
+    /// A training holds it.
     Held,
     /// Nobody holds it, and it contains no name or does not exist.
     Released,
@@ -196,6 +187,14 @@ impl Hold {
             _ => Self::Elsewhere,
         }
     }
+}
+
+fn set_time(path: &Path, time: SystemTime) {
+    let _ = File::options().write(true).open(path).and_then(|file| file.set_modified(time));
+}
+
+fn in_use(folder: &Path, lock: &Path) -> String {
+    format!("{} is in use by another program{}", folder.display(), holder(lock))
 }
 
 /// Who holds the lock file, as it was signed.

@@ -17,7 +17,7 @@ const INSIDE: &str = "robopianist/models/hands/third_party/shadow_hand";
 /// The CRC-32 of the mesh files in this package, one after another in the order of their names.
 const CHECKSUM: u32 = 0x88cc_c91c;
 
-/// The contents of the mesh files, whose `names` are sorted. They are fetched first unless the cache folder has them undamaged.
+/// The contents of the mesh files, whose `names` are sorted. Fetches them first unless the cache folder has them undamaged.
 ///
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.

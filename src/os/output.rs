@@ -10,7 +10,7 @@ use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
@@ -42,14 +42,24 @@ impl Unfinished {
         // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
         let path = folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.partial", std::process::id()));
-        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
+        unfinished().insert(path.clone());
         Self { path }
     }
+
+    /// Gives what has been created the name `target`, in place of whatever has it.
+    fn become_named(&self, target: &Path) -> io::Result<()> {
+        fs::rename(&self.path, target)?;
+        sync_folder(target)
+    }
+}
+
+fn unfinished() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Drop for Unfinished {
     fn drop(&mut self) {
-        let mut unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut unfinished = unfinished();
         remove(&self.path);
         unfinished.remove(&self.path);
     }
@@ -57,7 +67,7 @@ impl Drop for Unfinished {
 
 /// Removes everything that this process has not finished, just before it exits. Nothing can be started afterwards.
 pub(super) fn remove_unfinished() {
-    let unfinished = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    let unfinished = unfinished();
     unfinished.iter().for_each(|path| remove(path));
     std::mem::forget(unfinished);
 }
@@ -171,8 +181,7 @@ impl OutputFile {
     /// Fails if the file cannot be written.
     pub fn complete(self) -> Result<()> {
         let Some((unfinished, target)) = &self.names else { return Ok(()) };
-        let named = self.file.sync_all().and_then(|()| fs::rename(&unfinished.path, target));
-        named.and_then(|()| sync_folder(target)).cannot("write", &self.path)
+        self.file.sync_all().and_then(|()| unfinished.become_named(target)).cannot("write", &self.path)
     }
 
     /// The path as the user gave it.
@@ -204,8 +213,7 @@ pub fn name_also(path: &Path, name: &Path) -> Result<()> {
     if fs::hard_link(path, &unfinished.path).is_err() {
         return write_whole(name, &read_bytes(path)?);
     }
-    let named = fs::rename(&unfinished.path, name).and_then(|()| sync_folder(name));
-    named.cannot("write", name)
+    unfinished.become_named(name).cannot("write", name)
 }
 
 /// Syncs the folder of a new file: the name of the file is on the disk only once its folder is.
@@ -229,7 +237,7 @@ pub fn put_aside(path: &Path, extension: &str) -> io::Result<PathBuf> {
     fs::rename(path, &aside).map(|()| aside)
 }
 
-/// `path`, or a numbered variant of it, that does not exist yet.
+/// The first of `path` and its numbered variants that does not exist yet.
 fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use console::Term;
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use super::say;
+use super::{number, say};
 
 /// The time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -131,14 +131,14 @@ impl Status {
 
     /// The parts of the line, the most important first.
     fn parts(&self, left: Duration) -> Vec<String> {
-        let known = |value: f64, text: String| if value.is_nan() { "-".to_owned() } else { text };
         let evaluated =
             if self.evaluation.is_nan() { String::new() } else { format!(" (eval {:.2})", self.evaluation) };
+        let per_cent = if self.drop_rate.is_nan() { "" } else { "%" };
         vec![
             format!("{:.0} steps/s", self.steps_per_s),
             format!("ETA {}", clock(left)),
-            format!("goals {}{evaluated}", known(self.goals, format!("{:.2}", self.goals))),
-            format!("drops {}", known(self.drop_rate, format!("{:.0}%", 100.0 * self.drop_rate))),
+            format!("goals {}{evaluated}", number(self.goals, 2)),
+            format!("drops {}{per_cent}", number(100.0 * self.drop_rate, 0)),
         ]
     }
 

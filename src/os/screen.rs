@@ -37,14 +37,14 @@ impl Screen {
     }
 }
 
-/// The lines as a text, cut to the width of the terminal on which it is printed, if there is one.
+/// Lines as a text, cut to the width of the terminal on which it is printed, if there is one.
 pub fn text_of(lines: &[String]) -> String {
     let width = Term::stdout().size_checked().map(|(_, columns)| usize::from(columns));
     let cut = |line: &'_ String| width.map_or(line.clone(), |width| truncate_str(line, width, "…").into_owned());
     lines.iter().map(|line| cut(line) + "\n").collect()
 }
 
-/// The rows as lines with aligned columns. The first `words` columns are aligned to the left, the others to the right, and the
+/// Rows as lines with aligned columns. The first `words` columns are aligned to the left, the others to the right, and the
 /// last one stays as it is.
 pub fn aligned(rows: &[Vec<String>], words: usize) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);

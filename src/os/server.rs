@@ -21,6 +21,9 @@ const KEPT: usize = 64;
 /// The time without an event after which a reader gets an event without news.
 const QUIET: Duration = Duration::from_secs(1);
 
+const NO_PAGE: Refusal = ("404 Not Found", "There is no such page.", &[]);
+const CROWDED: Refusal = ("503 Service Unavailable", "There are too many viewers.", &[]);
+
 /// What a user can do about a port that cannot be opened.
 const OTHER_PORT: &str = "choose another one, or 0 for any free port";
 
@@ -133,40 +136,37 @@ impl Shared {
 
     fn serve(self: &Arc<Self>, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
-        let refusal = match Request::read(&mut stream) {
-            Ok(Some(request)) => self.answer(&mut stream, &request),
-            Ok(None) => Ok(()),
-            Err(refusal) => Err((refusal, "GET")),
-        };
-        if let Err((refusal, allowed)) = refusal {
-            let allow = [("Allow", allowed)];
-            refuse(&mut stream, refusal, if refusal.0.starts_with("405") { &allow } else { &[] });
+        let answered = Request::read(&mut stream).and_then(|request| match request {
+            Some(request) => self.answer(&mut stream, &request),
+            None => Ok(()),
+        });
+        if let Err(refusal) = answered {
+            refuse(&mut stream, refusal);
         }
     }
 
-    /// Answers a request. An error is a refusal, with the methods that are allowed.
-    fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), (Refusal, &'static str)> {
-        request.expect_local().map_err(|refusal| (refusal, "GET"))?;
-        let on_post = self.on_post.as_ref().filter(|_| request.path == "/controls");
-        let allowed = if on_post.is_some() { "POST" } else { "GET" };
-        if !matches!(&*request.path, "/" | "/events") && on_post.is_none() {
-            return Err((("404 Not Found", "There is no such page."), allowed));
-        }
-        if request.method != allowed {
-            return Err((("405 Method Not Allowed", "This method is not allowed here."), allowed));
-        }
-        if let Some(on_post) = on_post {
-            request.expect_own().map_err(|refusal| (refusal, allowed))?;
-            on_post(&request.body).map_err(|sentence| (("400 Bad Request", sentence), allowed))?;
-            let _ = answer(stream, "204 No Content", &[], "");
-        } else if request.path == "/" {
-            let _ = answer(stream, "200 OK", &[("Content-Type", "text/html; charset=utf-8")], &self.page);
-        } else {
-            let slot = Slot::take(self, MOST_READERS, |news| &mut news.readers);
-            let _slot = slot.ok_or((("503 Service Unavailable", "There are too many viewers."), allowed))?;
-            // An error is a reader that has gone, or has read nothing for too long.
-            let _ = self.send_events(stream);
-        }
+    fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), Refusal> {
+        request.expect_local()?;
+        // An error of a write is a reader that has gone, or has read nothing for too long.
+        let _ = match (&*request.path, &self.on_post) {
+            ("/", _) => {
+                request.expect_method("GET")?;
+                answer(stream, "200 OK", &[("Content-Type", "text/html; charset=utf-8")], &self.page)
+            }
+            ("/events", _) => {
+                request.expect_method("GET")?;
+                let slot = Slot::take(self, MOST_READERS, |news| &mut news.readers);
+                let _slot = slot.ok_or(CROWDED)?;
+                self.send_events(stream)
+            }
+            ("/controls", Some(on_post)) => {
+                request.expect_method("POST")?;
+                request.expect_own()?;
+                on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence, &[][..]))?;
+                answer(stream, "204 No Content", &[], "")
+            }
+            _ => return Err(NO_PAGE),
+        };
         Ok(())
     }
 

@@ -60,51 +60,38 @@ fn is_steering(c: char) -> bool {
 
 /// A text of one line. Characters that control a terminal are escaped as in JSON, so that JSON stays valid.
 pub fn harmless(text: &str) -> String {
-    let mut harmless = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            c if is_steering(c) => {
-                c.encode_utf16(&mut [0; 2]).iter().for_each(|unit| harmless += &format!("\\u{unit:04x}"));
-            }
-            c => harmless.push(c),
-        }
-    }
-    harmless
+    let escape = |c: char| c.encode_utf16(&mut [0; 2]).iter().map(|unit| format!("\\u{unit:04x}")).collect();
+    escaped(text, "", escape)
+}
+
+/// A text in which the characters that control a terminal, but for those in `kept`, are escaped.
+fn escaped(text: &str, kept: &str, escape: impl Fn(char) -> String) -> String {
+    let shown = |c: char| if is_steering(c) && !kept.contains(c) { escape(c) } else { c.to_string() };
+    text.chars().map(shown).collect()
 }
 
 /// Prints a line to stderr. Characters that control the terminal are escaped, since the line may quote an untrusted file.
 pub fn say(line: &str) {
-    let mut harmless = SPEAKER.get().cloned().unwrap_or_default();
-    for c in line.chars() {
-        match c {
-            '\n' | '\t' => harmless.push(c),
-            c if is_steering(c) => harmless.extend(c.escape_unicode()),
-            c => harmless.push(c),
-        }
-    }
-    let _ = std::io::stderr().write_all((harmless + "\n").as_bytes());
+    let speaker = SPEAKER.get().map_or("", String::as_str);
+    let harmless = escaped(line, "\n\t", |c| c.escape_unicode().to_string());
+    let _ = std::io::stderr().write_all(format!("{speaker}{harmless}\n").as_bytes());
 }
 
 /// A text as a single shell word, quoted if necessary.
 pub fn quoted(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
-    if !text.is_empty() && text.chars().all(plain) {
-        text.to_owned()
-    } else {
-        format!("'{}'", text.replace('\'', "'\\''"))
-    }
+    let is_word = !text.is_empty() && text.chars().all(plain);
+    if is_word { text.to_owned() } else { format!("'{}'", text.replace('\'', "'\\''")) }
 }
 
 /// A path as a single shell word, even if it is not valid UTF-8.
 pub fn quoted_path(path: &Path) -> String {
-    path.to_str().map_or_else(
-        || {
-            let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
-            // The only one of these escapes that means something else in a shell.
-            format!("$'{}'", escaped.replace("\\\"", "\""))
-        },
-        quoted,
-    )
+    if let Some(text) = path.to_str() {
+        return quoted(text);
+    }
+    let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
+    // The only one of these escapes that means something else in a shell.
+    format!("$'{}'", escaped.replace("\\\"", "\""))
 }
 
 /// How the user has called this program, for commands that are printed: by cargo, by a path, or by its name.

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use super::EpisodePhysics;
 use super::physics::add_settings;
 use crate::config::EnvConfig;
-use crate::sim::{Simulation, SimulationState};
+use crate::sim::Simulation;
 
 /// The end of an episode whose physics diverged.
 #[derive(Clone, Debug)]
@@ -35,7 +35,7 @@ impl Diverged {
             "iteration": iteration,
             "environment": env,
             "episode_length": self.length,
-            "state": tail.start.numbers(),
+            "state": tail.start,
             "ctrl": ctrl,
             "actions": actions,
         });
@@ -64,7 +64,7 @@ const STEPS: usize = 16;
 #[derive(Clone, Debug)]
 pub struct Tail {
     /// The state before the first of these steps.
-    pub start: SimulationState,
+    pub start: Box<[f64]>,
     /// The controls sent in each step, in the model's order, one step after another.
     pub controls: Vec<f64>,
     /// The policy's action in each step, one step after another.

@@ -401,7 +401,7 @@ impl Resumable for Repose {
         state.counters.extend(rng::position(&self.rng));
         state.counters.extend([self.age, self.held].map(u64::from));
         state.counters.push(u64::from(self.episode.randomized));
-        state.put_list(self.sim.state().numbers().iter().copied());
+        state.put_list(self.sim.state());
         state.numbers.extend(self.goal);
         state.numbers.extend(self.last.action.iter().copied().map(f64::from));
         state.numbers.extend(self.servos.last());

@@ -125,7 +125,7 @@ impl Task {
         let place = self.config.goal_position.value;
         let own = self.hand.place();
         let scene = file.display();
-        let timestep = self.scene.own_timestep();
+        let timestep = self.scene.own_timestep;
         let sim_dt = self.config.sim_dt;
         if timestep != sim_dt {
             notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));

@@ -9,12 +9,13 @@ use std::ptr;
 
 use anyhow::{Context, Error, Result, anyhow, bail, ensure};
 use mujoco_rs::mujoco_c::{mj_deleteSpec, mj_parseXML};
-use mujoco_rs::prelude::{MjModel, MjSpec, MjtCone, MjtGeomBase, MjtObjBase};
+use mujoco_rs::prelude::{MjModel, MjSpec};
 use mujoco_rs::wrappers::SpecItem;
-use mujoco_rs::wrappers::mj_editing::{MjsBody, MjtGeomInertia};
+use mujoco_rs::wrappers::mj_editing::{MjsBody, MjsGeom};
 use serde::{Deserialize, Serialize};
 
-use super::placing::{frames_within, geom_within};
+use super::constants::*;
+use super::placing::{frames_within, geoms_within};
 use crate::quat;
 
 /// The group of geoms that are drawn and by convention collide with nothing.
@@ -89,10 +90,8 @@ impl Compilation {
     /// Fails if MuJoCo cannot read the scene, if it has no such body, or if the body has a mesh.
     pub(super) fn spec(&self, file: Option<&Path>) -> Result<MjSpec> {
         let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
-        let mut spec = spec.map_err(|error| match file.and_then(parse_error) {
-            Some(whole) => refused(whole),
-            None => refused(error),
-        })?;
+        let whole = || file.and_then(parse_error);
+        let mut spec = spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;
         if self.keeps_all() {
             return Ok(spec);
         }
@@ -116,8 +115,8 @@ impl Compilation {
         model.opt_mut().timestep = self.timestep;
         match self.cone {
             Cone::Scene => {}
-            Cone::Pyramidal => model.opt_mut().cone = MjtCone::mjCONE_PYRAMIDAL as i32,
-            Cone::Elliptic => model.opt_mut().cone = MjtCone::mjCONE_ELLIPTIC as i32,
+            Cone::Pyramidal => model.opt_mut().cone = mjCONE_PYRAMIDAL as i32,
+            Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
         }
     }
 }
@@ -153,29 +152,31 @@ pub fn origin(file: Option<&Path>) -> String {
 fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Result<()> {
     ensure!(spec.body_mut(goal).is_none(), "has a body `{goal}` that is no mocap body");
     let no_body = || format!("has no body `{name}`");
-    let object = compiled.name_to_id(MjtObjBase::mjOBJ_BODY, name).with_context(no_body)?;
+    let object = compiled.name_to_id(mjOBJ_BODY, name).with_context(no_body)?;
     let frames = frames_within(compiled, object);
     let shown = spec.world_body_mut().add_body();
     shown.with_name(goal).with_pos(compiled.body_pos()[object]).with_mocap(true);
-    for geom in 0..compiled.ngeom() as usize {
-        let Some((mut pos, mut quat)) = geom_within(compiled, &frames, geom) else { continue };
+    for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames) {
         let kind = compiled.geom_type()[geom];
         let mut mesh_name = "";
-        if matches!(kind, MjtGeomBase::mjGEOM_MESH | MjtGeomBase::mjGEOM_SDF) {
+        if matches!(kind, mjGEOM_MESH | mjGEOM_SDF) {
             // MuJoCo has moved the vertices of the mesh to its centre, and its geoms with them. It will do so with this one.
             let mesh = compiled.geom_dataid()[geom] as usize;
-            mesh_name = compiled.id_to_name(MjtObjBase::mjOBJ_MESH, mesh).unwrap_or_default();
+            mesh_name = compiled.id_to_name(mjOBJ_MESH, mesh).unwrap_or_default();
             quat = quat::mul(quat, quat::conj(compiled.mesh_quat()[mesh]));
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
-        let size = compiled.geom_size()[geom];
-        let group = compiled.geom_group()[geom];
-        let copy = shown.add_geom();
-        copy.with_type(kind).with_size(size).with_pos(pos).with_quat(quat).with_meshname(mesh_name).with_group(group);
-        copy.with_contype(0).with_conaffinity(0).with_mass(0.0).with_rgba([0.2, 0.8, 0.2, 0.4]);
+        let copy = only_seen(shown).with_type(kind).with_size(compiled.geom_size()[geom]);
+        copy.with_pos(pos).with_quat(quat).with_meshname(mesh_name);
+        copy.with_group(compiled.geom_group()[geom]).with_rgba([0.2, 0.8, 0.2, 0.4]);
     }
     Ok(())
+}
+
+/// Adds a geom that touches nothing and has no mass.
+pub(super) fn only_seen(body: &mut MjsBody) -> &mut MjsGeom {
+    body.add_geom().with_contype(0).with_conaffinity(0).with_mass(0.0).with_density(0.0)
 }
 
 /// Multiplies the lengths of a body and its descendants by `factor` and leaves their masses as they are.
@@ -187,13 +188,13 @@ fn resize(body: &mut MjsBody, factor: f64) -> Result<()> {
     scale(body.fullinertia_mut(), factor * factor);
     for geom in body.geom_iter_mut(false) {
         let kind = geom.type_();
-        if matches!(kind, MjtGeomBase::mjGEOM_MESH | MjtGeomBase::mjGEOM_SDF | MjtGeomBase::mjGEOM_HFIELD) {
+        if matches!(kind, mjGEOM_MESH | mjGEOM_SDF | mjGEOM_HFIELD) {
             bail!("has a mesh, whose size cannot be set here; scale the mesh in the scene");
         }
         scale(geom.pos_mut(), factor);
         scale(geom.size_mut(), factor);
         scale(geom.fromto_mut(), factor);
-        let dimensions = if geom.typeinertia() == MjtGeomInertia::mjINERTIA_SHELL { 2 } else { 3 };
+        let dimensions = if geom.typeinertia() == mjINERTIA_SHELL { 2 } else { 3 };
         geom.set_density(geom.density() / factor.powi(dimensions));
     }
     body.frame_iter_mut(false).for_each(|frame| scale(frame.pos_mut(), factor));
@@ -237,15 +238,13 @@ mod tests {
             let compilation = Compilation { object: "cube".into(), size, adds_goal: Some("goal"), ..plain };
             let model = compilation.compile(Some(file.path())).unwrap();
             let shapes_of = |name: &str| -> Vec<_> {
-                let body = model.name_to_id(MjtObjBase::mjOBJ_BODY, name).unwrap();
+                let body = model.name_to_id(mjOBJ_BODY, name).unwrap();
                 let frames = frames_within(&model, body);
-                let placed = (0..model.ngeom() as usize)
-                    .filter_map(|geom| Some((geom, geom_within(&model, &frames, geom)?)))
-                    .map(|(geom, (pos, quat))| {
-                        let turn = quat::rotation_vector(quat::canonical(quat));
-                        let kind = (model.geom_type()[geom], model.geom_dataid()[geom]);
-                        (kind, [model.geom_size()[geom], pos, turn].concat())
-                    });
+                let placed = geoms_within(&model, &frames).into_iter().map(|(geom, (pos, quat))| {
+                    let turn = quat::rotation_vector(quat::canonical(quat));
+                    let kind = (model.geom_type()[geom], model.geom_dataid()[geom]);
+                    (kind, [model.geom_size()[geom], pos, turn].concat())
+                });
                 placed.collect()
             };
             let (object, goal) = (shapes_of("cube"), shapes_of("goal"));

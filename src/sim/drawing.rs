@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtJoint};
+use mujoco_rs::prelude::MjModel;
 use serde::Serialize;
 
 use super::Scene;
+use super::constants::*;
 use super::look::{Camera, HIDDEN, is_of};
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z. A pose is in the frame of the parent or of the body.
@@ -62,13 +63,13 @@ pub struct DrawnGeom {
     #[serde(skip_serializing_if = "Option::is_none")]
     mesh: Option<usize>,
     /// Whether it is part only of a fine picture, or only of a plain one.
-    #[serde(skip_serializing_if = "is_false")]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     fine: bool,
-    #[serde(skip_serializing_if = "is_false")]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     plain: bool,
 }
 
-/// A point of view on a sphere around a centre, in degrees.
+/// From where a page shows the scene.
 #[derive(Clone, Debug, Serialize)]
 pub struct DrawnCamera {
     /// Viewing direction around the vertical.
@@ -120,10 +121,6 @@ const MOST_CORNERS: usize = 65_535;
 /// The colour of a shape that has none.
 const UNCOLOURED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
 
-fn is_false(flag: &bool) -> bool {
-    !flag
-}
-
 impl Scene {
     /// What a page needs to draw this scene, perhaps from this camera. `dressed` is the beginning of the names of the bodies that
     /// wear a [`super::Dress`], if it was loaded.
@@ -169,10 +166,10 @@ fn drawn_body(model: &MjModel, body: usize) -> DrawnBody {
         let at = model.jnt_qposadr()[joint] as usize;
         DrawnJoint {
             r#type: match model.jnt_type()[joint] {
-                MjtJoint::mjJNT_FREE => "free",
-                MjtJoint::mjJNT_BALL => "ball",
-                MjtJoint::mjJNT_SLIDE => "slide",
-                MjtJoint::mjJNT_HINGE => "hinge",
+                mjJNT_FREE => "free",
+                mjJNT_BALL => "ball",
+                mjJNT_SLIDE => "slide",
+                mjJNT_HINGE => "hinge",
             },
             at,
             pos: model.jnt_pos()[joint],
@@ -193,20 +190,20 @@ fn drawn_body(model: &MjModel, body: usize) -> DrawnBody {
 fn is_floor(model: &MjModel, geom: usize) -> bool {
     let [width, length, _] = model.geom_size()[geom];
     let level = model.geom_quat()[geom][0] > 0.9999 && model.geom_bodyid()[geom] == 0;
-    let endless = model.geom_type()[geom] == MjtGeomBase::mjGEOM_PLANE && width == 0.0 && length == 0.0;
+    let endless = model.geom_type()[geom] == mjGEOM_PLANE && width == 0.0 && length == 0.0;
     endless && level && model.geom_group()[geom] < HIDDEN
 }
 
 /// A shape, unless it is of a kind that a page does not draw, or hidden.
 fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<DrawnGeom> {
     let kind = match model.geom_type()[geom] {
-        MjtGeomBase::mjGEOM_PLANE => "plane",
-        MjtGeomBase::mjGEOM_SPHERE => "sphere",
-        MjtGeomBase::mjGEOM_CAPSULE => "capsule",
-        MjtGeomBase::mjGEOM_ELLIPSOID => "ellipsoid",
-        MjtGeomBase::mjGEOM_CYLINDER => "cylinder",
-        MjtGeomBase::mjGEOM_BOX => "box",
-        MjtGeomBase::mjGEOM_MESH => "mesh",
+        mjGEOM_PLANE => "plane",
+        mjGEOM_SPHERE => "sphere",
+        mjGEOM_CAPSULE => "capsule",
+        mjGEOM_ELLIPSOID => "ellipsoid",
+        mjGEOM_CYLINDER => "cylinder",
+        mjGEOM_BOX => "box",
+        mjGEOM_MESH => "mesh",
         _ => return None,
     };
     let body = model.geom_bodyid()[geom] as usize;
@@ -243,7 +240,6 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
     let mut places = BTreeMap::new();
     let mut parts = vec![DrawnMesh::default()];
-
     for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
         if parts.last().is_some_and(|part| part.corners.len() + 3 > MOST_CORNERS) {
             parts.push(DrawnMesh::default());

@@ -5,7 +5,7 @@
 
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Mutex, Once};
+use std::sync::{Mutex, Once, PoisonError};
 
 use mujoco_rs::wrappers::mj_logging::{MjLogMessage, MjtLogLevel};
 
@@ -30,7 +30,7 @@ pub fn stepping<T>(kind: &'static str, number: usize, work: impl FnOnce() -> T) 
 /// any function registered before. Other threads keep running meanwhile. If MuJoCo also fails on one of them, that thread
 /// waits until `rescue` has returned.
 pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
-    *RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner()) = Some(Box::new(rescue));
+    *RESCUE.lock().unwrap_or_else(PoisonError::into_inner) = Some(Box::new(rescue));
 }
 
 /// Discards MuJoCo's messages except for fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
@@ -50,7 +50,7 @@ fn report_fatal(message: &MjLogMessage) {
     }
     let whose = STEPPED.get().map_or(String::new(), |(kind, number)| format!("{kind} {number}: "));
     let said = format!("{whose}MuJoCo cannot continue: {}", message.subject());
-    let mut rescue = RESCUE.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let mut rescue = RESCUE.lock().unwrap_or_else(PoisonError::into_inner);
     // A panic must not unwind through MuJoCo's frames.
     let _ = catch_unwind(AssertUnwindSafe(|| match rescue.take() {
         Some(rescue) => rescue(&said),

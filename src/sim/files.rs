@@ -13,17 +13,16 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
     let mut files = vec![scene.to_owned()];
     let mut folders = BTreeSet::new();
     let mut names = BTreeSet::new();
-
     let mut known = BTreeSet::from([scene.to_owned()]);
     let mut done = 0;
     while done < files.len() {
         // What is no XML names no files.
         let bytes = read_bytes(&files[done]).unwrap_or_default();
         let text = String::from_utf8_lossy(&bytes);
-        let attributes = attributes(&text).collect::<Vec<_>>();
-        folders.extend((!attributes.is_empty()).then(|| folder_of(&files[done])));
+        let folder = folder_of(&files[done]);
         done += 1;
-        for (name, value) in attributes {
+        for (name, value) in attributes(&text) {
+            folders.insert(folder.clone());
             if name.ends_with("dir") {
                 folders.insert(top.join(value));
             } else if name.starts_with("file") {

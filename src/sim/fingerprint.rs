@@ -2,7 +2,10 @@
 
 use std::fmt::Debug;
 
-use mujoco_rs::prelude::{MjModel, MjtGeomBase};
+use mujoco_rs::prelude::MjModel;
+
+use super::constants::*;
+use super::symmetry::touches;
 
 /// Lists these arrays of a model, or what one geom has in each.
 macro_rules! arrays {
@@ -44,7 +47,6 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
     let none = [0.0; 2];
     let solref = [0.02, 1.0];
     let solimp = [0.9, 0.95, 0.001, 0.5, 2.0];
-
     let unusual = unusual! { model:
         actuator_armature 0.0, actuator_damping 0.0, actuator_dampingpoly none, dof_dampingpoly none, jnt_stiffnesspoly none,
         tendon_dampingpoly none, tendon_stiffnesspoly none, tendon_solref_lim solref, tendon_solimp_lim solimp,
@@ -57,27 +59,25 @@ pub(super) fn fingerprint(model: &MjModel) -> String {
     format!("{:08x}", hasher.finalize())
 }
 
-/// Takes the geoms that collide with something, and their meshes and height fields.
+/// Takes the shapes that can touch something.
 fn take_geoms(model: &MjModel, take: &mut dyn FnMut(&[&dyn Debug])) {
     for geom in 0..model.ngeom() as usize {
-        let is_paired = model.pair_geom1().iter().chain(model.pair_geom2()).any(|&paired| paired as usize == geom);
-        if model.geom_contype()[geom] == 0 && model.geom_conaffinity()[geom] == 0 && !is_paired {
+        if !touches(model, geom) {
             continue;
         }
         take(arrays! { model[geom]:
             geom_type geom_bodyid geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim geom_priority
             geom_friction geom_solmix geom_solref geom_solimp geom_margin geom_gap geom_fluid
         });
-        if model.geom_type()[geom] == MjtGeomBase::mjGEOM_MESH {
+        if model.geom_type()[geom] == mjGEOM_MESH {
             let mesh = model.geom_dataid()[geom] as usize;
             let first = model.mesh_vertadr()[mesh] as usize;
-            let count = model.mesh_vertnum()[mesh] as usize;
-            take(&[&&model.mesh_vert()[first..first + count]]);
-        } else if model.geom_type()[geom] == MjtGeomBase::mjGEOM_HFIELD {
+            take(&[&&model.mesh_vert()[first..][..model.mesh_vertnum()[mesh] as usize]]);
+        } else if model.geom_type()[geom] == mjGEOM_HFIELD {
             let field = model.geom_dataid()[geom] as usize;
-            let first = model.hfield_adr()[field];
+            let first = model.hfield_adr()[field] as usize;
             let count = model.hfield_nrow()[field] * model.hfield_ncol()[field];
-            take(&[&model.hfield_size()[field], &&model.hfield_data()[first as usize..(first + count) as usize]]);
+            take(&[&model.hfield_size()[field], &&model.hfield_data()[first..][..count as usize]]);
         }
     }
 }

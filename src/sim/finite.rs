@@ -3,9 +3,10 @@
 use std::io::Read;
 
 use anyhow::{Context, Result, anyhow};
-use mujoco_rs::prelude::{MjModel, MjtObjBase};
+use mujoco_rs::prelude::MjModel;
 use tempfile::NamedTempFile;
 
+use super::constants::*;
 use crate::os::shortened;
 
 /// A description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
@@ -24,7 +25,7 @@ pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let found = found.map(|(quantity, object)| {
         // A degree of freedom has no name, but it belongs to a joint that may have one.
         let of_joint = object.strip_prefix("DOF ").and_then(|dof| model.dof_jntid().get(dof.parse::<usize>().ok()?));
-        let joint = of_joint.and_then(|&joint| model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint as usize));
+        let joint = of_joint.and_then(|&joint| model.id_to_name(mjOBJ_JOINT, joint as usize));
         let object = joint.map_or(object, |name| format!("joint `{}`", shortened(name)));
         if object.is_empty() { quantity } else { format!("{quantity} of {object}") }
     });
@@ -35,9 +36,9 @@ pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
 fn first_in_assets(model: &MjModel) -> Option<String> {
     let of = |starts: &[i32], at: usize| starts.iter().rposition(|&start| start as usize <= at).unwrap_or_default();
     let height = model.hfield_data().iter().position(|x| !x.is_finite());
-    let height = height.map(|at| ("hfield_data", "hfield", MjtObjBase::mjOBJ_HFIELD, of(model.hfield_adr(), at)));
+    let height = height.map(|at| ("hfield_data", "hfield", mjOBJ_HFIELD, of(model.hfield_adr(), at)));
     let vertex = model.mesh_vert().iter().position(|vertex| !vertex.iter().all(|x| x.is_finite()));
-    let vertex = vertex.map(|at| ("mesh_vert", "mesh", MjtObjBase::mjOBJ_MESH, of(model.mesh_vertadr(), at)));
+    let vertex = vertex.map(|at| ("mesh_vert", "mesh", mjOBJ_MESH, of(model.mesh_vertadr(), at)));
     let (quantity, kind, object, id) = height.or(vertex)?;
     let name = model.id_to_name(object, id).unwrap_or_default();
     Some(format!("{quantity} of {kind} `{}`", shortened(name)))
@@ -51,7 +52,6 @@ fn first_in(text: &str) -> Option<(String, String)> {
     let mut heading = "";
     let mut name = None;
     let mut derived = None;
-
     for line in text.lines() {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default();

@@ -5,13 +5,12 @@
 use std::path::Path;
 
 use anyhow::{Result, anyhow};
-use mujoco_rs::mujoco_c::{mjtBuiltin as MjtBuiltin, mjtLightType as MjtLightType};
-use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
+use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::MjsBody;
-use mujoco_rs::wrappers::mj_model::MjtTexture;
 
-use super::compilation::{Compilation, VISUAL};
+use super::compilation::{Compilation, VISUAL, only_seen};
+use super::constants::*;
 
 /// The opacity of the colours of an object.
 const SOLID: f32 = 1.0;
@@ -32,9 +31,9 @@ const PLATE: f64 = 0.02;
 /// Fails if MuJoCo refuses the scene.
 pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
-    let has_no_sky = !model.tex_type().contains(&MjtTexture::mjTEXTURE_SKYBOX);
+    let has_no_sky = !model.tex_type().contains(&mjTEXTURE_SKYBOX);
     let shown = |body: usize| {
-        let name = model.id_to_name(MjtObjBase::mjOBJ_BODY, body).filter(|name| !name.is_empty())?;
+        let name = model.id_to_name(mjOBJ_BODY, body).filter(|name| !name.is_empty())?;
         let is_goal = model.body_mocapid()[body] >= 0;
         let opacity = if is_goal { CLEAR } else { SOLID };
         (is_goal || name == compilation.object).then_some((name, plain_box(model, body)?, opacity))
@@ -46,42 +45,33 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
     let mut spec = compilation.spec(Some(file))?;
     if is_dark {
         let light = spec.world_body_mut().add_light();
-        light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(MjtLightType::mjLIGHT_DIRECTIONAL);
+        light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(mjLIGHT_DIRECTIONAL);
     }
     if has_no_sky {
         let sky = spec.add_texture();
-        sky.with_name("sky of shadow-repose").with_type(MjtTexture::mjTEXTURE_SKYBOX);
-        sky.with_builtin(MjtBuiltin::mjBUILTIN_GRADIENT).with_width(64).with_height(384);
+        sky.with_name("sky of shadow-repose").with_type(mjTEXTURE_SKYBOX);
+        sky.with_builtin(mjBUILTIN_GRADIENT).with_width(64).with_height(384);
         sky.with_rgb1([0.74, 0.78, 0.83]).with_rgb2([0.42, 0.49, 0.58]);
     }
     for (name, half, opacity) in boxes {
         let body = spec.body_mut(name).ok_or_else(|| anyhow!("there is no body {name}"))?;
-        add_plates(body, half, opacity);
+        colour_faces(body, half, opacity);
     }
     spec.compile().map(Some).map_err(|error| anyhow!("{error}"))
 }
 
-/// Adds a coloured plate to each face of a box with these half sizes.
-fn add_plates(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
+/// Puts a coloured plate on each face of a box with these half sizes in m.
+fn colour_faces(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
     for (face, [red, green, blue]) in FACES.into_iter().enumerate() {
         let axis = face / 2;
-        let sign = if face % 2 == 0 { 1.0 } else { -1.0 };
         let mut size = half.map(|half| 0.88 * half);
-        let mut position = [0.0; 3];
         size[axis] = PLATE * half[axis];
-        position[axis] = sign * half[axis];
-        body.add_geom()
-            .with_type(MjtGeomBase::mjGEOM_BOX)
-            .with_size(size)
-            .with_pos(position)
-            .with_rgba([red, green, blue, opacity])
-            .with_group(VISUAL)
-            .with_contype(0)
-            .with_conaffinity(0)
-            // Regardless of the defaults of its class.
-            .with_quat([1.0, 0.0, 0.0, 0.0])
-            .with_mass(0.0)
-            .with_density(0.0);
+        let mut position = [0.0; 3];
+        position[axis] = if face % 2 == 0 { half[axis] } else { -half[axis] };
+        let plate = only_seen(body).with_type(mjGEOM_BOX).with_size(size).with_pos(position);
+        // Regardless of the defaults of its class.
+        plate.with_quat([1.0, 0.0, 0.0, 0.0]);
+        plate.with_rgba([red, green, blue, opacity]).with_group(VISUAL);
     }
 }
 
@@ -89,7 +79,7 @@ fn add_plates(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
 fn plain_box(model: &MjModel, body: usize) -> Option<[f64; 3]> {
     let geom = usize::try_from(model.body_geomadr()[body]).ok()?;
     let is_plain = model.body_geomnum()[body] == 1
-        && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX
+        && model.geom_type()[geom] == mjGEOM_BOX
         && model.geom_matid()[geom] < 0
         && model.geom_pos()[geom] == [0.0; 3]
         && model.geom_quat()[geom] == [1.0, 0.0, 0.0, 0.0];

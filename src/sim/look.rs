@@ -3,11 +3,13 @@
 //! Nothing here changes the physics: meshes have no mass and collide with nothing, and they come after the existing objects.
 
 use anyhow::{Context, Result, anyhow};
-use mujoco_rs::prelude::{MjModel, MjtGeomBase, MjtObjBase};
+use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
+use serde::Serialize;
 
-use super::compilation::{Compilation, VISUAL};
+use super::compilation::{Compilation, VISUAL, only_seen};
+use super::constants::*;
 
 /// The group of geoms that are not drawn.
 pub(super) const HIDDEN: i32 = 3;
@@ -48,7 +50,7 @@ pub enum Quality {
 }
 
 /// The position of a camera on a sphere around the scene's centre, which it looks at.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Camera {
     /// Viewing direction around the vertical, degrees (0 is along +x).
     pub azimuth: f64,
@@ -81,10 +83,8 @@ impl Look {
             // MuJoCo's free camera starts 1.5 extents away.
             model.stat_mut().extent = camera.distance / 1.5;
         }
-        let [width, height] = self.size.map(|pixels| pixels as i32);
         let visual = model.vis_mut();
-        visual.global.offwidth = width;
-        visual.global.offheight = height;
+        [visual.global.offwidth, visual.global.offheight] = self.size.map(|pixels| pixels as i32);
         if self.quality == Quality::Fast {
             visual.quality.offsamples = 0;
             model.light_castshadow_mut().fill(false);
@@ -110,9 +110,8 @@ impl Dress {
         for Piece { body, file, material, height } in &self.pieces {
             let found = spec.body_mut(body);
             let body = found.with_context(|| format!("there is no body {body} for the mesh {file}"))?;
-            let geom = body.add_geom().with_type(MjtGeomBase::mjGEOM_MESH).with_meshname(file).with_material(material);
+            let geom = only_seen(body).with_type(mjGEOM_MESH).with_meshname(file).with_material(material);
             geom.with_pos([0.0, 0.0, *height]).with_group(VISUAL);
-            geom.with_contype(0).with_conaffinity(0).with_density(0.0);
         }
         let mut model = spec.compile_with_vfs(&files).map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
         for geom in 0..model.ngeom() as usize {
@@ -127,5 +126,5 @@ impl Dress {
 /// Whether a shape is of one of the bodies whose names begin with `bodies`.
 pub(super) fn is_of(model: &MjModel, geom: usize, bodies: &str) -> bool {
     let body = model.geom_bodyid()[geom] as usize;
-    model.id_to_name(MjtObjBase::mjOBJ_BODY, body).is_some_and(|name| name.starts_with(bodies))
+    model.id_to_name(mjOBJ_BODY, body).is_some_and(|name| name.starts_with(bodies))
 }

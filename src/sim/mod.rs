@@ -4,6 +4,7 @@
 //! Angles are in rad, lengths in m, in the world frame.
 
 mod compilation;
+mod constants;
 mod drawing;
 mod fatal;
 mod files;
@@ -33,7 +34,7 @@ pub use files::scene_files;
 pub use look::{Camera, Dress, Look, Piece, Quality};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
-pub use simulation::{Pose, Simulation, SimulationState, Validity, Velocity};
+pub use simulation::{Pose, Simulation, Validity, Velocity};
 pub use structure::Parts;
 pub use variation::{Change, Variants};
 

@@ -214,8 +214,7 @@ impl egui::Plugin for CloseLeftPanel {
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
         let button = egui::PointerButton::Primary;
-        let modifiers = egui::Modifiers::NONE;
-        let press = |pos, pressed| Event::PointerButton { pos, button, pressed, modifiers };
+        let press = |pos, pressed| Event::PointerButton { pos, button, pressed, modifiers: egui::Modifiers::NONE };
         let moved = Event::PointerMoved;
         let drag = [moved(edge), press(edge, true), moved(side), press(side, false), Event::PointerGone];
         if let Some(event) = drag.into_iter().nth(self.frame) {

@@ -19,10 +19,15 @@ pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> 
     frames
 }
 
-/// The pose of a geom in the frame that the poses of bodies are given in, if its body has one.
-pub(super) fn geom_within(model: &MjModel, frames: &[Option<Placed>], geom: usize) -> Option<Placed> {
-    let frame = frames[model.geom_bodyid()[geom] as usize]?;
-    Some(inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]))
+/// The geoms of the bodies that have a pose, each with its own in the same frame.
+pub(super) fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
+    let mut geoms = Vec::new();
+    for geom in 0..model.ngeom() as usize {
+        if let Some(frame) = frames[model.geom_bodyid()[geom] as usize] {
+            geoms.push((geom, inside(frame, model.geom_pos()[geom], model.geom_quat()[geom])));
+        }
+    }
+    geoms
 }
 
 /// A pose that is given in a frame as a pose in the surroundings of that frame.

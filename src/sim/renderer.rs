@@ -31,7 +31,7 @@ impl Renderer {
         Ok(Self { renderer, data: MjData::new(scene.model.clone()) })
     }
 
-    /// Returns the width and height of pictures in pixels.
+    /// The width and height of pictures in pixels.
     pub fn size(&self) -> [u32; 2] {
         let global = &self.data.model().vis().global;
         [global.offwidth as u32, global.offheight as u32]

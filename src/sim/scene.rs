@@ -4,12 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
-use mujoco_rs::prelude::{
-    MjModel, MjtBias, MjtDisableBit, MjtDyn, MjtEnableBit, MjtGain, MjtIntegrator, MjtJoint, MjtObjBase, MjtTrn,
-};
+use mujoco_rs::prelude::{MjModel, MjtDisableBit, MjtObjBase};
 
 use super::Look;
 use super::compilation::{Compilation, origin};
+use super::constants::*;
 use super::fatal::quieten_mujoco;
 use super::fingerprint::fingerprint;
 use super::finite::not_finite;
@@ -17,18 +16,15 @@ use super::furnish::furnished;
 use crate::os::shortened;
 
 /// What a scene may not disable: nothing could be held without it.
-const NEEDED: [(&str, MjtDisableBit); 3] = [
-    ("constraint", MjtDisableBit::mjDSBL_CONSTRAINT),
-    ("contact", MjtDisableBit::mjDSBL_CONTACT),
-    ("actuation", MjtDisableBit::mjDSBL_ACTUATION),
-];
+const NEEDED: [(&str, MjtDisableBit); 3] =
+    [("constraint", mjDSBL_CONSTRAINT), ("contact", mjDSBL_CONTACT), ("actuation", mjDSBL_ACTUATION)];
 
 /// A compiled MuJoCo model that any number of simulations can share.
 #[derive(Clone)]
 pub struct Scene {
     pub(super) model: Arc<MjModel>,
-    /// The timestep in its file, s.
-    pub(super) own_timestep: f64,
+    /// The timestep in its file, s, in whose place another is used.
+    pub own_timestep: f64,
 }
 
 /// A hinge joint with limits.
@@ -99,8 +95,9 @@ impl Scene {
         quieten_mujoco();
         let compiled = compilation.compile(file).and_then(|model| {
             // The built-in scene is known to be finite.
-            let culprit = file.map_or(Ok(None), |_| not_finite(&model))?;
-            if let Some(culprit) = culprit {
+            if file.is_some()
+                && let Some(culprit) = not_finite(&model)?
+            {
                 bail!("{culprit} is not a finite number");
             }
             Self::checked(model, compilation)
@@ -133,20 +130,21 @@ impl Scene {
     pub fn set_look(&mut self, look: &Look, nominal: &Self) {
         let model = Arc::get_mut(&mut self.model).expect("a new scene is not shared");
         // MuJoCo computes these anew with masses, but the picture stays as it is.
-        model.stat_mut().center = nominal.model.stat().center;
-        model.stat_mut().extent = nominal.model.stat().extent;
+        let nominal = nominal.model.stat();
+        model.stat_mut().center = nominal.center;
+        model.stat_mut().extent = nominal.extent;
         look.set_up(model);
     }
 
     fn checked(mut model: MjModel, compilation: &Compilation) -> Result<Self> {
         let own_timestep = model.opt().timestep;
         compilation.set_options(&mut model);
-        let halves = model.opt().integrator != MjtIntegrator::mjINT_RK4 as i32;
+        let halves = model.opt().integrator != mjINT_RK4 as i32;
         ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
         for (flag, bit) in NEEDED {
             ensure!(model.opt().disableflags & bit as i32 == 0, "{flag} must not be disabled in its <flag>");
         }
-        let awake = model.opt().enableflags & MjtEnableBit::mjENBL_SLEEP as i32 == 0;
+        let awake = model.opt().enableflags & mjENBL_SLEEP as i32 == 0;
         ensure!(awake, "sleep is not part of the state that MuJoCo can save; leave sleep switched off");
         Ok(Self { model: Arc::new(model), own_timestep })
     }
@@ -176,10 +174,10 @@ impl Scene {
     /// # Errors
     /// Fails if there is no such joint, it is not a hinge, or it has no limits.
     pub fn hinge(&self, name: &str) -> Result<Hinge> {
-        let id = self.find(MjtObjBase::mjOBJ_JOINT, "joint", name)?;
+        let id = self.find(mjOBJ_JOINT, "joint", name)?;
         let name = shortened(name);
         let kind = self.model.jnt_type()[id];
-        ensure!(kind == MjtJoint::mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
+        ensure!(kind == mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
         ensure!(self.model.jnt_limited()[id], "joint `{name}` must have a range");
         Ok(Hinge {
             qpos: self.model.jnt_qposadr()[id] as usize,
@@ -204,17 +202,12 @@ impl Scene {
     /// The number of the first joint of a body if it is a free joint.
     pub(super) fn free_joint(&self, body: usize) -> Option<usize> {
         let joint = usize::try_from(self.model.body_jntadr()[body]).ok();
-        joint.filter(|&joint| self.model.jnt_type()[joint] == MjtJoint::mjJNT_FREE)
-    }
-
-    /// The timestep in its file, s, in whose place another is used.
-    pub fn own_timestep(&self) -> f64 {
-        self.own_timestep
+        joint.filter(|&joint| self.model.jnt_type()[joint] == mjJNT_FREE)
     }
 
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
-        let name = |id| self.model.id_to_name(MjtObjBase::mjOBJ_KEY, id).unwrap_or_default().to_owned();
+        let name = |id| self.model.id_to_name(mjOBJ_KEY, id).unwrap_or_default().to_owned();
         (0..self.model.nkey() as usize).map(name).collect()
     }
 
@@ -223,7 +216,7 @@ impl Scene {
     /// # Errors
     /// Fails if there is no such body.
     pub fn body(&self, name: &str) -> Result<Body> {
-        Ok(Body(self.find(MjtObjBase::mjOBJ_BODY, "body", name)?))
+        Ok(Body(self.find(mjOBJ_BODY, "body", name)?))
     }
 
     /// Finds the body or, if there is none, the site `name`.
@@ -234,7 +227,7 @@ impl Scene {
         if let Ok(body) = self.body(name) {
             return Ok(Frame::Body(body));
         }
-        Ok(Frame::Site(self.find(MjtObjBase::mjOBJ_SITE, "body or site", name)?))
+        Ok(Frame::Site(self.find(mjOBJ_SITE, "body or site", name)?))
     }
 
     /// The number of the keyframe in which an episode starts: `name`, else `start` or `home`, else the only one, if any.
@@ -243,9 +236,9 @@ impl Scene {
     /// Fails if there is no keyframe `name`.
     pub fn start(&self, name: &str) -> Result<Option<usize>> {
         if !name.is_empty() {
-            return self.find(MjtObjBase::mjOBJ_KEY, "keyframe", name).map(Some);
+            return self.find(mjOBJ_KEY, "keyframe", name).map(Some);
         }
-        let known = ["start", "home"].into_iter().find_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_KEY, name));
+        let known = ["start", "home"].into_iter().find_map(|name| self.model.name_to_id(mjOBJ_KEY, name));
         Ok(known.or((self.model.nkey() == 1).then_some(0)))
     }
 
@@ -279,24 +272,26 @@ impl Scene {
     /// # Errors
     /// Fails if there is no such actuator, or if it is of another kind.
     pub fn servo(&self, name: &str) -> Result<Actuator> {
-        let id = self.find(MjtObjBase::mjOBJ_ACTUATOR, "actuator", name)?;
-        let name = shortened(name);
-        let group = self.model.actuator_group()[id];
-        let is_servo = self.is_position_servo(id);
-        ensure!(is_servo, "actuator `{name}` must be a position servo (<position>): its control is an angle");
-        let is_disabled = (0..31).contains(&group) && self.model.opt().disableactuator >> group & 1 == 1;
-        ensure!(!is_disabled, "actuator `{name}` must not be disabled by its group {group}");
-        let moves = matches!(self.model.actuator_trntype()[id], MjtTrn::mjTRN_JOINT | MjtTrn::mjTRN_TENDON);
-        ensure!(moves, "actuator `{name}` must drive a joint or a tendon");
-        let is_angle = self.model.actuator_gear()[id][0] == 1.0;
-        ensure!(is_angle, "actuator `{name}` must have a gear of 1: its control is an angle");
-        let is_direct =
-            self.model.actuator_dyntype()[id] == MjtDyn::mjDYN_NONE && self.model.actuator_delay()[id] == 0.0;
-        ensure!(is_direct, "actuator `{name}` must act at once: without activation dynamics (timeconst) and delay");
-        let ctrl = self.model.actuator_ctrladr()[id] as usize;
-        let one_limited = self.model.actuator_ctrlnum()[id] == 1 && self.model.actuator_ctrllimited()[ctrl];
-        ensure!(one_limited, "actuator `{name}` must have one control with a ctrlrange");
-        Ok(Actuator { id, ctrl, range: self.model.actuator_ctrlrange()[ctrl] })
+        let id = self.find(mjOBJ_ACTUATOR, "actuator", name)?;
+        let model = &self.model;
+        let group = model.actuator_group()[id];
+        let is_disabled = (0..31).contains(&group) && model.opt().disableactuator >> group & 1 == 1;
+        let moves = matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON);
+        let is_angle = model.actuator_gear()[id][0] == 1.0;
+        let is_direct = model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
+        let ctrl = model.actuator_ctrladr()[id] as usize;
+        let is_limited = model.actuator_ctrlnum()[id] == 1 && model.actuator_ctrllimited()[ctrl];
+        for (holds, what) in [
+            (self.is_position_servo(id), "be a position servo (<position>): its control is an angle"),
+            (!is_disabled, &format!("not be disabled by its group {group}")),
+            (moves, "drive a joint or a tendon"),
+            (is_angle, "have a gear of 1: its control is an angle"),
+            (is_direct, "act at once: without activation dynamics (timeconst) and delay"),
+            (is_limited, "have one control with a ctrlrange"),
+        ] {
+            ensure!(holds, "actuator `{}` must {what}", shortened(name));
+        }
+        Ok(Actuator { id, ctrl, range: model.actuator_ctrlrange()[ctrl] })
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
@@ -306,8 +301,8 @@ impl Scene {
     /// Whether the force is kp · (control - length), with or without damping.
     fn is_position_servo(&self, id: usize) -> bool {
         let kp = self.model.actuator_gainprm()[id][0];
-        self.model.actuator_gaintype()[id] == MjtGain::mjGAIN_FIXED
-            && self.model.actuator_biastype()[id] == MjtBias::mjBIAS_AFFINE
+        self.model.actuator_gaintype()[id] == mjGAIN_FIXED
+            && self.model.actuator_biastype()[id] == mjBIAS_AFFINE
             && kp > 0.0
             && self.model.actuator_biasprm()[id][..2] == [0.0, -kp]
     }

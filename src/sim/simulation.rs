@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use anyhow::{Result, ensure};
-use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
+use mujoco_rs::prelude::{MjData, MjModel};
 
+use super::constants::*;
 use super::{Actuator, Body, Frame, Mocap, Scene};
 use crate::quat::{self, Quat};
 
@@ -18,19 +19,8 @@ pub enum Validity {
     Diverged,
 }
 
-/// Everything that the next step depends on, in the order of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct SimulationState(Box<[f64]>);
-
-impl SimulationState {
-    /// The values of the state.
-    pub fn numbers(&self) -> &[f64] {
-        &self.0
-    }
-}
-
-/// MuJoCo's name for the components of a [`SimulationState`].
-const EVERYTHING: u32 = MjtState::mjSTATE_INTEGRATION as u32;
+/// MuJoCo's name for everything that the next step depends on.
+const EVERYTHING: u32 = mjSTATE_INTEGRATION as u32;
 
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
@@ -52,7 +42,7 @@ impl Simulation {
         self.spare = self.take_own_model();
     }
 
-    /// Gives up its own model, if there is one, which is returned, and uses the model of the scene.
+    /// Goes back to the model of the scene. Its own model, if there was one, is handed over.
     pub(super) fn take_own_model(&mut self) -> Option<MjModel> {
         match self.shared.take() {
             Some(shared) => Arc::into_inner(self.data.swap_model(shared)),
@@ -95,9 +85,9 @@ impl Simulation {
     ///
     /// # Panics
     /// Panics if the scene or the state is of another kind.
-    pub fn start_replay(&mut self, state: &SimulationState, scene: &Scene) {
+    pub fn start_replay(&mut self, state: &[f64], scene: &Scene) {
         self.data.swap_model(scene.model.clone());
-        self.data.set_state(&state.0, EVERYTHING).expect("a state of the same scene");
+        self.data.set_state(state, EVERYTHING).expect("a state of the same scene");
     }
 
     /// Takes `substeps` steps of plain `mj_step`: the physics alone, for comparison. The bodies are one substep behind the joints.
@@ -108,44 +98,43 @@ impl Simulation {
     /// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
-        [MjtWarning::mjWARN_BADQPOS, MjtWarning::mjWARN_BADQVEL, MjtWarning::mjWARN_BADQACC, MjtWarning::mjWARN_BADCTRL]
-            .iter()
-            .any(|&kind| warnings[kind as usize].number > 0)
+        let kinds = [mjWARN_BADQPOS, mjWARN_BADQVEL, mjWARN_BADQACC, mjWARN_BADCTRL];
+        kinds.iter().any(|&kind| warnings[kind as usize].number > 0)
     }
 
-    /// The generalised positions.
+    /// The generalised positions, in the model's order: rad, m, and quaternions.
     pub fn qpos(&self) -> &[f64] {
         self.data.qpos()
     }
 
-    /// The generalised positions for modification.
+    /// The same, to be changed. [`Simulation::refresh`] must follow.
     pub fn qpos_mut(&mut self) -> &mut [f64] {
         self.data.qpos_mut()
     }
 
-    /// The generalised velocities.
+    /// The generalised velocities, in the model's order: rad/s and m/s.
     pub fn qvel(&self) -> &[f64] {
         self.data.qvel()
     }
 
-    /// The generalised velocities for modification.
+    /// The same, to be changed. [`Simulation::refresh`] must follow.
     pub fn qvel_mut(&mut self) -> &mut [f64] {
         self.data.qvel_mut()
     }
 
-    /// The controls in the model's order.
+    /// The controls, in the model's order.
     pub fn ctrl(&self) -> &[f64] {
         self.data.ctrl()
     }
 
-    /// The controls for modification.
+    /// The same, to be changed.
     pub fn ctrl_mut(&mut self) -> &mut [f64] {
         self.data.ctrl_mut()
     }
 
-    /// A copy of the state.
-    pub fn state(&self) -> SimulationState {
-        SimulationState(self.data.state(EVERYTHING))
+    /// Everything that the next step depends on, in the order of MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION`.
+    pub fn state(&self) -> Box<[f64]> {
+        self.data.state(EVERYTHING)
     }
 
     /// Resumes from the values of a state, with bodies up to date. The next step is bit for bit the next step of the
@@ -185,8 +174,8 @@ impl Simulation {
     pub fn velocity(&self, frame: Frame) -> Velocity {
         let (kind, id) = match frame {
             // XBODY is the frame's origin. BODY would be the centre of mass.
-            Frame::Body(Body(id)) => (MjtObjBase::mjOBJ_XBODY, id),
-            Frame::Site(id) => (MjtObjBase::mjOBJ_SITE, id),
+            Frame::Body(Body(id)) => (mjOBJ_XBODY, id),
+            Frame::Site(id) => (mjOBJ_SITE, id),
         };
         let [wx, wy, wz, x, y, z] = self.data.object_velocity(kind, id, false);
         Velocity { linear: [x, y, z], angular: [wx, wy, wz] }

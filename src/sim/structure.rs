@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use anyhow::{Result, bail};
-use mujoco_rs::prelude::{MjtJoint, MjtObjBase, MjtTrn, MjtWrap};
+use anyhow::{Result, ensure};
+use mujoco_rs::prelude::{MjtObjBase, MjtWrap};
 use serde::{Deserialize, Serialize};
 
+use super::constants::*;
 use super::{Actuator, Scene};
 use crate::os::shortened;
 
@@ -26,39 +27,16 @@ pub struct Parts {
     pub start: String,
 }
 
+/// All that is missing or ambiguous in a scene, each with the setting that mends it.
+type Problems = Vec<String>;
+
 /// The message for a user whose scene has nothing to turn.
 const NO_OBJECT: &str = "has no body with a free joint that the hand could turn; for a cube like the built-in one, add \
                          <body name=\"cube\" pos=\"X Y Z\"><freejoint/><geom type=\"box\" size=\".025 .025 .025\" \
                          mass=\".028\" friction=\"1.2\"/></body> to <worldbody>";
 
-/// Takes the only one that was `found` for a part that is not named, or says what is wrong: `none` if there is none, or what there
-/// are several of.
-fn settle(
-    part: &mut String,
-    found: &[Result<String, String>],
-    none: Option<&str>,
-    what: &str,
-    setting: &str,
-) -> Option<String> {
-    if !part.is_empty() {
-        return None;
-    }
-    match found {
-        [Ok(only)] => {
-            part.clone_from(only);
-            None
-        }
-        [Err(problem)] => Some(problem.clone()),
-        [] => none.map(str::to_owned),
-        several => {
-            let names: Vec<String> = several.iter().flatten().map(|name| format!("`{}`", shortened(name))).collect();
-            Some(format!("has several {what}, {}: name one by {setting}", names.join(", ")))
-        }
-    }
-}
-
 impl Scene {
-    /// `named`, completed by the structure of the scene. The actuators are all actuators, and the joints are the
+    /// What `named` leaves open is found by the structure of the scene. The actuators are all actuators, and the joints are the
     /// limited hinges of the trees that they move. The fingertips are the last bodies of these trees. The object is the only
     /// other body with a free joint. The goal is the only other mocap body that no equality constraint ties to something.
     ///
@@ -66,64 +44,84 @@ impl Scene {
     /// Fails with one message on all that is missing or ambiguous, and the settings that mend it.
     pub fn find_parts(&self, named: &Parts) -> Result<Parts> {
         let mut parts = named.clone();
-        let mut problems = Vec::new();
-        if parts.actuators.is_empty() {
-            parts.actuators = self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut problems);
+        let mut problems = Problems::new();
+        let hand = self.find_hand(&mut parts, &mut problems);
+        let others = (1..self.model.nbody() as usize).filter(|&body| !hand.contains(&self.root_of(body)));
+        let free: Vec<usize> = others.clone().filter(|&body| self.free_joint(body).is_some()).collect();
+        if parts.object.is_empty() && free.is_empty() {
+            problems.push(NO_OBJECT.into());
         }
-        let ids = parts.actuators.iter().filter_map(|name| self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, name));
-        let trees: BTreeSet<usize> = ids.flat_map(|id| self.trees_of(id)).collect();
-        let of_hand = |body: usize| trees.contains(&(self.model.body_rootid()[body] as usize));
-        let hinges = self.limited_hinges(&of_hand);
+        self.name_only(&free, &mut parts.object, ("bodies with a free joint", "hand.object"), &mut problems);
+        let held = self.trees_of_constraints();
+        let is_goal = |body: &usize| self.model.body_mocapid()[*body] >= 0 && !held.contains(body);
+        let goals: Vec<usize> = others.filter(is_goal).collect();
+        self.name_only(&goals, &mut parts.goal, ("mocap bodies", "hand.goal"), &mut problems);
+        ensure!(problems.is_empty(), problems.join("; "));
+        Ok(parts)
+    }
+
+    /// Names the parts of the hand that are not named. The result is the first bodies of the trees that its actuators move.
+    fn find_hand(&self, parts: &mut Parts, problems: &mut Problems) -> BTreeSet<usize> {
+        if parts.actuators.is_empty() {
+            parts.actuators = self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
+        }
+        let actuators = parts.actuators.iter().filter_map(|name| self.model.name_to_id(mjOBJ_ACTUATOR, name));
+        let trees = self.trees_of(actuators);
+        let is_hinge = |&joint: &usize| {
+            trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
+                && self.model.jnt_type()[joint] == mjJNT_HINGE
+                && self.model.jnt_limited()[joint]
+        };
+        let hinges: Vec<usize> = (0..self.model.njnt() as usize).filter(is_hinge).collect();
         if parts.joints.is_empty() {
-            parts.joints = self.names(MjtObjBase::mjOBJ_JOINT, hinges.iter().copied(), &mut problems);
+            parts.joints = self.names(mjOBJ_JOINT, hinges.iter().copied(), problems);
         }
         if parts.joints.is_empty() || parts.actuators.is_empty() {
             let found = "position servos that move limited hinges are needed";
             problems.push(format!("has no hand: {found}; hand.joints and hand.actuators name them"));
         }
         if parts.fingertips.is_empty() {
-            parts.fingertips = self.names(MjtObjBase::mjOBJ_BODY, self.last_bodies(&hinges), &mut problems);
+            parts.fingertips = self.names(mjOBJ_BODY, self.last_bodies(&hinges), problems);
         }
         if parts.fingertips.is_empty() {
             problems.push("has no fingertips; hand.fingertips names them".into());
         }
-        let free = self.bodies(&|body| !of_hand(body) && self.free_joint(body).is_some());
-        let held = self.trees_of_constraints();
-        let is_mocap = |body: usize| self.model.body_mocapid()[body] >= 0;
-        let goals = self.bodies(&|body| !of_hand(body) && is_mocap(body) && !held.contains(&body));
-        problems.extend(settle(&mut parts.object, &free, Some(NO_OBJECT), "bodies with a free joint", "hand.object"));
-        problems.extend(settle(&mut parts.goal, &goals, None, "mocap bodies", "hand.goal"));
-        if !problems.is_empty() {
-            bail!(problems.join("; "));
+        trees
+    }
+
+    /// Names a part that is not named, if there is only one body that it can be.
+    fn name_only(&self, found: &[usize], part: &mut String, (what, setting): (&str, &str), problems: &mut Problems) {
+        if !part.is_empty() || found.is_empty() {
+            return;
         }
-        Ok(parts)
+        if let [only] = *found {
+            *part = self.names(mjOBJ_BODY, [only], problems).concat();
+            return;
+        }
+        let names = self.names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new());
+        let names: Vec<String> = names.iter().map(|name| format!("`{}`", shortened(name))).collect();
+        problems.push(format!("has several {what}, {}: name one by {setting}", names.join(", ")));
     }
 
-    /// The names of the bodies that are `sought`, or what is wrong with a name.
-    fn bodies(&self, sought: &dyn Fn(usize) -> bool) -> Vec<Result<String, String>> {
-        let bodies = (1..self.model.nbody() as usize).filter(|&body| sought(body));
-        bodies.map(|body| self.name(MjtObjBase::mjOBJ_BODY, body)).collect()
-    }
-
-    /// The limited hinges of the bodies that are `sought`.
-    fn limited_hinges(&self, sought: &dyn Fn(usize) -> bool) -> Vec<usize> {
-        let model = &self.model;
-        let hinge = |joint: usize| model.jnt_type()[joint] == MjtJoint::mjJNT_HINGE && model.jnt_limited()[joint];
-        let joints = 0..model.njnt() as usize;
-        joints.filter(|&joint| sought(model.jnt_bodyid()[joint] as usize) && hinge(joint)).collect()
+    /// The number of the first body of the tree that a body belongs to.
+    fn root_of(&self, body: usize) -> usize {
+        self.model.body_rootid()[body] as usize
     }
 
     /// The first bodies of the trees that equality constraints tie to each other, e.g. a mocap body that guides a hand.
     fn trees_of_constraints(&self) -> BTreeSet<usize> {
         let model = &self.model;
-        let ids = model.eq_objtype().iter().zip(model.eq_obj1id().iter().zip(model.eq_obj2id()));
-        let tied = ids.flat_map(|(&kind, (&a, &b))| [a, b].map(|id| (kind, id as usize)));
-        let bodies = tied.filter_map(|(kind, id)| match kind {
-            MjtObjBase::mjOBJ_BODY => Some(id),
-            MjtObjBase::mjOBJ_SITE => Some(model.site_bodyid()[id] as usize),
-            _ => None,
-        });
-        bodies.map(|body| model.body_rootid()[body] as usize).collect()
+        let mut trees = BTreeSet::new();
+        for (i, kind) in model.eq_objtype().iter().enumerate() {
+            for id in [model.eq_obj1id()[i] as usize, model.eq_obj2id()[i] as usize] {
+                match *kind {
+                    mjOBJ_BODY => trees.insert(self.root_of(id)),
+                    mjOBJ_SITE => trees.insert(self.root_of(model.site_bodyid()[id] as usize)),
+                    _ => false,
+                };
+            }
+        }
+        trees
     }
 
     /// The bodies that one of these hinges moves and that carry no other body.
@@ -131,7 +129,9 @@ impl Scene {
         let count = self.model.nbody() as usize;
         let mut moved = vec![false; count];
         let mut carries = vec![false; count];
-        hinges.iter().for_each(|&joint| moved[self.model.jnt_bodyid()[joint] as usize] = true);
+        for &joint in hinges {
+            moved[self.model.jnt_bodyid()[joint] as usize] = true;
+        }
         // Every body has a higher number than its parent.
         for body in 1..count {
             let parent = self.model.body_parentid()[body] as usize;
@@ -141,21 +141,25 @@ impl Scene {
         (1..count).filter(|&body| moved[body] && !carries[body]).collect()
     }
 
-    /// The first bodies of the trees that an actuator moves.
-    fn trees_of(&self, actuator: usize) -> impl Iterator<Item = usize> {
-        let bodies = self.wraps(actuator).into_iter().filter_map(|(kind, id, _)| match kind {
-            MjtWrap::mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
-            MjtWrap::mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
-            _ => None,
-        });
-        bodies.map(|body| self.model.body_rootid()[body as usize] as usize).filter(|&root| root != 0)
+    /// The first bodies of the trees that these actuators move.
+    fn trees_of(&self, actuators: impl Iterator<Item = usize>) -> BTreeSet<usize> {
+        let mut trees = BTreeSet::new();
+        for (kind, id, _) in actuators.flat_map(|actuator| self.wraps(actuator)) {
+            match kind {
+                mjWRAP_JOINT => trees.insert(self.root_of(self.model.jnt_bodyid()[id] as usize)),
+                mjWRAP_SITE => trees.insert(self.root_of(self.model.site_bodyid()[id] as usize)),
+                _ => false,
+            };
+        }
+        trees.remove(&0);
+        trees
     }
 
     /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
     /// in space drives no sum.
     pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
-        let name = |joint: usize| self.model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
-        let joints = self.wraps(actuator.id).into_iter().filter(|(kind, ..)| *kind == MjtWrap::mjWRAP_JOINT);
+        let name = |joint: usize| self.model.id_to_name(mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
+        let joints = self.wraps(actuator.id).into_iter().filter(|(kind, ..)| *kind == mjWRAP_JOINT);
         joints.map(|(_, joint, coefficient)| (name(joint), coefficient)).collect()
     }
 
@@ -165,8 +169,8 @@ impl Scene {
         let wrap =
             |at: usize| (self.model.wrap_type()[at], self.model.wrap_objid()[at] as usize, self.model.wrap_prm()[at]);
         match self.model.actuator_trntype()[actuator] {
-            MjtTrn::mjTRN_JOINT => vec![(MjtWrap::mjWRAP_JOINT, target, 1.0)],
-            MjtTrn::mjTRN_TENDON => {
+            mjTRN_JOINT => vec![(mjWRAP_JOINT, target, 1.0)],
+            mjTRN_TENDON => {
                 let first = self.model.tendon_adr()[target] as usize;
                 (first..first + self.model.tendon_num()[target] as usize).map(wrap).collect()
             }
@@ -174,30 +178,30 @@ impl Scene {
         }
     }
 
-    /// The name of an object, or a sentence if it has none.
-    fn name(&self, kind: MjtObjBase, id: usize) -> Result<String, String> {
-        let name = self.model.id_to_name(kind, id).filter(|name| !name.is_empty());
+    /// The names of these objects. Each that has none is a problem.
+    fn names(&self, kind: MjtObjBase, ids: impl IntoIterator<Item = usize>, problems: &mut Problems) -> Vec<String> {
         let what = match kind {
-            MjtObjBase::mjOBJ_ACTUATOR => "actuator",
-            MjtObjBase::mjOBJ_JOINT => "joint",
+            mjOBJ_ACTUATOR => "actuator",
+            mjOBJ_JOINT => "joint",
             _ => "body",
         };
-        name.map(str::to_owned).ok_or_else(|| format!("{what} {id} of the compiled scene needs a name"))
-    }
-
-    /// The names of those objects that have one. The others become `problems`.
-    fn names(&self, kind: MjtObjBase, ids: impl IntoIterator<Item = usize>, problems: &mut Vec<String>) -> Vec<String> {
-        let names = ids.into_iter().map(|id| self.name(kind, id));
-        names.filter_map(|name| name.map_err(|problem| problems.push(problem)).ok()).collect()
+        let mut names = Vec::new();
+        for id in ids {
+            match self.model.id_to_name(kind, id) {
+                Some(name) if !name.is_empty() => names.push(name.to_owned()),
+                _ => problems.push(format!("{what} {id} of the compiled scene needs a name")),
+            }
+        }
+        names
     }
 
     /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
-        self.names(MjtObjBase::mjOBJ_JOINT, 0..self.model.njnt() as usize, &mut Vec::new())
+        self.names(mjOBJ_JOINT, 0..self.model.njnt() as usize, &mut Problems::new())
     }
 
     /// The names of all actuators that have one.
     pub fn actuators(&self) -> Vec<String> {
-        self.names(MjtObjBase::mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut Vec::new())
+        self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut Problems::new())
     }
 }

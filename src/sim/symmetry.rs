@@ -2,7 +2,8 @@
 
 use mujoco_rs::prelude::{MjModel, MjtGeomBase};
 
-use super::placing::{Placed, frames_within, geom_within, inside};
+use super::constants::*;
+use super::placing::{Placed, frames_within, geoms_within, inside};
 use super::{Body, Scene};
 use crate::quat::{self, CUBE_ROTATIONS, Quat};
 
@@ -11,9 +12,8 @@ const TOLERANCE: f64 = 1e-5;
 
 /// A shape that can touch others, in the frame of the body.
 struct Shape {
-    kind: MjtGeomBase,
-    /// The mesh or height field, -1 for none.
-    data: i32,
+    /// What it is, and the number of its mesh or height field, -1 for none.
+    kind: (MjtGeomBase, i32),
     size: [f64; 3],
     position: [f64; 3],
     orientation: Quat,
@@ -64,14 +64,14 @@ impl Scene {
                 moves |= body > top && model.body_jntnum()[body] > 0;
             }
         }
-        let shape = |geom: usize| {
-            let (position, orientation) = geom_within(model, &frames, geom)?;
-            let kind = model.geom_type()[geom];
-            let data = model.geom_dataid()[geom];
-            let size = model.geom_size()[geom];
-            touches(model, geom).then_some(Shape { kind, data, size, position, orientation })
-        };
-        Form { shapes: (0..model.ngeom() as usize).filter_map(shape).collect(), inertia, moves }
+        let touching = geoms_within(model, &frames).into_iter().filter(|&(geom, _)| touches(model, geom));
+        let shapes = touching.map(|(geom, (position, orientation))| Shape {
+            kind: (model.geom_type()[geom], model.geom_dataid()[geom]),
+            size: model.geom_size()[geom],
+            position,
+            orientation,
+        });
+        Form { shapes: shapes.collect(), inertia, moves }
     }
 }
 
@@ -84,7 +84,7 @@ impl Form {
 }
 
 /// Whether a geom can be in a contact.
-fn touches(model: &MjModel, geom: usize) -> bool {
+pub(super) fn touches(model: &MjModel, geom: usize) -> bool {
     let pairs = [model.pair_geom1(), model.pair_geom2()];
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0
@@ -111,17 +111,15 @@ impl Shape {
     /// Whether this shape is in the place of another and fills the same space.
     fn fills(&self, other: &Self) -> bool {
         let scale = self.size.iter().chain(&self.position).fold(0.0, |most: f64, x| most.max(x.abs()));
-        if (self.kind, self.data) != (other.kind, other.data) || !alike(&self.position, &other.position, scale) {
+        if self.kind != other.kind || !alike(&self.position, &other.position, scale) {
             return false;
         }
         let between = matrix(quat::mul(quat::conj(other.orientation), self.orientation));
-        let size = match self.kind {
-            MjtGeomBase::mjGEOM_SPHERE => self.size,
+        let size = match self.kind.0 {
+            mjGEOM_SPHERE => self.size,
             // Their axis is z.
-            MjtGeomBase::mjGEOM_CAPSULE | MjtGeomBase::mjGEOM_CYLINDER if between[2][2].abs() >= 1.0 - TOLERANCE => {
-                self.size
-            }
-            MjtGeomBase::mjGEOM_BOX | MjtGeomBase::mjGEOM_ELLIPSOID => {
+            mjGEOM_CAPSULE | mjGEOM_CYLINDER if between[2][2].abs() >= 1.0 - TOLERANCE => self.size,
+            mjGEOM_BOX | mjGEOM_ELLIPSOID => {
                 let axis = |row: [f64; 3]| (0..3).find(|&j| row[j].abs() >= 1.0 - TOLERANCE);
                 let [Some(x), Some(y), Some(z)] = between.map(axis) else { return false };
                 [x, y, z].map(|axis| self.size[axis])
@@ -139,7 +137,7 @@ impl Inertia {
         let principal = model.body_inertia()[body];
         let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
         let axes = matrix(axes);
-        let square = centre.iter().map(|x| x * x).sum::<f64>();
+        let square: f64 = centre.iter().map(|x| x * x).sum();
         for i in 0..3 {
             self.first[i] += mass * centre[i];
             for j in 0..3 {
@@ -154,18 +152,16 @@ impl Inertia {
     fn is_kept(&self, turn: Quat) -> bool {
         let rotation = matrix(turn);
         let second = &self.second;
-        let turned = [0, 1, 2].map(|i| {
-            [0, 1, 2].map(|j| -> f64 {
-                let terms = (0..9).map(|at| rotation[i][at / 3] * second[at / 3][at % 3] * rotation[j][at % 3]);
-                terms.sum()
-            })
-        });
-        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
-        let first = quat::rotate(turn, self.first);
+        let entry = |i: usize, j: usize| -> f64 {
+            (0..9).map(|at| rotation[i][at / 3] * second[at / 3][at % 3] * rotation[j][at % 3]).sum()
+        };
+        let turned = [0, 1, 2].map(|i| [0, 1, 2].map(|j| entry(i, j)));
         let second = second.as_flattened();
+        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
         // A centre of mass that is off by a rounding error does not count.
         let mass_times_length = largest(&self.first).max(1e-9);
-        alike(&first, &self.first, mass_times_length) && alike(turned.as_flattened(), second, largest(second))
+        alike(&quat::rotate(turn, self.first), &self.first, mass_times_length)
+            && alike(turned.as_flattened(), second, largest(second))
     }
 }
 

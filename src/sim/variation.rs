@@ -11,6 +11,7 @@ use anyhow::{Result, ensure};
 use mujoco_rs::mujoco_c::mj_copyModel;
 use mujoco_rs::prelude::{MjData, MjModel};
 
+use super::placing::frames_within;
 use super::{Actuator, Body, Hinge, Scene, Simulation};
 
 /// A change of the physics of a scene.
@@ -44,11 +45,8 @@ impl Change {
                 scale(model.pair_friction_mut().as_flattened_mut(), factor);
             }
             Self::Mass(Body(top), factor) => {
-                // Every body has a higher number than its parent.
-                let mut below = vec![false; model.nbody() as usize];
-                for body in top..below.len() {
-                    below[body] = body == top || below[model.body_parentid()[body] as usize];
-                    if below[body] {
+                for (body, frame) in frames_within(model, top).iter().enumerate() {
+                    if frame.is_some() {
                         model.body_mass_mut()[body] *= factor;
                         scale(&mut model.body_inertia_mut()[body], factor);
                     }

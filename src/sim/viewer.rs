@@ -37,7 +37,7 @@ impl Viewer {
         Ok(Self { viewer, panel })
     }
 
-    /// Returns whether the window is still open.
+    /// Whether the window is still open.
     pub fn is_open(&self) -> bool {
         self.viewer.running()
     }
@@ -61,10 +61,9 @@ impl Viewer {
         self.panel.borrow_mut().readout = readout;
         self.viewer.render().map_err(|error| described(&error))?;
         let controls = &mut self.panel.borrow_mut().controls;
-        let asked = Controls { reset: controls.reset | was_reset, ..*controls };
-        controls.steps = 0;
-        controls.reset = false;
-        controls.new_goal = false;
+        controls.reset |= was_reset;
+        let asked = *controls;
+        *controls = Controls { steps: 0, reset: false, new_goal: false, ..asked };
         Ok(asked)
     }
 }

@@ -46,7 +46,8 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
         let config = H264SampleEntryConfig { length_size: LengthSize::FourBytes };
         let describe = || build_avc1_box_from_annexb(&stream, &config).map(SampleEntry::Avc1);
         let sample_entry = (number == 0).then(describe).transpose()?;
-        let data = without_parameter_sets(&stream)?;
+        let data = units_with_lengths(&stream)?;
+        ensure!(!data.is_empty(), "the encoder skipped a frame");
         file.write_all(&data)?;
         muxer.append_sample(&Sample {
             track_kind: TrackKind::Video,
@@ -69,16 +70,16 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
     file.into_inner().map_err(|error| anyhow!("{}", error.error()))
 }
 
-/// An encoded frame as MP4 stores it. The parameter sets go into the index.
-fn without_parameter_sets(stream: &[u8]) -> Result<Vec<u8>> {
+/// The units of a frame, each behind its length, as the file holds them.
+fn units_with_lengths(stream: &[u8]) -> Result<Vec<u8>> {
     let mut data = Vec::with_capacity(stream.len());
     for unit in parse_annexb_nal_units(stream)? {
+        // The parameter sets go into the index.
         if !matches!(unit.nal_unit_type, H264NalUnitType::Sps | H264NalUnitType::Pps) {
             data.extend_from_slice(&u32::try_from(unit.data.len())?.to_be_bytes());
             data.extend_from_slice(unit.data);
         }
     }
-    ensure!(!data.is_empty(), "the encoder skipped a frame");
     Ok(data)
 }
 
