@@ -124,13 +124,13 @@ impl Shared {
                 continue;
             };
             let _ = stream.set_write_timeout(Some(PATIENCE));
-            let Some(slot) = Slot::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
+            let Some(permit) = Permit::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
                 let _ = answer(&mut stream, "503 Service Unavailable", &[], "There are too many connections.\n");
                 continue;
             };
             let connection = thread::Builder::new().name("connection".into());
             // Without a thread, the connection is closed.
-            let _ = connection.spawn(move || slot.shared.serve(stream));
+            let _ = connection.spawn(move || permit.shared.serve(stream));
         }
     }
 
@@ -155,8 +155,8 @@ impl Shared {
             }
             ("/events", _) => {
                 request.expect_method("GET")?;
-                let slot = Slot::take(self, MOST_READERS, |news| &mut news.readers);
-                let _slot = slot.ok_or(CROWDED)?;
+                let permit = Permit::take(self, MOST_READERS, |news| &mut news.readers);
+                let _permit = permit.ok_or(CROWDED)?;
                 self.send_events(stream)
             }
             ("/controls", Some(on_post)) => {
@@ -192,14 +192,14 @@ impl Shared {
     }
 }
 
-/// One of the connections or readers that there may be, as long as it lives.
-struct Slot {
+/// The permit of one of the connections or readers that there may be.
+struct Permit {
     shared: Arc<Shared>,
     count: fn(&mut News) -> &mut usize,
 }
 
-impl Slot {
-    /// A slot, unless all of them are taken.
+impl Permit {
+    /// A permit, unless there are `most` of them already.
     fn take(shared: &Arc<Shared>, most: usize, count: fn(&mut News) -> &mut usize) -> Option<Self> {
         let mut news = shared.news();
         let taken = count(&mut news);
@@ -212,7 +212,7 @@ impl Slot {
     }
 }
 
-impl Drop for Slot {
+impl Drop for Permit {
     fn drop(&mut self) {
         *(self.count)(&mut self.shared.news()) -= 1;
     }
