@@ -280,9 +280,6 @@ fn an_earlier_file_is_refused_with_the_name_of_a_script_that_converts_it_without
     };
     for name in ["policy.safetensors", "checkpoints/latest.safetensors"] {
         let today = run.join(name);
-        let mut without_mirror = Checkpoint::parse(&fs::read(&today).unwrap()).unwrap();
-        without_mirror.config = without_mirror.config.replace("mirror = false\n", "");
-        fs::write(&today, without_mirror.to_bytes().unwrap()).unwrap();
         python(&backwards, &[&scripts, &today, &earlier]);
         let refused = program(folder.path(), &["play", "--json", "--ckpt", "earlier"]);
         assert_eq!(refused.status.code(), Some(1));
