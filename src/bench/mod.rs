@@ -63,7 +63,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
     let mut lines = format!("{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n");
-    let measures: [(Part, Measure); 4] = [
+    let measures: [(Part, Measurement); 4] = [
         (Part::Physics, physics_and_pool),
         (Part::Learner, learner),
         (Part::Training, end_to_end),
@@ -78,7 +78,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
 }
 
 /// The measurement of a part.
-type Measure = fn(&Arc<Task>, &Config) -> Result<Found>;
+type Measurement = fn(&Arc<Task>, &Config) -> Result<Found>;
 
 /// Environments that record their physics, and the random actions that they take.
 struct Bursts {

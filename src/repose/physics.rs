@@ -21,8 +21,6 @@ pub struct Quantity {
     pub setting: &'static str,
     /// Its unit, or 1 for a factor.
     pub unit: &'static str,
-    /// The value that changes nothing.
-    pub neutral: f64,
     /// The value for the whole task.
     task: fn(&EnvConfig) -> Vec<f64>,
     law: Law,
@@ -70,32 +68,32 @@ fn vector(values: &[f64]) -> [f64; 3] {
 /// All quantities, in the order in which they are drawn.
 #[rustfmt::skip]
 pub const QUANTITIES: [Quantity; 10] = [
-    Quantity { name: "friction", setting: "friction_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "friction", setting: "friction_scale", unit: "1",
         task: |env| vec![env.friction_scale], law: Law::Uniform(|drawn| drawn.friction),
         change: |_, x| vec![Change::Friction(x[0])] },
-    Quantity { name: "cube_mass", setting: "cube_mass_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "cube_mass", setting: "cube_mass_scale", unit: "1",
         task: |env| vec![env.cube_mass_scale], law: Law::Uniform(|drawn| drawn.cube_mass),
         change: |hand, x| vec![Change::Mass(hand.object.body, x[0])] },
-    Quantity { name: "hand_mass", setting: "hand_mass_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "hand_mass", setting: "hand_mass_scale", unit: "1",
         task: |env| vec![env.hand_mass_scale], law: Law::Uniform(|drawn| drawn.hand_mass),
         change: |hand, x| each(&hand.roots, x, Change::Mass) },
-    Quantity { name: "cube_size", setting: "cube_size_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "cube_size", setting: "cube_size_scale", unit: "1",
         task: |env| vec![env.cube_size_scale], law: Law::Size(|drawn| drawn.cube_size), change: none },
-    Quantity { name: "delay", setting: "action_delay", unit: "control steps", neutral: 0.0,
+    Quantity { name: "delay", setting: "action_delay", unit: "control steps",
         task: |env| vec![f64::from(env.action_delay)], law: Law::Whole(|drawn| drawn.delay), change: none },
-    Quantity { name: "cube_com", setting: "cube_com", unit: "m", neutral: 0.0,
+    Quantity { name: "cube_com", setting: "cube_com", unit: "m",
         task: |env| env.cube_com.into(), law: Law::Within(|drawn| drawn.cube_com),
         change: |hand, x| vec![Change::CentreOfMass(hand.object.body, vector(x))] },
-    Quantity { name: "gravity", setting: "gravity", unit: "m/s^2", neutral: 0.0,
+    Quantity { name: "gravity", setting: "gravity", unit: "m/s^2",
         task: |env| env.gravity.into(), law: Law::Normal(|drawn| drawn.gravity),
         change: |_, x| vec![Change::Gravity(vector(x))] },
-    Quantity { name: "gains", setting: "gains_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "gains", setting: "gains_scale", unit: "1",
         task: |env| vec![env.gains_scale], law: Law::Each(|hand| hand.actuators.len(), |drawn| drawn.gains),
         change: |hand, x| each(&hand.actuators, x, Change::Gain) },
-    Quantity { name: "damping", setting: "damping_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "damping", setting: "damping_scale", unit: "1",
         task: |env| vec![env.damping_scale], law: Law::Each(|hand| hand.joints.len(), |drawn| drawn.damping),
         change: |hand, x| each(&hand.joints, x, Change::Damping) },
-    Quantity { name: "frictionloss", setting: "frictionloss_scale", unit: "1", neutral: 1.0,
+    Quantity { name: "frictionloss", setting: "frictionloss_scale", unit: "1",
         task: |env| vec![env.frictionloss_scale], law: Law::Each(|hand| hand.joints.len(), |drawn| drawn.frictionloss),
         change: |hand, x| each(&hand.joints, x, Change::FrictionLoss) },
 ];
@@ -104,6 +102,11 @@ pub const QUANTITIES: [Quantity; 10] = [
 const OTHERS: [&str; 3] = ["cone", "noise", "bias"];
 
 impl Quantity {
+    /// The value that changes nothing.
+    fn neutral(&self) -> f64 {
+        if self.unit == "1" { 1.0 } else { 0.0 }
+    }
+
     /// The number of values in an episode of this hand.
     fn count(&self, hand: &Hand) -> usize {
         match self.law {
@@ -160,7 +163,7 @@ pub struct Physics(Vec<Vec<f64>>);
 impl Physics {
     /// The physics of the scene as it is.
     pub(super) fn neutral(hand: &Hand) -> Self {
-        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral; quantity.count(hand)]).collect())
+        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral(); quantity.count(hand)]).collect())
     }
 
     /// The physics that a task sets.
@@ -175,7 +178,7 @@ impl Physics {
 
     /// What it changes in a scene.
     pub(super) fn changes(&self, hand: &Hand) -> Vec<Change> {
-        let differ = QUANTITIES.iter().zip(&self.0).filter(|(of, values)| values.iter().any(|x| *x != of.neutral));
+        let differ = QUANTITIES.iter().zip(&self.0).filter(|(of, values)| values.iter().any(|x| *x != of.neutral()));
         differ.flat_map(|(quantity, values)| (quantity.change)(hand, values)).collect()
     }
 
@@ -220,7 +223,7 @@ mod tests {
     fn the_physics_of_the_default_task_are_those_of_the_scene() {
         let config = Config::default();
         for (quantity, values) in QUANTITIES.iter().zip(Physics::of_task(&config.env).0) {
-            assert!(values.iter().all(|x| *x == quantity.neutral), "{}", quantity.name);
+            assert!(values.iter().all(|x| *x == quantity.neutral()), "{}", quantity.name);
         }
     }
 

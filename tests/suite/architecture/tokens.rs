@@ -14,7 +14,7 @@ const FILE: usize = 3500;
 const FUNCTION: usize = 500;
 
 /// The files with more tokens. The list only shrinks.
-const LONGER_FILES: &[&str] = &["repose/environment.rs"];
+const LONGER_FILES: &[&str] = &[];
 
 /// The functions with more tokens. The list only shrinks.
 const LONGER_FUNCTIONS: &[&str] = &["config/overlay.rs: typed", "config/rules.rs: violations"];
