@@ -81,6 +81,9 @@ pub struct Moment<'a> {
     pub step: Option<(&'a [f32], Option<End>)>,
 }
 
+/// What is told of every moment.
+pub type Observer<'a> = dyn FnMut(Moment) -> Result<()> + 'a;
+
 impl Moment<'_> {
     /// Returns whether this step ended the episode.
     pub fn ends(&self) -> bool {
@@ -154,7 +157,6 @@ pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     let player = Player::new(task, Episodes::scored(0, 1));
     let policy = policy.freeze();
     let mut value = [0.0_f32];
-
     policy.values(&player.observation, &mut value, &mut policy.workspace(1));
     ensure!((value[0] * value[0]).is_finite(), "the values of the policy are not finite");
     Ok(())
@@ -166,7 +168,7 @@ impl Trial<'_> {
     ///
     /// # Errors
     /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics.
-    pub fn play(&self, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<Option<Vec<EpisodeStats>>> {
+    pub fn play(&self, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
         let played = self.play_lanes(0..LANES, observer)?;
         Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
     }
@@ -191,11 +193,7 @@ impl Trial<'_> {
     ///
     /// # Errors
     /// Fails as [`Trial::play`] does.
-    pub fn play_together(
-        &self,
-        exchange: &Exchange,
-        observer: &mut dyn FnMut(Moment) -> Result<()>,
-    ) -> Result<Option<Vec<EpisodeStats>>> {
+    pub fn play_together(&self, exchange: &Exchange, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
         let own = exchange.own(LANES.min(self.episodes.count));
         let Some(own) = self.play_lanes(own, observer)? else { return Ok(None) };
         let mut all = exchange.all_gather(own).concat();
@@ -205,23 +203,19 @@ impl Trial<'_> {
 
     /// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
     /// episode's result does not depend on who plays it.
-    fn play_lanes(
-        &self,
-        own: Range<usize>,
-        observer: &mut dyn FnMut(Moment) -> Result<()>,
-    ) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
+    fn play_lanes(&self, own: Range<usize>, observer: &mut Observer) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
         let Episodes { first, count, .. } = self.episodes;
         let mut group = Lanes::new(self, own.start..own.end.min(count));
         let mut results = Vec::with_capacity(count);
         for first in (first + own.start..first + count).step_by(LANES) {
             group.start(first, observer)?;
-            while group.is_running() {
+            while group.lanes.iter().any(|lane| lane.running) {
                 if self.stop.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
                 group.step(observer)?;
             }
-            results.extend(group.episodes());
+            results.extend((first..).zip(group.lanes[..group.count].iter_mut().map(Lane::episode)));
         }
         Ok(Some(results))
     }
@@ -258,12 +252,8 @@ impl<'a> Lanes<'a> {
         }
     }
 
-    fn is_running(&self) -> bool {
-        self.lanes.iter().any(|lane| lane.running)
-    }
-
     /// Starts the episodes from number `first` on.
-    fn start(&mut self, first: usize, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<()> {
+    fn start(&mut self, first: usize, observer: &mut Observer) -> Result<()> {
         let episodes = self.trial.episodes;
         self.first = first;
         self.count = self.lanes.len().min(episodes.first + episodes.count - first);
@@ -280,7 +270,7 @@ impl<'a> Lanes<'a> {
     }
 
     /// Takes one step in each lane whose episode has not ended.
-    fn step(&mut self, observer: &mut dyn FnMut(Moment) -> Result<()>) -> Result<()> {
+    fn step(&mut self, observer: &mut Observer) -> Result<()> {
         let Self { trial, lanes, observations, actions, work, first, .. } = self;
         let Spaces { observation_size, action_size, .. } = self.spaces;
         trial.actor.choose(observations, lanes, actions, work.as_mut());
@@ -303,11 +293,6 @@ impl<'a> Lanes<'a> {
             lane.running = lane.end.is_none();
         }
         Ok(())
-    }
-
-    /// The episodes, once they have ended, with their numbers.
-    fn episodes(&mut self) -> impl Iterator<Item = (usize, EpisodeStats)> {
-        (self.first..).zip(self.lanes[..self.count].iter_mut().map(Lane::episode))
     }
 }
 
