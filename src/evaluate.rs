@@ -63,7 +63,7 @@ pub struct Episodes {
 }
 
 impl Episodes {
-    /// Returns the first `count` episodes for a score.
+    /// The first `count` episodes for a score.
     pub fn scored(seed: u64, count: usize) -> Self {
         Self { seed, purpose: "score", first: 0, count }
     }
@@ -85,7 +85,7 @@ pub struct Moment<'a> {
 pub type Observer<'a> = dyn FnMut(Moment) -> Result<()> + 'a;
 
 impl Moment<'_> {
-    /// Returns whether this step ended the episode.
+    /// Whether this step ended the episode.
     pub fn ends(&self) -> bool {
         self.step.is_some_and(|(_, end)| end.is_some())
     }
@@ -110,7 +110,7 @@ impl Lane {
         self.running = true;
     }
 
-    /// Returns the record of the episode, once.
+    /// The record of the episode, once.
     fn episode(&mut self) -> EpisodeStats {
         EpisodeStats { turned: self.env.take_sums().turned, ..self.env.episode() }
     }
@@ -407,12 +407,12 @@ impl Player {
         self.lane.env.redirect(&mut self.observation);
     }
 
-    /// Returns the environment.
+    /// The environment.
     pub fn env(&self) -> &Repose {
         &self.lane.env
     }
 
-    /// Returns the environment for the window, which lets the user pull at it.
+    /// The environment for the window, which lets the user pull at it.
     pub fn env_mut(&mut self) -> &mut Repose {
         &mut self.lane.env
     }

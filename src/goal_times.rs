@@ -94,7 +94,8 @@ fn percentile(sorted: &[f64], fraction: f64) -> f64 {
 fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
     let count = points.clone().count() as f64;
     let mean = |of: &dyn Fn([f64; 2]) -> f64| points.clone().map(of).sum::<f64>() / count;
-    let [x_mean, y_mean] = [mean(&|[x, _]| x), mean(&|[_, y]| y)];
+    let x_mean = mean(&|[x, _]| x);
+    let y_mean = mean(&|[_, y]| y);
     let spread = mean(&|[x, _]| (x - x_mean).powi(2));
     let slope = if spread > 0.0 { mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread } else { f64::NAN };
     [y_mean - slope * x_mean, slope]

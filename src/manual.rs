@@ -13,7 +13,8 @@ const PROGRAM: &str = "shadow-repose";
 /// # Errors
 /// Fails if stdout cannot be written to.
 pub fn completions(shell: Shell) -> Result<()> {
-    let (mut text, mut program) = (Vec::new(), command());
+    let mut text = Vec::new();
+    let mut program = command();
     if shell != Shell::Bash {
         clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
         let more = if shell == Shell::Fish { after_commands(&program) } else { String::new() };
@@ -25,7 +26,7 @@ pub fn completions(shell: Shell) -> Result<()> {
     os::print(&text)
 }
 
-/// Returns what clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
+/// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
 fn after_commands(program: &clap::Command) -> String {
     let names = |command: &clap::Command| command.get_subcommands().map(|of| of.get_name().to_owned()).collect();
     let values = |command: &clap::Command| {
@@ -48,14 +49,16 @@ fn after_commands(program: &clap::Command) -> String {
 pub fn man() -> Result<()> {
     let mut program = command().name(PROGRAM);
     program.build();
-    let (mut page, whole) = (Vec::new(), clap_mangen::Man::new(program.clone()));
+    let mut page = Vec::new();
+    let whole = clap_mangen::Man::new(program.clone());
     whole.render_title(&mut page)?;
     whole.render_name_section(&mut page)?;
     whole.render_synopsis_section(&mut page)?;
     whole.render_description_section(&mut page)?;
     let mut page = String::from_utf8(page)?;
     for command in program.get_subcommands().filter(|command| command.get_name() != "help") {
-        let (mut section, part) = (Vec::new(), clap_mangen::Man::new(command.clone()));
+        let mut section = Vec::new();
+        let part = clap_mangen::Man::new(command.clone());
         part.render_description_section(&mut section)?;
         part.render_options_section(&mut section)?;
         part.render_extra_section(&mut section)?;

@@ -44,7 +44,7 @@ struct Condition {
 }
 
 impl Condition {
-    /// Returns whether it belongs to the grid of friction and mass.
+    /// Whether it belongs to the grid of friction and mass.
     fn is_in_grid(&self) -> bool {
         self.sets.len() == 2
     }
@@ -144,7 +144,7 @@ fn played(
     Ok(rows)
 }
 
-/// Returns all rows: the task itself, the single changes, and the grid.
+/// All rows: the task itself, the single changes, and the grid.
 fn conditions() -> Vec<Condition> {
     let set = |key: &str, value: &str| Override { key: key.into(), value: value.into() };
     let mut conditions = vec![Condition { name: "nominal".into(), sets: Vec::new() }];
@@ -167,7 +167,7 @@ fn conditions() -> Vec<Condition> {
     conditions
 }
 
-/// Returns the mean fraction of goals over the single changes, each counted as at most 1.
+/// The mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Row]) -> f64 {
     let single = rows.iter().skip(1).filter(|row| !row.condition.is_in_grid());
     let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();

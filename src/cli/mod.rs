@@ -94,7 +94,7 @@ pub enum Command {
     Man,
 }
 
-/// Returns the command line with what is only known at run time: version, examples, defaults that are settings.
+/// The command line with what is only known at run time: version, examples, defaults that are settings.
 pub fn command() -> clap::Command {
     let run = Config::default().run;
     let defaults = [
@@ -347,7 +347,7 @@ impl PlayArgs {
     }
 }
 
-/// Returns a usage error for the command `name`, for options that are valid alone but not in combination.
+/// A usage error for the command `name`, for options that are valid alone but not in combination.
 pub fn usage_error(name: &str, text: &str) -> clap::Error {
     let mut command = command();
     command.build();

@@ -26,7 +26,7 @@ pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
     Ok(())
 }
 
-/// Returns the commands that use a setting.
+/// The commands that use a setting.
 fn users(key: &str) -> &'static [&'static str] {
     match key {
         "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.patience" => &["train"],

@@ -21,7 +21,7 @@ impl Config {
         differing.into_iter().map(|(key, [own, other])| format!("{key} = {other}, not {own}")).collect()
     }
 
-    /// Returns the settings that make `other` another training: all but the total number of steps and the number of threads.
+    /// The settings that make `other` another training: all but the total number of steps and the number of threads.
     pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
         differing([self, other].map(Self::settled))
     }
@@ -45,7 +45,7 @@ impl Config {
         settings(&own).filter_map(|(key, value)| Some((key, Ramp::read(value)?))).collect()
     }
 
-    /// Returns these settings without the length of the run and without what depends on the machine.
+    /// These settings without the length of the run and without what depends on the machine.
     fn settled(&self) -> Self {
         let mut same = self.clone();
         (same.run.total_steps, same.run.threads, same.run.shards) = (0, 0, self.shards());
@@ -80,7 +80,7 @@ fn differing(both: [Config; 2]) -> Vec<Difference> {
     both.map(|((key, own), (_, other))| (key, [own.clone(), other.clone()])).collect()
 }
 
-/// Returns a value as `--set` takes it, without spaces.
+/// A value as `--set` takes it, without spaces.
 pub fn short(value: &Value) -> String {
     let joined = |parts: Vec<String>| parts.join(",");
     match value {
@@ -94,7 +94,7 @@ pub fn short(value: &Value) -> String {
     }
 }
 
-/// Returns a value as part of another one, where text has quotes.
+/// A value as part of another one, where text has quotes.
 fn inner(value: &Value) -> String {
     if value.is_str() { value.to_string() } else { short(value) }
 }

@@ -12,35 +12,35 @@ use crate::os::{shortened, similar};
 pub(super) static DEFAULTS: LazyLock<Table> =
     LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
 
-/// Returns the settings of all sections of a table, each with its dotted key.
+/// The settings of all sections of a table, each with its dotted key.
 pub(super) fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
     let sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
     sections.flat_map(|(section, keys)| keys.iter().map(move |(key, value)| (format!("{section}.{key}"), value)))
 }
 
-/// Returns the value with this dotted key.
+/// The value with this dotted key.
 pub(super) fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     let (section, rest) = key.split_once('.').unwrap_or((key, ""));
     rest.split_terminator('.').try_fold(table.get(section)?, |value, part| value.get(part))
 }
 
-/// Returns a number, whole or not.
+/// A number, whole or not.
 pub(super) fn number(value: &Value) -> Option<f64> {
     value.as_float().or(value.as_integer().map(|x| x as f64))
 }
 
-/// Returns a number as text: `1e300` rather than 301 digits.
+/// A number as text: `1e300` rather than 301 digits.
 pub(super) fn brief(x: f64) -> String {
     let text = x.to_string();
     if text.len() > 20 { format!("{x:e}") } else { text }
 }
 
-/// Returns whether a table of the base is a ramp, rather than a section or values by group.
+/// Whether a table of the base is a ramp, rather than a section or values by group.
 pub(super) fn is_ramp(table: &Table) -> bool {
     table.contains_key("from")
 }
 
-/// Returns the table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
+/// The table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
 /// for a string key. Numbers may lack the zero before their point, which TOML requires.
 pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     let parse = |text: &str| format!("value = {text}").parse::<Table>().ok().filter(|t| t.len() == 1);
@@ -64,7 +64,7 @@ pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     Table::from_iter([(parts[0].to_owned(), value)])
 }
 
-/// Returns the text with a zero before each point that begins a number: `[0.5,-0.1]` for `[.5,-.1]`.
+/// The text with a zero before each point that begins a number: `[0.5,-0.1]` for `[.5,-.1]`.
 fn with_zeros(text: &str) -> String {
     let bytes = text.as_bytes();
     let begins = |i: usize| {
@@ -74,7 +74,7 @@ fn with_zeros(text: &str) -> String {
     text.char_indices().map(|(i, c)| if begins(i) { "0.".to_owned() } else { c.to_string() }).collect()
 }
 
-/// Returns whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
+/// Whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
 pub(super) fn names_scene(text: &str, stored: &str) -> bool {
     let asked = table_of("env.model", text, &DEFAULTS);
     let file = lookup(&asked, "env.model").and_then(Value::as_str).map(|asked| Path::new(asked).canonicalize());
@@ -127,7 +127,7 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
     }
 }
 
-/// Returns what a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
+/// What a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
 fn inner(expected: &Table, value: &Value) -> Option<Table> {
     let constant = [("from", value.clone()), ("to", value.clone()), ("steps", 0.into())];
     let constant = constant.into_iter().map(|(part, value)| (part.to_owned(), value)).collect();

@@ -57,7 +57,7 @@ const LONGEST_NAME: usize = 255;
 /// The smallest and the largest magnitude of a nonzero value. Much is computed from these values in `f32`.
 const IN_F32: [f64; 2] = [1e-37, 1e38];
 
-/// Returns every rule that the values break, as "key = value: must …".
+/// Every rule that the values break, as "key = value: must …".
 pub(super) fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
     let table = Table::try_from(config).expect("a configuration is a tree of tables");
@@ -89,7 +89,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
     rules.0
 }
 
-/// Returns the values of a setting that are not counts.
+/// The values of a setting that are not counts.
 fn floats(value: &Value) -> Vec<f64> {
     match value {
         Value::Float(x) => vec![*x],

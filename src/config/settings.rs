@@ -240,61 +240,61 @@ pub struct NetConfig {
 }
 
 impl Config {
-    /// Returns the number of control steps in the first iteration.
+    /// The number of control steps in the first iteration.
     pub fn steps_per_iteration(&self) -> u64 {
         self.env.num_envs.saturating_mul(self.ppo.first_horizon()) as u64
     }
 
-    /// Returns the number of samples in a minibatch.
+    /// The number of samples in a minibatch.
     pub fn samples_per_minibatch(&self) -> usize {
         self.ppo.minibatch_of(self.steps_per_iteration() as usize, self.ppo.first_horizon())
     }
 
-    /// Returns the number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
+    /// The number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
     pub fn shards(&self) -> usize {
         let found = [16, 8, 4, 2].into_iter().find(|&shards| self.divides(shards)).unwrap_or(1);
         if self.run.shards == 0 { found } else { self.run.shards }
     }
 
-    /// Returns whether environments and minibatches can be divided evenly into `shards`.
+    /// Whether environments and minibatches can be divided evenly into `shards`.
     pub(super) fn divides(&self, shards: usize) -> bool {
         self.env.num_envs.is_multiple_of(shards) && self.samples_per_minibatch().is_multiple_of(shards)
     }
 }
 
 impl PpoConfig {
-    /// Returns the structure of the policy that is trained.
+    /// The structure of the policy that is trained.
     pub fn net(&self) -> NetConfig {
         NetConfig { hidden: self.hidden.clone(), activation: self.activation }
     }
 
-    /// Returns the number of control steps of each environment in the first iteration.
+    /// The number of control steps of each environment in the first iteration.
     pub fn first_horizon(&self) -> usize {
         self.horizon.from.max(1.0) as usize
     }
 
-    /// Returns the control steps of each environment in an iteration that begins after `env_steps` control steps of the run. This
+    /// The control steps of each environment in an iteration that begins after `env_steps` control steps of the run. This
     /// is the largest multiple of the first horizon that the ramp has reached.
     pub fn horizon_at(&self, env_steps: u64) -> usize {
         let first = self.first_horizon();
         (self.horizon.at(env_steps) / first as f64 + 1e-9) as usize * first
     }
 
-    /// Returns the number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
+    /// The number of samples in a minibatch of a rollout with this many samples and this horizon. It is the same for all
     /// horizons of a run.
     pub fn minibatch_of(&self, samples: usize, horizon: usize) -> usize {
         let in_first = samples / (horizon / self.first_horizon());
         in_first / self.minibatches
     }
 
-    /// Returns how far a value may move from its value at collection time, or infinity if `value_clip` is 0.
+    /// How far a value may move from its value at collection time, or infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
         if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
     }
 }
 
 impl RandomizationConfig {
-    /// Returns whether a training has randomised episodes, at its beginning or later.
+    /// Whether a training has randomised episodes, at its beginning or later.
     pub fn happens(&self) -> bool {
         self.share.from > 0.0 || self.share.to > 0.0
     }
@@ -308,17 +308,17 @@ impl EnvConfig {
         Self { act_moving_average, ..self.clone() }
     }
 
-    /// Returns the number of physics steps in one control step.
+    /// The number of physics steps in one control step.
     pub fn substeps(&self) -> usize {
         (self.ctrl_dt / self.sim_dt).round() as usize
     }
 
-    /// Returns the number of control steps after which an episode is truncated.
+    /// The number of control steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> u32 {
         (self.max_episode_seconds / self.ctrl_dt).round() as u32
     }
 
-    /// Returns the path of the user's own scene, or `None` for the built-in one.
+    /// The path of the user's own scene, or `None` for the built-in one.
     pub fn model_file(&self) -> Option<&Path> {
         (self.model != BUILTIN_MODEL).then(|| Path::new(&self.model))
     }

@@ -62,7 +62,7 @@ const SMALL: f64 = 1e-4;
 /// Pixels between two dashes.
 const GAP: i32 = 3;
 
-/// Returns the colour and dash length (pixels) of each curve in turn. Once all colours are used, they repeat with dashes.
+/// The colour and dash length (pixels) of each curve in turn. Once all colours are used, they repeat with dashes.
 fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
     let dashes = std::iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
     dashes.flat_map(|dash| COLOURS.iter().map(move |colour| (colour.stroke_width(2), dash)))
@@ -70,7 +70,7 @@ fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
 
 /// A picture that is drawn in the same way in each format.
 pub trait Picture {
-    /// Returns its width and height in pixels.
+    /// Its width and height in pixels.
     ///
     /// # Errors
     /// Fails if the picture is too small for what it shows.
@@ -142,7 +142,7 @@ pub(super) fn draw_text<B: DrawingBackend<ErrorType: 'static>>(
     Ok(area.draw(&Text::new(printable(text), at, style))?)
 }
 
-/// Returns a text without the characters that XML does not allow.
+/// A text without the characters that XML does not allow.
 fn printable(text: &str) -> String {
     let allowed = |c: char| !c.is_control() && !matches!(c, '\u{fffe}' | '\u{ffff}');
     text.chars().map(|c| if allowed(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
@@ -273,7 +273,7 @@ impl Curve {
         self.points.iter().map(|[x, _]| *x)
     }
 
-    /// Returns all values, including the band.
+    /// All values, including the band.
     fn values(&self) -> impl Iterator<Item = f64> {
         self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
     }
@@ -302,7 +302,7 @@ impl Curve {
     }
 }
 
-/// Returns the range of the values and zero, with a margin at the top. It is never empty.
+/// The range of the values and zero, with a margin at the top. It is never empty.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
     if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }

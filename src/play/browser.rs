@@ -63,7 +63,7 @@ impl Followed {
         Ok(Self { stamp: Stamp::of(&path), run, path })
     }
 
-    /// Returns whether the file has changed since the last call.
+    /// Whether the file has changed since the last call.
     fn has_changed(&mut self) -> bool {
         let before = self.stamp;
         self.stamp = Stamp::of(&self.path);
@@ -160,7 +160,7 @@ fn recorded(header: &Value) -> About {
     described(actor, policy, header["seed"].as_u64())
 }
 
-/// Returns the settings of the header of a trace as a configuration file.
+/// The settings of the header of a trace as a configuration file.
 ///
 /// # Errors
 /// Fails if there are none.

@@ -21,13 +21,13 @@ pub(super) struct Mirror {
     tips: Vec<(usize, Quat)>,
 }
 
-/// Returns the mirrored rotation: its axis is mirrored like a point, and its sense is the opposite one.
+/// The mirrored rotation: its axis is mirrored like a point, and its sense is the opposite one.
 fn mirrored([w, x, y, z]: Quat) -> Quat {
     [w, -x, y, -z]
 }
 
 impl Mirror {
-    /// Returns the mirror from the hand of `here` to the hand of `policy`.
+    /// The mirror from the hand of `here` to the hand of `policy`.
     ///
     /// # Errors
     /// Fails if, in any recorded pose, the fingertips of one hand are not where the mirrored fingertips of the other are.
@@ -76,7 +76,7 @@ impl Mirror {
         }
     }
 
-    /// Returns it as a matrix `[O, O]`: an observation as a row times it is the mirrored one.
+    /// The matrix `[O, O]` that mirrors an observation, which is a row on its left.
     pub(super) fn matrix(&self, size: usize) -> Vec<f32> {
         let mut matrix = vec![0.0; size * size];
         for (i, row) in matrix.chunks_exact_mut(size).enumerate() {

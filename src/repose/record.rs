@@ -37,7 +37,7 @@ pub struct Record {
 }
 
 impl Record {
-    /// Returns the record of a hand in its scene, and of an object with these rotations.
+    /// The record of a hand in its scene, and of an object with these rotations.
     pub(super) fn of(hand: &Hand, scene: &Scene, symmetry: Vec<usize>) -> Self {
         let Parts { joints, actuators, fingertips, .. } = hand.parts.clone();
         let ranges = hand.actuators.iter().map(|actuator| actuator.range).collect();
@@ -62,7 +62,7 @@ impl Record {
         Ok(record)
     }
 
-    /// Returns the record of a policy with this setting: by default it treats as the same all rotations that map the object
+    /// The record of a policy with this setting: by default it treats as the same all rotations that map the object
     /// onto itself.
     pub fn with(mut self, symmetry: Symmetry) -> Self {
         match symmetry {
@@ -73,7 +73,7 @@ impl Record {
         self
     }
 
-    /// Returns the text for a file.
+    /// The text for a file.
     ///
     /// # Panics
     /// Never panics: all of it can be written as JSON.
@@ -81,7 +81,7 @@ impl Record {
         serde_json::to_string(self).expect("names and numbers")
     }
 
-    /// Returns the observations and actions of a policy for it.
+    /// The observations and actions of a policy for it.
     pub fn spaces(&self) -> Spaces {
         Layout::new(self.joints.len(), self.fingertips.len(), self.actuators.len()).spaces(&self.symmetry)
     }
@@ -143,7 +143,7 @@ fn is_other_side(found: &str, own: &str) -> bool {
         .any(|(here, there)| found.contains(here) && is_named(&found.replace(here, there), own))
 }
 
-/// Returns the poses of the fingertips in a pose of the hand.
+/// The poses of the fingertips in a pose of the hand.
 fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
     let mut sim = Simulation::new(scene);
     for (joint, fraction) in hand.joints.iter().zip(fractions.iter().cycle()) {

@@ -100,17 +100,17 @@ impl Task {
         Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
     }
 
-    /// Returns the settings.
+    /// The settings.
     pub fn config(&self) -> &EnvConfig {
         &self.config
     }
 
-    /// Returns the hand in the scene.
+    /// The hand in the scene.
     pub fn hand(&self) -> &Hand {
         &self.hand
     }
 
-    /// Returns the scene.
+    /// The scene.
     pub fn scene(&self) -> &Scene {
         &self.scene
     }
@@ -157,7 +157,7 @@ impl Task {
         notes
     }
 
-    /// Returns a table of what was found in the scene, and in what order.
+    /// A table of what was found in the scene, and in what order.
     pub fn table(&self) -> String {
         let Parts { joints, actuators, fingertips, object, goal, .. } = &self.hand.parts;
         let listed = |names: &[String]| format!("{}: {}", names.len(), names.join(" "));
@@ -204,28 +204,28 @@ impl Task {
         Ok(Arc::new(Self { mirror, symmetry, warnings, ..Arc::unwrap_or_clone(self) }))
     }
 
-    /// Returns where the policy that it is prepared for does not fit well.
+    /// Where the policy that it is prepared for does not fit well.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Returns the record of its hand and object.
+    /// The record of its hand and object.
     pub fn record(&self) -> Record {
         Record::of(&self.hand, &self.scene, self.symmetry.clone())
     }
 
-    /// Returns what mirrors observations, as a matrix `[O, O]` that is multiplied from the right, if they are mirrored.
+    /// What mirrors observations, as a matrix `[O, O]` that is multiplied from the right, if they are mirrored.
     pub fn mirror(&self) -> Option<Vec<f32>> {
         self.mirror.as_ref().map(|mirror| mirror.matrix(self.hand.layout.size))
     }
 
-    /// Returns where the goal is shown.
+    /// Where the goal is shown.
     pub fn goal_place(&self) -> [f64; 3] {
         let [x, y, z] = self.config.goal_position.value;
         [x, y, z + self.config.target_height]
     }
 
-    /// Returns the description of observations and actions for a learner.
+    /// The description of observations and actions for a learner.
     pub fn spaces(&self) -> Spaces {
         self.hand.layout.spaces(&self.symmetry)
     }

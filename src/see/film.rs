@@ -88,7 +88,7 @@ impl Film {
     }
 }
 
-/// Returns the lines of text for a frame.
+/// The lines of text for a frame.
 fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
     let tolerance = env.config().success_tolerance.to_degrees();
     vec![

@@ -103,7 +103,7 @@ impl Replay {
         *ended = end;
     }
 
-    /// Returns the file.
+    /// The file.
     ///
     /// # Errors
     /// Fails if there are no episodes.

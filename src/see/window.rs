@@ -112,7 +112,7 @@ impl Tally {
         self.goals += episode.goals;
     }
 
-    /// Returns what happened in the episodes before the current one, including episodes that the user ended.
+    /// What happened in the episodes before the current one, including episodes that the user ended.
     fn before(&self) -> String {
         match self.episodes {
             0 => "nothing yet".to_owned(),
@@ -126,7 +126,7 @@ impl Tally {
     }
 }
 
-/// Returns the curves of the error and the reward, without points.
+/// The curves of the error and the reward, without points.
 fn curves(task: &Task) -> [Trend; 2] {
     let level = Some(task.config().success_tolerance.to_degrees());
     [

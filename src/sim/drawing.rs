@@ -235,8 +235,9 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<Dra
 /// The parts of a mesh. They have one corner for each pair of point and normal that a triangle uses, in the order of first
 /// use.
 fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<DrawnMesh> {
-    let [first, points, normals] =
-        [model.mesh_faceadr()[mesh], model.mesh_vertadr()[mesh], model.mesh_normaladr()[mesh]];
+    let first = model.mesh_faceadr()[mesh];
+    let points = model.mesh_vertadr()[mesh];
+    let normals = model.mesh_normaladr()[mesh];
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
     let mut places = BTreeMap::new();
     let mut parts = vec![DrawnMesh::default()];

@@ -14,7 +14,8 @@ pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
 
     let margin = (0.6 * scaled.height()).ceil();
     let longest = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
-    let [across, down] = [longest as f32 * advance + 2.0 * margin, lines.len() as f32 * spacing + margin];
+    let across = longest as f32 * advance + 2.0 * margin;
+    let down = lines.len() as f32 * spacing + margin;
     for row in rgb.chunks_exact_mut(3 * width).take(down as usize) {
         let dark = &mut row[..3 * width.min(across as usize)];
         dark.iter_mut().for_each(|channel| *channel = (u32::from(*channel) * 2 / 5) as u8);

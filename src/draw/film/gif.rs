@@ -26,7 +26,8 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
     let [width, height] = format.size.map(|pixels| pixels as usize);
     let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
     let mut palette = Palette::new(&waiting);
-    let [columns, rows] = [u16::try_from(width)?, u16::try_from(height)?];
+    let columns = u16::try_from(width)?;
+    let rows = u16::try_from(height)?;
     let mut encoder = Encoder::new(BufWriter::new(file), columns, rows, &palette.quantizer.color_map_rgb())?;
     encoder.set_repeat(Repeat::Infinite)?;
     let mut previous = Vec::new();

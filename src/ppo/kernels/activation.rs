@@ -6,7 +6,7 @@
 use super::widest::widest;
 use crate::config::Activation;
 
-/// Returns e^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|). The argument x is clamped to [-87, 88].
+/// E^x - 1 with an error below 3e-7 · max(|e^x - 1|, |x|). The argument x is clamped to [-87, 88].
 ///
 /// With x = n ln 2 + r, |r| ≤ ln 2 / 2: e^x - 1 = 2ⁿ (e^r - 1) + (2ⁿ - 1), which loses no precision near 0. The
 /// polynomial for (e^r - 1 - r) / r² is taken from `expf` in Cephes (S. L. Moshier).

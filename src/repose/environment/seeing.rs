@@ -58,7 +58,8 @@ impl Repose {
     pub fn observe(&self, observation: &mut [f32]) {
         let hand = &self.task.hand;
         let config = &self.task.config;
-        let (qpos, qvel) = (self.sim.qpos(), self.sim.qvel());
+        let qpos = self.sim.qpos();
+        let qvel = self.sim.qvel();
         let mut cells = Writer::new(&hand.layout, observation);
         cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
         cells.put("joint_vel", hand.joints.iter().map(|joint| config.vel_obs_scale * qvel[joint.dof]));
