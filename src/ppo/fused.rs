@@ -15,7 +15,7 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::backend::{GradientBackend, Losses};
-use super::kernels::{Arithmetic, Net, ROWS, Workspace};
+use super::kernels::{Arithmetic, Net, Purpose, ROWS, Workspace};
 use super::loss::{Loss, Sums};
 use super::policy::Policy;
 use super::rollout::{Rollout, RolloutBlock};
@@ -60,7 +60,7 @@ impl Fused {
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
         self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
-            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, true, self.arithmetic)));
+            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, self.arithmetic)));
         }
         self.parts.resize_with(groups, Default::default);
         for (part, range) in self.parts.iter_mut().flat_map(|nets| nets.iter_mut().zip(policy.layout.nets())) {
@@ -117,7 +117,7 @@ impl GradientBackend for Fused {
         let largest = of.groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = self.reserve(policy, of.groups.len(), largest);
         let jobs = Jobs {
-            nets: policy.nets(self.arithmetic, true),
+            nets: policy.nets(self.arithmetic, Purpose::Learning),
             loss: Loss::new(policy, rollout, of.count, &self.config),
             rows,
             seen: &self.seen,

@@ -146,7 +146,7 @@ impl Ppo {
 
     /// A reusable workspace for acting in blocks of up to `rows` environments.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        Workspace::new(&self.policy.layout.actor, rows, false, self.arithmetic)
+        Workspace::new(&self.policy.layout.actor, rows, self.arithmetic)
     }
 
     /// The policy of this iteration, for collecting a rollout.

@@ -6,7 +6,7 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::Normalizer;
-use super::kernels::{Arithmetic, Net, Workspace};
+use super::kernels::{Arithmetic, Net, Purpose, Workspace};
 use super::parameters::{Layer, ParameterLayout};
 use super::perception::{InputTransform, Perception};
 use crate::config::{Activation, NetConfig};
@@ -96,11 +96,11 @@ impl Policy {
         InputTransform::new(self.perception, &self.normalizer)
     }
 
-    /// Actor and critic, prepared for workspaces of this arithmetic, for `learning` or for acting.
-    pub(super) fn nets(&self, arithmetic: Arithmetic, learning: bool) -> [Net<'_>; 2] {
+    /// Actor and critic, prepared for workspaces of this arithmetic.
+    pub(super) fn nets(&self, arithmetic: Arithmetic, purpose: Purpose) -> [Net<'_>; 2] {
         let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
         let mut nets = [&self.layout.actor, &self.layout.critic].map(net);
-        Net::prepare(&mut nets, arithmetic, learning);
+        Net::prepare(&mut nets, arithmetic, purpose);
         nets
     }
 
@@ -111,7 +111,7 @@ impl Policy {
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let [actor, critic] = self.nets(arithmetic, false);
+        let [actor, critic] = self.nets(arithmetic, Purpose::Acting);
         FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
     }
 }
@@ -120,7 +120,7 @@ impl FrozenPolicy<'_> {
     /// A reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
     /// time, in f32.
     pub fn workspace(&self, rows: usize) -> Workspace {
-        Workspace::new(&self.policy.layout.actor, rows, false, Arithmetic::F32)
+        Workspace::new(&self.policy.layout.actor, rows, Arithmetic::F32)
     }
 
     /// The sizes and the structure of observations and actions.

@@ -14,6 +14,15 @@ use crate::config::Activation;
 /// The most elements of a product that gemm takes as a small one.
 const LARGEST_SMALL: usize = 16 * 16;
 
+/// What nets are prepared for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Purpose {
+    /// Many forward passes of few rows: to rearrange the weights for each would take longer than its products.
+    Acting,
+    /// Forward and backward passes of many rows.
+    Learning,
+}
+
 /// One network with the current parameters.
 pub(crate) struct Net<'a> {
     layers: Vec<Dense<'a>>,
@@ -47,14 +56,12 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Creates a workspace for a net with these layers, or with the same hidden layers and fewer outputs. The backward
-    /// pass requires `learning`.
-    pub fn new(layers: &[parameters::Layer], rows: usize, learning: bool, arithmetic: Arithmetic) -> Self {
-        let widest = layers.iter().map(|layer| layer.outputs).max().expect("a net has layers");
+    /// Creates a workspace for a net with these layers, or with the same hidden layers and fewer outputs.
+    pub fn new(layers: &[parameters::Layer], rows: usize, arithmetic: Arithmetic) -> Self {
         Self {
             inputs: vec![0.0; rows * layers[0].inputs],
             outputs: layers.iter().map(|layer| vec![0.0; rows * layer.outputs]).collect(),
-            grads: [0, 1].map(|_| vec![0.0; if learning { rows * widest } else { 0 }]),
+            grads: Default::default(),
             multiplier: Multiplier::new(arithmetic),
             rows,
         }
@@ -66,8 +73,10 @@ impl Workspace {
     }
 
     /// The outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
-    /// respect to them.
+    /// respect to them, which the first call makes.
     pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
+        let widest = self.outputs.iter().map(Vec::len).max().expect("a net has layers");
+        self.grads.iter_mut().for_each(|grad| grad.resize(widest, 0.0));
         let last = self.outputs.last().expect("a net has layers");
         (&last[..rows * outputs], &mut self.grads[0][..rows * outputs])
     }
@@ -87,16 +96,16 @@ impl<'a> Net<'a> {
         Self { layers: layers.iter().map(layer).collect(), activation }
     }
 
-    /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. With `learning`, they are for
-    /// forward and backward passes. Otherwise they are for many forward passes of few rows, where making them would take longer
-    /// than the product. The results are the same, bit for bit.
-    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learning: bool) {
+    /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. The results are the same, bit
+    /// for bit.
+    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, purpose: Purpose) {
         let mut parts = Vec::new();
+        let learns = purpose == Purpose::Learning;
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
-            if !learning {
+            if !learns {
                 layer.weight_t = Some(layer.transposed().into());
             }
-            let read = [Some(layer.weight.transposed()), learning.then_some(layer.weight)];
+            let read = [Some(layer.weight.transposed()), learns.then_some(layer.weight)];
             for (packed, read) in layer.packed.iter_mut().zip(read).filter(|_| arithmetic.packs()) {
                 if let Some(read) = read {
                     parts.extend(packed.insert(Packed::default()).parts_of_right(read));
@@ -217,10 +226,10 @@ mod tests {
             let [plain, packed] = [false, true].map(|packed| {
                 let mut nets = [Net::new(&layout.actor, &parameters, Activation::Elu)];
                 if packed {
-                    Net::prepare(&mut nets, arithmetic, true);
+                    Net::prepare(&mut nets, arithmetic, Purpose::Learning);
                 }
                 let [net] = nets;
-                let mut work = Workspace::new(&layout.actor, rows, true, arithmetic);
+                let mut work = Workspace::new(&layout.actor, rows, arithmetic);
                 work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
                 let outputs = net.forward(rows, &mut work).to_vec();
                 let (_, grad) = work.outputs_and_grad(rows, net.outputs());
@@ -237,14 +246,14 @@ mod tests {
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
         let layout = ParameterLayout::new(&[300, 64], &SPACES);
         let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
-        let mut work = Workspace::new(&layout.actor, 64, false, Arithmetic::F32);
+        let mut work = Workspace::new(&layout.actor, 64, Arithmetic::F32);
         work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
         for layers in [&layout.actor, &layout.critic] {
             let net = || Net::new(layers, &parameters, Activation::Elu);
             for rows in [1, 2, 5, 13, 32, 64] {
                 let expected = net().forward(rows, &mut work).to_vec();
                 let mut nets = [net()];
-                Net::prepare(&mut nets, Arithmetic::F32, false);
+                Net::prepare(&mut nets, Arithmetic::F32, Purpose::Acting);
                 assert_eq!(nets[0].forward(rows, &mut work), expected, "{rows} rows");
             }
         }
