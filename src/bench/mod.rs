@@ -171,7 +171,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     Ok((figures, lines))
 }
 
-/// Measures the env steps per second of whole iterations of a training with these settings, without the first one if there are
+/// Measures the env steps per second of whole iterations of a training run with these settings, without the first one if there are
 /// more.
 fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut agent = Agent::for_task(task, config, Exchange::alone(config.shards()))?;

@@ -1,4 +1,4 @@
-//! Checks that all ranks of a training are alike, and warns if a launcher binds one of them to a single core.
+//! Checks that all ranks of a training run are alike, and warns if a launcher binds one of them to a single core.
 
 use anyhow::{Result, ensure};
 

@@ -1,4 +1,4 @@
-//! What the ranks of a training compute together, and how they exchange it.
+//! What the ranks of a training run compute together, and how they exchange it.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 
 use super::Ranks;
 
-/// The shards of a training, the shards that this rank computes, and the exchange with the other ranks. All ranks make the same
+/// The shards of a training run, the shards that this rank computes, and the exchange with the other ranks. All ranks make the same
 /// calls in the same order. Copies share the count of their traffic.
 #[derive(Clone)]
 pub struct Exchange {
