@@ -5,7 +5,7 @@ use std::fmt::Debug;
 use mujoco_rs::prelude::MjModel;
 
 use super::constants::*;
-use super::symmetry::touches;
+use super::placing::touches;
 
 /// Lists these arrays of a model, or what one geom has in each.
 macro_rules! arrays {

@@ -1,4 +1,4 @@
-//! The places of the parts of a body in its frame.
+//! The places of the parts of a body in its frame, and which of them can touch anything.
 
 use mujoco_rs::prelude::MjModel;
 
@@ -34,4 +34,12 @@ pub(super) fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(u
 pub(super) fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> Placed {
     let [x, y, z] = quat::rotate(axes, position);
     ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))
+}
+
+/// Whether a geom can be in a contact.
+pub(super) fn touches(model: &MjModel, geom: usize) -> bool {
+    let pairs = [model.pair_geom1(), model.pair_geom2()];
+    model.geom_contype()[geom] != 0
+        || model.geom_conaffinity()[geom] != 0
+        || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
 }

@@ -3,7 +3,7 @@
 use mujoco_rs::prelude::{MjModel, MjtGeomBase};
 
 use super::constants::*;
-use super::placing::{Placed, frames_within, geoms_within, inside};
+use super::placing::{Placed, frames_within, geoms_within, inside, touches};
 use super::{Body, Scene};
 use crate::quat::{self, CUBE_ROTATIONS, Quat};
 
@@ -81,14 +81,6 @@ impl Form {
         let onto = |shape: &Shape| self.shapes.iter().any(|other| shape.turned(turn).fills(other));
         !self.moves && self.inertia.is_kept(turn) && self.shapes.iter().all(onto)
     }
-}
-
-/// Whether a geom can be in a contact.
-pub(super) fn touches(model: &MjModel, geom: usize) -> bool {
-    let pairs = [model.pair_geom1(), model.pair_geom2()];
-    model.geom_contype()[geom] != 0
-        || model.geom_conaffinity()[geom] != 0
-        || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
 }
 
 /// The rotation as a matrix: its columns are the rotated axes.
