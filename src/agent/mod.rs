@@ -208,9 +208,10 @@ impl<E: Resumable> Agent<E> {
 /// Fails with the environment's number if an environment panics.
 pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t: usize) -> Result<()> {
     let Spaces { observation_size, action_size, .. } = envs.spaces;
-    let (row, actions, next) =
-        (rollout.step(t, 1), rollout.step(t, action_size), rollout.step(t + 1, observation_size));
-    envs.step(&rollout.actions[actions], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
+    let row = rollout.step(t, 1);
+    let acted = rollout.step(t, action_size);
+    let next = rollout.step(t + 1, observation_size);
+    envs.step(&rollout.actions[acted], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
     rollout.dones[row].iter_mut().zip(&envs.ends).for_each(|(done, end)| *done = end.is_some());
     Ok(())
 }
