@@ -35,7 +35,7 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
         bail!("{}: would replace the input {}; choose another name", path.display(), read.display());
     }
     let Some(whole) = final_path(path) else { return Ok(()) };
-    let (Some(folder), Some(name)) = (whole.parent(), whole.file_name()) else { return Ok(()) };
+    let Some((folder, name)) = whole.parent().zip(whole.file_name()) else { return Ok(()) };
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
     let (run, names) = if inside { (folder.parent(), &INSIDE[..]) } else { (Some(folder), &IN_RUN[..]) };
     let run = RunFolder::at(run.unwrap_or(folder).to_owned());

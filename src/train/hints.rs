@@ -13,12 +13,15 @@ const MUCH: usize = 2 << 30;
 
 /// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
 pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
-    let (mut hints, total) = (Vec::from_iter(of_ramps(config)), config.run.total_steps);
+    let mut hints = Vec::from_iter(of_ramps(config));
+    let total = config.run.total_steps;
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
         hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
     }
-    let (env, usual, weight) = (&config.env, &default.env, config.training.task_reward.to);
+    let env = &config.env;
+    let usual = &default.env;
+    let weight = config.training.task_reward.to;
     for (key, value, usual) in [
         ("env.rot_reward_scale", env.rot_reward_scale, usual.rot_reward_scale),
         ("env.dist_reward_scale", env.dist_reward_scale, usual.dist_reward_scale),
