@@ -148,7 +148,7 @@ pub fn expect_finite_actions(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     Ok(())
 }
 
-/// Checks the value that the policy gives to the start of an episode of this task, which only a training needs. Its square must
+/// Checks the value that the policy gives to the start of an episode of this task, which only a training run needs. Its square must
 /// also be finite, because learning minimises squares.
 ///
 /// # Errors

@@ -40,8 +40,8 @@
 //! | [`run`] | the folder of a run and its logs | os, sim |
 //! | [`draw`] | charts, films, pictures and pages as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip, a server for a page | - |
-//! | [`tags`] | what a training logs: names, meanings, units | repose |
-//! | [`ranks`] | the division of a training into shards, and the ranks (processes) that compute them | os, rng, schedule |
+//! | [`tags`] | what a training run logs: names, meanings, units | repose |
+//! | [`ranks`] | the division of a training run into shards, and the ranks (processes) that compute them | os, rng, schedule |
 //! | [`spaces`] | what a learner needs to know about observations and actions | - |
 //! | [`schedule`] | blocks of work on all threads, over many rounds without a barrier | - |
 //! | [`quat`] | rotations | - |
@@ -68,7 +68,7 @@
 //! Observations are stored raw everywhere: a policy turns the object onto itself and normalises them as it reads them.
 //! `ppo::fused` describes how a minibatch is computed. `ppo::candle` computes the same with candle's tensors.
 //!
-//! A training may be spread over several processes. [`ranks`] describes what they exchange.
+//! A training run may be spread over several processes. [`ranks`] describes what they exchange.
 //!
 //! # Recovery
 //! At the end of each iteration, [`train`] calls [`agent::Agent::checkpoint`]. It copies the state of the learner and of

@@ -51,7 +51,7 @@ impl Condition {
 }
 
 /// A row of the table with its score.
-struct Row {
+struct Scored {
     condition: Condition,
     config: EnvConfig,
     score: Score,
@@ -60,7 +60,7 @@ struct Row {
 }
 
 /// What comes out.
-pub struct Report {
+pub struct TableOutput {
     /// Whether the table is printed as JSON.
     pub json: bool,
     /// The picture of the table.
@@ -79,7 +79,7 @@ pub fn robustness(
     actor: &Actor,
     place: &str,
     episodes: Episodes,
-    report: &Report,
+    report: &TableOutput,
     requests: &Requests,
 ) -> Result<ExitCode> {
     let output = report.picture.as_ref().map(PictureFile::create).transpose()?;
@@ -120,11 +120,11 @@ fn played(
     actor: &Actor,
     episodes: Episodes,
     requests: &Requests,
-) -> Result<Vec<Row>> {
+) -> Result<Vec<Scored>> {
     let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config().clone()).collect();
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
     let bar = os::progress_bar((different * episodes.count) as u64, "episodes", "robustness");
-    let mut rows: Vec<Row> = Vec::new();
+    let mut rows: Vec<Scored> = Vec::new();
     for ((condition, task), config) in playable.into_iter().zip(configs) {
         let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
         bar.set_message(condition.name.clone());
@@ -139,7 +139,7 @@ fn played(
         let nominal = rows.first().map_or(score["goals"], |nominal| nominal.score["goals"]);
         // Without any goals there is no fraction.
         let kept = if nominal > 0.0 { score["goals"] / nominal } else { f64::NAN };
-        rows.push(Row { condition, config, score, kept });
+        rows.push(Scored { condition, config, score, kept });
     }
     Ok(rows)
 }
@@ -168,14 +168,14 @@ fn conditions() -> Vec<Condition> {
 }
 
 /// The mean fraction of goals over the single changes, each counted as at most 1.
-fn mean_kept(rows: &[Row]) -> f64 {
+fn mean_kept(rows: &[Scored]) -> f64 {
     let single = rows.iter().skip(1).filter(|row| !row.condition.is_in_grid());
     let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();
     kept.iter().sum::<f64>() / kept.len() as f64
 }
 
-fn as_json(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> Value {
-    let of_row = |row: &Row| {
+fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {
+    let of_row = |row: &Scored| {
         let value = |set: &Override| {
             let table: toml::Table = format!("value = {}", set.value).parse().expect("the values are TOML");
             (set.key.clone(), json!(table["value"]))
@@ -195,10 +195,10 @@ fn as_json(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> Value 
     })
 }
 
-fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
+fn table(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> String {
     let mut text = format!("checkpoint {checkpoint}\n{episodes} episodes a row, seed {seed}\n\n");
     text += &format!("{:<30} {:>5}  {:<15} {:>7} {:>6}\n", "", "goals", "95 % interval", "drops", "kept");
-    for Row { condition, score, kept, .. } in rows {
+    for Scored { condition, score, kept, .. } in rows {
         let [low, high] = score.goals_ci95.map(|goals| number(goals, 2));
         let drops = format!("{} %", measure("drop_rate").text(score["drop_rate"]));
         let goals = number(score["goals"], 2);
@@ -208,7 +208,7 @@ fn table(rows: &[Row], episodes: usize, seed: u64, checkpoint: &str) -> String {
     text + &format!("\nmean kept over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
 }
 
-fn picture(rows: &[Row], episodes: usize, checkpoint: &str) -> BarChart {
+fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
     let bars = rows.iter().filter(|row| !row.condition.is_in_grid()).map(|row| {
         let nominal = rows[0].score["goals"];
         let note = format!("{:.2} goals, {:.0} % drops", row.score["goals"], 100.0 * row.score["drop_rate"]);
@@ -232,10 +232,10 @@ mod tests {
     use crate::config::{Config, Settings};
     use crate::repose::EpisodeStats;
 
-    fn row(condition: Condition, goals: u32, kept: f64) -> Row {
+    fn row(condition: Condition, goals: u32, kept: f64) -> Scored {
         let config = Settings::new().sets(&condition.sets).resolve().unwrap().env;
         let episode = EpisodeStats { length: 10, goals, ..Default::default() };
-        Row { condition, config, score: Score::of(&[episode, episode], 0.01), kept }
+        Scored { condition, config, score: Score::of(&[episode, episode], 0.01), kept }
     }
 
     #[test]
@@ -257,10 +257,11 @@ mod tests {
     fn what_is_kept_is_averaged_over_the_single_changes_and_never_more_than_all() {
         let conditions = conditions();
         let kept = [1.0, 0.5, 1.2];
-        let mut rows: Vec<Row> = conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
+        let mut rows: Vec<Scored> =
+            conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
         rows.push(row(conditions[24].clone(), 2, 0.1));
         assert_eq!(mean_kept(&rows), 0.75);
-        let of_nothing: Vec<Row> = conditions[..3].iter().map(|of| row(of.clone(), 0, f64::NAN)).collect();
+        let of_nothing: Vec<Scored> = conditions[..3].iter().map(|of| row(of.clone(), 0, f64::NAN)).collect();
         assert!(mean_kept(&of_nothing).is_nan() && as_json(&of_nothing, 2, 3, "x")["mean_kept"].is_null());
         let value = as_json(&rows, 2, 3, "x");
         assert_eq!(value["rows"][1]["set"], json!({ "env.friction_scale": 0.5 }));

@@ -1,4 +1,4 @@
-//! The quantities that a training logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
+//! The quantities that a training run logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
 use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, TaskReward, TrainingReward};
@@ -51,7 +51,7 @@ const OTHERS: [(&str, &str, &str); 21] = [
     ("settings", "settings", "Every setting of the run, as in its config.toml."),
 ];
 
-/// The quantity with this name, if a training logs it.
+/// The quantity with this name, if a training run logs it.
 pub fn tag(name: &str) -> Option<Tag> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {

@@ -37,7 +37,7 @@ pub struct Agent<E: Env> {
     pub iteration: u64,
     /// The number of control steps so far, over all environments.
     pub env_steps: u64,
-    /// The point at which it was forked from another training, if it was.
+    /// The point at which it was forked from another training run, if it was.
     pub fork: Option<Fork>,
     /// The exchange with other ranks, which assigns environments and samples, and adds up results.
     pub exchange: Exchange,

@@ -148,7 +148,7 @@ pub fn parse_from<T: Into<OsString> + Clone>(words: impl IntoIterator<Item = T>)
 
 /// The options that change settings.
 #[derive(Args, Debug, Default)]
-pub struct Settings {
+pub struct SettingArgs {
     /// TOML file with the settings that differ from the defaults
     #[arg(long, value_name = "FILE", help_heading = SETTINGS)]
     pub config: Option<PathBuf>,
@@ -162,7 +162,7 @@ pub struct Settings {
 pub struct TrainArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
-    pub settings: Settings,
+    pub settings: SettingArgs,
     /// Random seed of the run [default: {seed}]
     #[arg(long, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
     pub seed: Option<u64>,
@@ -178,7 +178,7 @@ pub struct TrainArgs {
     /// Path of the run folder, instead of runs/shadow-hand-repose/DATE-TIME[-NAME]
     #[arg(long, value_name = "DIR", conflicts_with = "name", help_heading = RUN_FOLDER)]
     pub run_dir: Option<PathBuf>,
-    /// Continue the training in this run folder or from this checkpoint, with its settings [default: the newest run]
+    /// Continue the training run in this run folder or from this checkpoint, with its settings [default: the newest run]
     #[arg(long, value_name = "RUN", num_args = 0..=1, conflicts_with_all = ["config", "seed", "name", "run_dir"], help_heading = START)]
     pub resume: Option<Option<PathBuf>>,
     /// Start a new run from an existing policy (fine-tuning): a checkpoint, a run folder, or the built-in `builtin` or `robust`.
@@ -264,7 +264,7 @@ pub struct PlayArgs {
     pub quality: Option<Quality>,
     /// Camera and meshes.
     #[command(flatten)]
-    pub shot: Shot,
+    pub shot: ShotArgs,
     /// The options that were given, for [`expect_together`].
     #[arg(skip)]
     pub given: Vec<String>,
@@ -290,7 +290,7 @@ pub struct ExportArgs {
 pub struct ViewArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
-    pub settings: Settings,
+    pub settings: SettingArgs,
     /// Motion of the hand: zero (still), random, or wave (a slow swing of each actuator)
     #[arg(long, default_value = "zero", value_parser = PossibleValuesParser::new(Actor::WITHOUT_POLICY.map(|(name, _)| name)),
         help_heading = SETTINGS)]
@@ -316,7 +316,7 @@ pub struct ViewArgs {
     pub quality: Quality,
     /// Camera and meshes.
     #[command(flatten)]
-    pub shot: Shot,
+    pub shot: ShotArgs,
     /// The options that were given, for [`expect_together`].
     #[arg(skip)]
     pub given: Vec<String>,
@@ -324,7 +324,7 @@ pub struct ViewArgs {
 
 /// The options for what is seen.
 #[derive(Args, Clone, Debug)]
-pub struct Shot {
+pub struct ShotArgs {
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
     pub camera: Option<Camera>,
@@ -333,7 +333,7 @@ pub struct Shot {
     pub plain: bool,
 }
 
-impl Shot {
+impl ShotArgs {
     /// What to show, with this size and quality.
     pub fn sized(&self, size: [u32; 2], quality: Quality) -> see::Shot {
         see::Shot { size, camera: self.camera, quality, plain: self.plain }
@@ -359,7 +359,7 @@ pub fn usage_error(name: &str, text: &str) -> clap::Error {
 pub struct BenchArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
-    pub settings: Settings,
+    pub settings: SettingArgs,
     /// Number of worker threads; 0: one per core [default: {threads}]
     #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
     pub threads: Option<usize>,

@@ -21,7 +21,7 @@ impl Config {
         differing.into_iter().map(|(key, [own, other])| format!("{key} = {other}, not {own}")).collect()
     }
 
-    /// The settings that make `other` another training: all but the total number of steps and the number of threads.
+    /// The settings that make `other` another training run: all but the total number of steps and the number of threads.
     pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
         differing([self, other].map(Self::settled))
     }

@@ -1,4 +1,4 @@
-//! Settings that change in the course of a training.
+//! Settings that change in the course of a training run.
 
 use std::fmt;
 

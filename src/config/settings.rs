@@ -22,7 +22,7 @@ pub struct Config {
     pub hand: Parts,
     /// Changes to the task and additions to its reward that only training uses.
     pub training: TrainingConfig,
-    /// Random physics, noise and delays of a share of the episodes of a training.
+    /// Random physics, noise and delays of a share of the episodes of a training run.
     pub randomization: RandomizationConfig,
     /// The learner.
     pub ppo: PpoConfig,
@@ -125,7 +125,7 @@ pub struct TrainingConfig {
     pub goal_lifetime: u64,
 }
 
-/// Random physics, noise and delays of a share of the episodes of a training. Intervals are [low, high].
+/// Random physics, noise and delays of a share of the episodes of a training run. Intervals are [low, high].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RandomizationConfig {
     pub share: Ramp,
@@ -294,7 +294,7 @@ impl PpoConfig {
 }
 
 impl RandomizationConfig {
-    /// Whether a training has randomised episodes, at its beginning or later.
+    /// Whether a training run has randomised episodes, at its beginning or later.
     pub fn happens(&self) -> bool {
         self.share.from > 0.0 || self.share.to > 0.0
     }

@@ -3,7 +3,7 @@
 //! On a file system without locks, the time of the lock file replaces the lock: it is renewed as long as the training runs.
 //!
 //! The file contains the name of its holder. A training run that ends normally removes that name. So a name in a file that nobody
-//! holds means that the training has failed or was killed.
+//! holds means that the training run has failed or was killed.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Read;
@@ -94,7 +94,7 @@ impl Locked {
         Ok(self)
     }
 
-    /// Releases the lock and removes the name of this program, after a training that ended normally.
+    /// Releases the lock and removes the name of this program, after a training run that ended normally.
     pub fn release(self) {
         // The file may belong to another program by now.
         if holder(&self.path) == name() {
@@ -161,7 +161,7 @@ impl Drop for Renewal {
 /// What the lock file of a run folder shows to a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hold {
-    /// A training holds it.
+    /// A training run holds it.
     Held,
     /// Nobody holds it, and it contains no name or does not exist.
     Released,

@@ -6,7 +6,7 @@ use clap::Error;
 
 use crate::cli::{Made, PlayArgs, expect_together, usage_error};
 use crate::os::Destination;
-use crate::robustness::Report;
+use crate::robustness::TableOutput;
 use crate::see::Shot;
 use crate::sim::Quality;
 
@@ -19,7 +19,7 @@ pub(super) enum Plan {
     /// Play for a score.
     Score(Outputs),
     /// Play for scores under changes.
-    Robustness(Report),
+    Robustness(TableOutput),
     /// Write the page of the trace in this file.
     Replay(PathBuf, Destination, Shot),
 }
@@ -55,7 +55,7 @@ impl Plan {
         let outputs = Outputs::of(args)?;
         Ok(match (&args.from_trace, &outputs.page, args.web) {
             (Some(trace), Some(page), _) => Self::Replay(trace.clone(), page.clone(), outputs.shot),
-            _ if args.robustness => Self::Robustness(Report { picture, json: args.json }),
+            _ if args.robustness => Self::Robustness(TableOutput { picture, json: args.json }),
             (_, _, Some(port)) => Self::Web(port, outputs.shot),
             _ if !args.wants_result() && (args.window || opens_windows) => {
                 Self::Window(shot(args, [1280, 720], Quality::High))
@@ -133,7 +133,7 @@ mod tests {
         assert!(matches!(way("--window"), Plan::Window(_)));
         assert!(matches!(way("--web --hands 3"), Plan::Web(7070, _)));
         let report = way("--robustness --out x.svg --json");
-        assert!(matches!(report, Plan::Robustness(Report { picture: Some(_), json: true })));
+        assert!(matches!(report, Plan::Robustness(TableOutput { picture: Some(_), json: true })));
         assert!(matches!(way("--from-trace t --out x.html"), Plan::Replay(..)));
         let all = way("--out a.gif --out b.html --out jsonl:c --json --fps 20 --size 64x32");
         let Plan::Score(outputs) = all else { panic!("a score") };

@@ -160,7 +160,7 @@ impl Ppo {
         let grad_norm = norm(&squares, &nets);
         let losses = self.losses(&sums, minibatch.count);
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
-            ensure!(value.is_finite(), "{what} is {value}: the training has failed and stops here");
+            ensure!(value.is_finite(), "{what} is {value}: the training run has failed and stops here");
         }
         if let Stage::Later = stage {
             let range = self.config.learning_rate_range;
@@ -188,7 +188,7 @@ impl Ppo {
     fn check_weights(&self) -> Result<()> {
         for View { name, range, .. } in self.policy.layout.views() {
             let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
-            ensure!(finite, "the update made `{name}` infinite or NaN: the training has failed and stops here");
+            ensure!(finite, "the update made `{name}` infinite or NaN: the training run has failed and stops here");
         }
         Ok(())
     }

@@ -43,7 +43,7 @@ impl Exchange {
         ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
         ensure!(
             ranks <= shards,
-            "{ranks} ranks, but the training has only {shards} shards (run.shards), and each rank needs at least one"
+            "{ranks} ranks, but the training run has only {shards} shards (run.shards), and each rank needs at least one"
         );
         assert!(shards.is_power_of_two(), "{shards} shards");
         Ok(Self { shards, ..self })

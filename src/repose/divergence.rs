@@ -20,7 +20,7 @@ pub struct Diverged {
 
 impl Diverged {
     /// One object. `state` is MuJoCo's `mj_getState` for `mjSTATE_INTEGRATION` before the first step. `ctrl` holds the
-    /// controls of each step in the model's order, and `actions` the policy's actions. In a training with randomised episodes,
+    /// controls of each step in the model's order, and `actions` the policy's actions. In a training run with randomised episodes,
     /// `randomization` is what this one has drawn on top of the settings (null if nothing). `pushes` is then the force on the object
     /// in each step. In an episode with assistance, `torques` is the torque on the object in each step.
     pub fn as_json(&self, config: &EnvConfig, iteration: u64, env: usize) -> String {

@@ -1,4 +1,4 @@
-//! The randomised episodes of a training: what each draws, and the models that it needs.
+//! The randomised episodes of a training run: what each draws, and the models that it needs.
 //!
 //! What a randomised episode draws depends only on the seed and the number of the episode. A resumed run therefore draws the same
 //! again, and all that is saved is whether the episode is randomised.
@@ -15,7 +15,7 @@ use crate::config::RandomizationConfig;
 use crate::rng::{self, Rng};
 use crate::sim::{Scene, Simulation, Variants, origin};
 
-/// The random physics, noise and delays of a training.
+/// The random physics, noise and delays of a training run.
 pub struct Randomization {
     config: RandomizationConfig,
     /// The scene of the episodes that are not randomised. It has the physics of the task.
@@ -48,7 +48,7 @@ impl EpisodePhysics {
 }
 
 impl Randomization {
-    /// Prepares the randomised episodes of a training, or `None` if it has none.
+    /// Prepares the randomised episodes of a training run, or `None` if it has none.
     ///
     /// # Errors
     /// Fails if the scene cannot be varied in this way, or if a setting names an unknown group of the observation.

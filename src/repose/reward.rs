@@ -194,7 +194,7 @@ pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> Training
     Terms::new(values)
 }
 
-/// The weights of the training's terms after `env_steps` control steps of the whole run.
+/// The weights of the terms that training adds, after `env_steps` control steps of the whole run.
 pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
     Terms::new(TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
@@ -202,7 +202,7 @@ pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> Tra
     }))
 }
 
-/// The weights that change in the course of a training, with their descriptions.
+/// The weights that change in the course of a training run, with their descriptions.
 pub(super) fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
     TRAINING.iter().zip(weights.values()).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
         Weight::Constant(_) => None,

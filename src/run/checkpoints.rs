@@ -119,7 +119,7 @@ impl Checkpoints {
     }
 }
 
-/// Checks that a folder that is about to be written into is no link: a run folder may have been changed since the training began.
+/// Checks that a folder that is about to be written into is no link: a run folder may have been changed since the training run began.
 ///
 /// # Errors
 /// Fails if it is.

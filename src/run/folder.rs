@@ -19,9 +19,9 @@ pub(super) const CONFIG: &str = "config.toml";
 pub(super) const VERSION: &str = "version.txt";
 pub(super) const POLICY: &str = "policy.safetensors";
 pub(super) const DIVERGED: &str = "diverged";
-/// A file with this name asks the training to stop.
+/// A file with this name asks the training run to stop.
 const STOP: &str = "stop";
-/// A file with this name says that the training is not to be continued.
+/// A file with this name says that the training run is not to be continued.
 pub(super) const FINISHED: &str = "finished";
 /// The prefixes of the names of a run's files.
 const OURS: [&str; 11] = [

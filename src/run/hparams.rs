@@ -52,7 +52,7 @@ pub(super) fn begin(folder: &Path, step: u64, hparams: &Hparams) -> Result<Event
     Ok(events)
 }
 
-/// The end of the row: whether the training has made all its steps, or failed.
+/// The end of the row: whether the training run has made all its steps, or failed.
 pub(super) fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
     let status = if succeeded { 1 } else { 2 };
     let info = message(|out| {

@@ -1,6 +1,6 @@
 //! The output of a training run: event file, `metrics.csv`, and a progress line.
 //!
-//! A log that cannot be written causes a warning and never ends the training. Lost iterations are counted, and the log is
+//! A log that cannot be written causes a warning and never ends the training run. Lost iterations are counted, and the log is
 //! opened again at the next checkpoint.
 
 use std::fs;

@@ -11,7 +11,7 @@ use crate::tags::tag;
 pub(super) struct Ended {
     /// The score of the episodes of the task as it is.
     pub nominal: Score,
-    /// The score of the randomised episodes, if the training has such.
+    /// The score of the randomised episodes, if the training run has such.
     pub randomized: Option<Score>,
 }
 

@@ -36,7 +36,7 @@ pub(super) struct Held {
     keep: usize,
     /// The settings of the run, as at its beginning (TOML).
     settings: String,
-    /// The options with which this training is resumed.
+    /// The options with which this training run is resumed.
     options: String,
     /// The state at the end of the last complete iteration.
     last: Arc<Checkpoint>,
@@ -81,7 +81,7 @@ impl Saver {
         self.save_before_fatal_errors();
     }
 
-    /// Writes into the folder for the first time, unless that is done. The order is the checkpoint that the training starts
+    /// Writes into the folder for the first time, unless that is done. The order is the checkpoint that the training run starts
     /// from (as the newest), the logs (cut off after it), and the settings. So a run that is killed in between can be
     /// resumed.
     ///
@@ -119,7 +119,7 @@ impl Saver {
         self.lock.take().into_iter().for_each(Locked::release);
     }
 
-    /// Clears the folder of a run that could not begin, unless it belongs to another training by now.
+    /// Clears the folder of a run that could not begin, unless it belongs to another training run by now.
     pub(super) fn give_back(&self) {
         if self.lock.as_ref().is_some_and(Locked::holds) {
             self.held.folder.clear();
@@ -141,7 +141,7 @@ impl Saver {
     /// Fails if the folder cannot be written to.
     pub(super) fn save(&mut self, report: &mut Report) -> Result<()> {
         if !self.lock.as_ref().is_some_and(Locked::holds) {
-            // The folder was deleted: create it again, unless another training has done so.
+            // The folder was deleted: create it again, unless another training run has done so.
             self.lock = Some(self.held.folder.claim(self.held.folder.lock()?)?);
         }
         report.sync();
@@ -196,7 +196,7 @@ impl Saver {
 }
 
 impl Held {
-    /// The progress of the training as text.
+    /// The progress of the training run as text.
     pub(super) fn steps_made(&self) -> String {
         format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
     }

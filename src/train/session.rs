@@ -57,7 +57,7 @@ impl Session {
         Ok((session, saver))
     }
 
-    /// Sets up the training that the first rank has planned.
+    /// Sets up the training run that the first rank has planned.
     ///
     /// # Errors
     /// Fails as [`Plan::receive`] and [`Session::new`] do.

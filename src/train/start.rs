@@ -264,7 +264,7 @@ fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig)
     let [found, expected] = [stored, settings].map(|settings| (settings.activation, settings.symmetry));
     ensure!(
         found == expected,
-        "its activation and symmetry are {found:?}, but those of this training are {expected:?}"
+        "its activation and symmetry are {found:?}, but those of this training run are {expected:?}"
     );
     Ok(())
 }

@@ -189,7 +189,7 @@ fn a_training_that_fails_names_the_iteration_and_leaves_the_last_checkpoint_inta
     let settings = ["ppo.learning_rate=1e30", "ppo.desired_kl=0", "run.checkpoint_every=1"];
     let mut args = train(&["--run-dir", "run"]);
     settings.iter().for_each(|setting| args.extend(["--set", setting]));
-    refused(folder.path(), &args, 1, &["iteration 1", "the training has failed"]);
+    refused(folder.path(), &args, 1, &["iteration 1", "the training run has failed"]);
     succeeded(program(folder.path(), &["play", "--ckpt", "run", "--episodes", "1"]));
 }
 

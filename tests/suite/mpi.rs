@@ -132,7 +132,7 @@ fn an_error_of_one_rank_names_it_and_ends_all() {
     let refused = mpi.run(folder.path(), 4, &training(&["--set", "run.shards=2"]));
     let said = stderr(&refused);
     assert!(
-        !refused.status.success() && said.matches("4 ranks, but the training has only 2 shards").count() == 1,
+        !refused.status.success() && said.matches("4 ranks, but the training run has only 2 shards").count() == 1,
         "{said}"
     );
     assert!(!folder.path().join("run").exists(), "a start that is refused leaves nothing");
