@@ -312,7 +312,8 @@ pub struct ViewArgs {
     #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size, help_heading = PICTURE)]
     pub size: [u32; 2],
     /// Rendering quality; high adds shadows, reflections and smooth edges
-    #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high", help_heading = PICTURE)]
+    #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high",
+        help_heading = PICTURE)]
     pub quality: Quality,
     /// Camera and meshes.
     #[command(flatten)]

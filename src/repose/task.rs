@@ -178,8 +178,8 @@ impl Task {
         .concat()
     }
 
-    /// Prepares the task for a policy with this record. Its [`Self::warnings`] say where the policy does not fit well. A policy for the hand
-    /// on the other side observes in the mirror.
+    /// Prepares the task for a policy with this record. Its [`Self::warnings`] say where the policy does not fit well. A policy for the
+    /// hand on the other side observes in the mirror.
     ///
     /// # Errors
     /// Fails if the policy is for another hand.
