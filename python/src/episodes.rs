@@ -1,6 +1,6 @@
 //! Episodes that ended, as columns with a row for each environment.
 
-use numpy::IntoPyArray;
+use numpy::{Element, IntoPyArray, PyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shadow_repose::repose::EpisodeStats;
@@ -13,21 +13,9 @@ pub(crate) fn columns<'py>(
     returns: &mut [f64],
 ) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
-    let floats = |of: &dyn Fn(usize, &EpisodeStats) -> f64| {
-        let mut column = vec![0.0; count];
-        episodes.iter().for_each(|(hand, episode)| column[*hand] = of(*hand, episode));
-        column.into_pyarray(py)
-    };
-    let counts = |of: fn(&EpisodeStats) -> u32| {
-        let mut column = vec![0_i64; count];
-        episodes.iter().for_each(|(hand, episode)| column[*hand] = of(episode).into());
-        column.into_pyarray(py)
-    };
-    let flags = |of: fn(&EpisodeStats) -> bool| {
-        let mut column = vec![false; count];
-        episodes.iter().for_each(|(hand, episode)| column[*hand] = of(episode));
-        column.into_pyarray(py)
-    };
+    let floats = |of: &dyn Fn(usize, &EpisodeStats) -> f64| column(py, count, episodes, of);
+    let counts = |of: fn(&EpisodeStats) -> u32| column(py, count, episodes, &|_, episode| i64::from(of(episode)));
+    let flags = |of: fn(&EpisodeStats) -> bool| column(py, count, episodes, &|_, episode| of(episode));
     columns.set_item("r", floats(&|hand, _| returns[hand]))?;
     columns.set_item("l", counts(|episode| episode.length))?;
     columns.set_item("goals", counts(|episode| episode.goals))?;
@@ -42,4 +30,18 @@ pub(crate) fn columns<'py>(
     columns.set_item("reward", terms)?;
     episodes.iter().for_each(|(hand, _)| returns[*hand] = 0.0);
     Ok(columns)
+}
+
+/// A value for each environment, zero where no episode has ended.
+fn column<'py, T: Element + Default + Clone>(
+    py: Python<'py>,
+    count: usize,
+    episodes: &[(usize, EpisodeStats)],
+    of: &dyn Fn(usize, &EpisodeStats) -> T,
+) -> Bound<'py, PyArray1<T>> {
+    let mut column = vec![T::default(); count];
+    for (hand, episode) in episodes {
+        column[*hand] = of(*hand, episode);
+    }
+    column.into_pyarray(py)
 }

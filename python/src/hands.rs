@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use shadow_repose::config::Config;
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{Lesson, Randomization, Repose, Task, TaskReward, TrainingReward};
+use shadow_repose::repose::{EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward};
 
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
@@ -119,7 +119,8 @@ impl Hands {
 
     /// The last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
     fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
-        let (size, blocks) = (self.observation_size(), &state.pool.blocks);
+        let size = self.observation_size();
+        let blocks = &state.pool.blocks;
         let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
         if self.autoreset != Autoreset::SameStep || !blocks.iter().flat_map(|block| &block.ends).any(is_cut) {
             return Ok(None);
@@ -130,6 +131,26 @@ impl Hands {
             to.copy_from_slice(row);
         }
         self.rows(py, finals).map(Some)
+    }
+
+    /// Steps all environments. The result is the episodes that ended.
+    fn advance(
+        &self,
+        py: Python,
+        state: &mut State,
+        actions: &[f32],
+        rewards: &mut [f32],
+    ) -> PyResult<Vec<(usize, EpisodeStats)>> {
+        let State { pool, workers, observations, .. } = &mut *state;
+        let workers = workers.pool()?;
+        let stepped =
+            py.detach(|| guarded(|| workers.install(|| pool.step(actions, self.autoreset, rewards, observations))));
+        let stepped =
+            stepped.and_then(|stepped| stepped.map_err(|error| PyRuntimeError::new_err(format!("{error:#}"))));
+        if stepped.is_err() {
+            state.can_step = Err(FAILED);
+        }
+        stepped
     }
 
     /// The terms of the last step, and zeros where a new episode took the place of the step.
@@ -170,6 +191,18 @@ impl State {
     fn waiting(&self) -> Vec<bool> {
         let ends = self.pool.blocks.iter().flat_map(|block| &block.ends);
         ends.map(|end| matches!(end, Some(End::Terminated | End::Truncated))).collect()
+    }
+
+    /// Restores the environments and their ends, and has them observe `size` values each.
+    fn restore(&mut self, saved: &EnvState, ends: Vec<Option<End>>, size: usize) -> anyhow::Result<()> {
+        let mut rest = &mut self.observations[..];
+        let sizes = self.pool.block_sizes().into_iter();
+        let rows = sizes.map(|block| rest.split_off_mut(..block * size).expect("rows of each block")).collect();
+        self.pool.restore(saved, rows)?;
+        let all = self.pool.blocks.iter_mut().flat_map(|block| &mut block.ends);
+        all.zip(ends).for_each(|(own, end)| *own = end);
+        self.can_step = Ok(());
+        Ok(())
     }
 
     fn started(&mut self, marked: &[bool]) {
@@ -286,7 +319,8 @@ impl Hands {
     #[setter]
     fn set_env_steps(&self, env_steps: u64) -> PyResult<()> {
         if let Some(state) = self.locked()?.as_mut() {
-            (state.env_steps, state.lesson_from) = (env_steps, None);
+            state.env_steps = env_steps;
+            state.lesson_from = None;
         }
         Ok(())
     }
@@ -331,7 +365,8 @@ impl Hands {
 
     /// Steps all environments once.
     fn step<'py>(&self, py: Python<'py>, actions: PyReadonlyArray2<'py, f32>) -> PyResult<Stepped<'py>> {
-        let (n, size) = (self.count, self.action_size());
+        let n = self.count;
+        let size = self.action_size();
         if actions.shape() != [n, size] {
             return Err(PyValueError::new_err(format!("actions must have the shape ({n}, {size})")));
         }
@@ -351,25 +386,14 @@ impl Hands {
         let restarted = if self.autoreset == Autoreset::NextStep { waiting } else { vec![false; n] };
         self.begin_lesson(state);
         let mut rewards = vec![0.0; n];
-        let State { pool, workers, observations, .. } = &mut *state;
-        let workers = workers.pool()?;
-        let stepped = py
-            .detach(|| guarded(|| workers.install(|| pool.step(&actions, self.autoreset, &mut rewards, observations))));
-        let stepped =
-            stepped.and_then(|stepped| stepped.map_err(|error| PyRuntimeError::new_err(format!("{error:#}"))));
-        let episodes = match stepped {
-            Ok(episodes) => episodes,
-            Err(error) => {
-                state.can_step = Err(FAILED);
-                return Err(error);
-            }
-        };
+        let episodes = self.advance(py, state, &actions, &mut rewards)?;
         let stepped = restarted.iter().filter(|restarted| !**restarted).count() as u64;
         state.env_steps = state.env_steps.saturating_add(stepped);
         state.returns.iter_mut().zip(&rewards).for_each(|(sum, reward)| *sum += f64::from(*reward));
         let ended = if episodes.is_empty() { None } else { Some(columns(py, n, &episodes, &mut state.returns)?) };
         let observations = self.rows(py, state.observations.clone())?;
-        let (ends, finals) = (state.ends().into_pyarray(py), self.finals(py, state)?);
+        let ends = state.ends().into_pyarray(py);
+        let finals = self.finals(py, state)?;
         let terms = self.terms.then(|| self.step_terms(py, state, &restarted)).transpose()?;
         Ok((observations, rewards.into_pyarray(py), ends, ended, finals, terms))
     }
@@ -393,7 +417,8 @@ impl Hands {
         let EnvState { numbers, counters } = guarded(|| state.pool.save())?;
         // Where a new episode begins at once, the future does not depend on an end.
         let ends = if self.autoreset == Autoreset::SameStep { vec![0; self.count] } else { state.ends() };
-        let (wide, long) = (numbers.len() / self.count, counters.len() / self.count);
+        let wide = numbers.len() / self.count;
+        let long = counters.len() / self.count;
         Ok((
             numbers.into_pyarray(py).reshape([self.count, wide])?,
             counters.into_pyarray(py).reshape([self.count, long])?,
@@ -419,7 +444,8 @@ impl Hands {
             ends.as_array().iter().map(|end| ENDS.get(usize::from(*end)).copied()).collect();
         let returns: Vec<f64> = returns.as_array().iter().copied().collect();
         let times: Vec<u64> = times.as_array().iter().copied().collect();
-        let (rows, n) = ([numbers.shape()[0], counters.shape()[0], returns.len()], self.count);
+        let rows = [numbers.shape()[0], counters.shape()[0], returns.len()];
+        let n = self.count;
         let saved = EnvState {
             numbers: numbers.as_array().iter().copied().collect(),
             counters: counters.as_array().iter().copied().collect(),
@@ -434,18 +460,11 @@ impl Hands {
             state.can_step = Err(NOT_SET);
             state.pool.set_lesson(self.lesson(lesson_from));
             state.pool.reseed(seed);
-            (state.seed, state.env_steps, state.returns) = (seed, env_steps, returns);
+            state.seed = seed;
+            state.env_steps = env_steps;
             state.lesson_from = Some(lesson_from);
-            let size = self.observation_size();
-            let mut rest = &mut state.observations[..];
-            let sizes = state.pool.block_sizes().into_iter();
-            let rows = sizes.map(|block| rest.split_off_mut(..block * size).expect("rows of each block")).collect();
-            state.pool.restore(&saved, rows)?;
-            let mut ends = ends.into_iter();
-            let all = state.pool.blocks.iter_mut().flat_map(|block| &mut block.ends);
-            all.zip(&mut ends).for_each(|(own, end)| *own = end);
-            state.can_step = Ok(());
-            Ok(())
+            state.returns = returns;
+            state.restore(&saved, ends, self.observation_size())
         };
         guarded(restore)?.context("not a state of such hands").map_err(refused)?;
         self.rows(py, state.observations.clone())

@@ -1,6 +1,6 @@
 //! Trained policies, and their scores.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -79,7 +79,8 @@ impl Policy {
         }
         let seen: Vec<f32> = observations.as_array().iter().copied().collect();
         // Another call may be using the threads. In a fork made meanwhile, they stay in use for ever.
-        let (mut shared, mut own) = (WORKERS.try_lock(), Workers::new(1));
+        let mut shared = WORKERS.try_lock();
+        let mut own = Workers::new(1);
         let computed = if rows <= GROUP {
             py.detach(|| guarded(|| compute(&self.fixed, &seen)))?
         } else {
@@ -176,7 +177,8 @@ fn ask(
     (observations, actions): (&[f32], &mut [f32]),
     stop: &AtomicBool,
 ) -> PyResult<()> {
-    let (rows, size) = (actions.len() / spaces.action_size, spaces.action_size);
+    let size = spaces.action_size;
+    let rows = actions.len() / size;
     let asked = Python::attach(|py| {
         let seen = observations.to_vec().into_pyarray(py).reshape([rows, spaces.observation_size])?;
         let chosen: PyReadonlyArrayDyn<f32> = act.call1(py, (seen,))?.extract(py)?;
@@ -230,20 +232,35 @@ pub(crate) fn evaluate(
         if let Some(path) = &trace {
             run::expect_output(path, loaded.and_then(|loaded| loaded.origin.file()), task.config().model_file())?;
         }
-        let output = trace.as_deref().map(OutputFile::create).transpose()?;
-        let mut output = output.map(|file| (file, Trace::new(&task, actor.name(), checkpoint.as_deref(), seed)));
-        let mut goal_times = GoalTimes::new(task.config());
         let trial = Trial { task: &task, actor: &actor, episodes: Episodes::scored(seed, episodes), stop };
-        let played = trial.play(&mut |moment| {
-            goal_times.observe(&moment);
-            output.iter_mut().for_each(|(_, trace)| trace.record(&moment));
-            Ok(())
-        })?;
-        let failed = raised.lock().expect("no panic while it is held").is_some();
-        let Some(played) = played.filter(|_| !failed) else { return anyhow::Ok(String::new()) };
-        output.map_or(Ok(()), |(file, trace)| file.finish(trace.finish().as_bytes()))?;
-        let score = Score::of(&played, task.config().ctrl_dt);
-        Ok(json_score(&score, &goal_times, checkpoint.as_deref(), seed).to_string())
+        let failed = || raised.lock().expect("no panic while it is held").is_some();
+        played(&trial, seed, checkpoint.as_deref(), trace.as_deref(), &failed)
     })?;
     raised.into_inner().ok().flatten().map_or_else(|| played.map_err(refused), Err)
+}
+
+/// Plays the episodes, and writes the first ones to the file `trace`. The result is their score as JSON, or nothing if they were
+/// stopped or have `failed`.
+fn played(
+    trial: &Trial,
+    seed: u64,
+    checkpoint: Option<&str>,
+    trace: Option<&Path>,
+    failed: &dyn Fn() -> bool,
+) -> anyhow::Result<String> {
+    let config = trial.task.config();
+    let output = trace.map(OutputFile::create).transpose()?;
+    let mut output = output.map(|file| (file, Trace::new(trial.task, trial.actor.name(), checkpoint, seed)));
+    let mut goal_times = GoalTimes::new(config);
+    let played = trial.play(&mut |moment| {
+        goal_times.observe(&moment);
+        output.iter_mut().for_each(|(_, trace)| trace.record(&moment));
+        Ok(())
+    })?;
+    let Some(played) = played.filter(|_| !failed()) else { return Ok(String::new()) };
+    if let Some((file, trace)) = output {
+        file.finish(trace.finish().as_bytes())?;
+    }
+    let score = Score::of(&played, config.ctrl_dt);
+    Ok(json_score(&score, &goal_times, checkpoint, seed).to_string())
 }

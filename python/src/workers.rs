@@ -55,7 +55,9 @@ impl Workers {
     /// # Errors
     /// Fails if the work panics, or with the exception that a signal raises.
     pub(crate) fn long<T: Send>(&mut self, py: Python, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
-        let (pool, stop, (tell, mut told)) = (self.pool()?, AtomicBool::new(false), mpsc::channel::<()>());
+        let pool = self.pool()?;
+        let stop = AtomicBool::new(false);
+        let (tell, mut told) = mpsc::channel::<()>();
         std::thread::scope(|scope| {
             let running = std::thread::Builder::new().spawn_scoped(scope, || {
                 // Dropped at the end, also by a panic.

@@ -40,6 +40,9 @@ struct Shared {
     page: String,
     on_post: Option<OnPost>,
     news: Mutex<News>,
+    /// The permits of readers and of connections: each has a copy as long as it lives.
+    readers: Arc<()>,
+    connections: Arc<()>,
     /// Something was sent, or somebody reads.
     changed: Condvar,
 }
@@ -51,8 +54,6 @@ struct News {
     /// The number of the first event that is kept.
     first: u64,
     events: VecDeque<Arc<str>>,
-    readers: usize,
-    connections: usize,
 }
 
 impl News {
@@ -73,7 +74,9 @@ impl Server {
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
         let port = listener.local_addr().map_err(cannot)?.port();
         let news = Mutex::new(News { hello: hello.into(), ..News::default() });
-        let shared = Arc::new(Shared { page, on_post, news, changed: Condvar::new() });
+        let readers = Arc::default();
+        let connections = Arc::default();
+        let shared = Arc::new(Shared { page, on_post, news, readers, connections, changed: Condvar::new() });
         let own = shared.clone();
         let accepting = thread::Builder::new().name("server".into());
         accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
@@ -103,9 +106,10 @@ impl Server {
 
     /// Waits until somebody reads the events, and returns whether it had to.
     pub fn wait_for_reader(&self) -> bool {
+        let is_alone = || Arc::strong_count(&self.shared.readers) == 1;
         let news = self.shared.news();
-        let waits = news.readers == 0;
-        drop(self.shared.changed.wait_while(news, |news| news.readers == 0));
+        let waits = is_alone();
+        drop(self.shared.changed.wait_while(news, |_| is_alone()));
         waits
     }
 }
@@ -124,17 +128,30 @@ impl Shared {
                 continue;
             };
             let _ = stream.set_write_timeout(Some(PATIENCE));
-            let Some(permit) = Permit::take(&self, MOST_CONNECTIONS, |news| &mut news.connections) else {
+            let Some(permit) = self.take_permit(&self.connections, MOST_CONNECTIONS) else {
                 let _ = answer(&mut stream, "503 Service Unavailable", &[], "There are too many connections.\n");
                 continue;
             };
             let connection = thread::Builder::new().name("connection".into());
+            let shared = self.clone();
             // Without a thread, the connection is closed.
-            let _ = connection.spawn(move || permit.shared.serve(stream));
+            let _ = connection.spawn(move || {
+                let _permit = permit;
+                shared.serve(stream);
+            });
         }
     }
 
-    fn serve(self: &Arc<Self>, mut stream: TcpStream) {
+    /// A permit, to be kept as long as it is used, unless there are `most` of them already.
+    fn take_permit(&self, permits: &Arc<()>, most: usize) -> Option<Arc<()>> {
+        // Nobody else counts meanwhile.
+        let _news = self.news();
+        let permit = (Arc::strong_count(permits) <= most).then(|| permits.clone());
+        self.changed.notify_all();
+        permit
+    }
+
+    fn serve(&self, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
         let answered = Request::read(&mut stream).and_then(|request| match request {
             Some(request) => self.answer(&mut stream, &request),
@@ -145,7 +162,7 @@ impl Shared {
         }
     }
 
-    fn answer(self: &Arc<Self>, stream: &mut TcpStream, request: &Request) -> Result<(), Refusal> {
+    fn answer(&self, stream: &mut TcpStream, request: &Request) -> Result<(), Refusal> {
         request.expect_local()?;
         // An error of a write is a reader that has gone, or has read nothing for too long.
         let _ = match (&*request.path, &self.on_post) {
@@ -155,8 +172,7 @@ impl Shared {
             }
             ("/events", _) => {
                 request.expect_method("GET")?;
-                let permit = Permit::take(self, MOST_READERS, |news| &mut news.readers);
-                let _permit = permit.ok_or(CROWDED)?;
+                let _permit = self.take_permit(&self.readers, MOST_READERS).ok_or(CROWDED)?;
                 self.send_events(stream)
             }
             ("/controls", Some(on_post)) => {
@@ -189,31 +205,5 @@ impl Shared {
             };
             next = news.next();
         }
-    }
-}
-
-/// The permit of one of the connections or readers that there may be.
-struct Permit {
-    shared: Arc<Shared>,
-    count: fn(&mut News) -> &mut usize,
-}
-
-impl Permit {
-    /// A permit, unless there are `most` of them already.
-    fn take(shared: &Arc<Shared>, most: usize, count: fn(&mut News) -> &mut usize) -> Option<Self> {
-        let mut news = shared.news();
-        let taken = count(&mut news);
-        if *taken >= most {
-            return None;
-        }
-        *taken += 1;
-        shared.changed.notify_all();
-        Some(Self { shared: shared.clone(), count })
-    }
-}
-
-impl Drop for Permit {
-    fn drop(&mut self) {
-        *(self.count)(&mut self.shared.news()) -= 1;
     }
 }
