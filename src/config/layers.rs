@@ -498,7 +498,6 @@ mod tests {
                 "training.drop_reward.to=-1e10",
                 "training.drop_reward = -10000000000: must be at most 1000000000 in magnitude",
             ),
-            ("env.act_moving_average=0", "must be above 0"),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(part), "{bad}: {part} is not in\n{text}");

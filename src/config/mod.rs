@@ -153,6 +153,8 @@ mod tests {
         assert_eq!(played(&[]), Ramp::constant(0.375));
         assert_eq!(played(&["env.act_moving_average=0.6"]), Ramp::constant(0.6));
         assert_eq!(config.env.at(0).act_moving_average, Ramp::constant(0.25));
+        let refused = Settings::new().sets(&[set("env.act_moving_average=0")]).resolve().unwrap_err().to_string();
+        assert!(refused.contains("must be above 0 and at most 1"), "{refused}");
     }
 
     #[test]

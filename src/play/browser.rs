@@ -94,7 +94,7 @@ pub(super) fn live(
         let newer = Stage { choice: stage.choice, ..Stage::find(Some(path), set)? };
         let record = |stage: &Stage| stage.loaded().map(|loaded| loaded.record.clone());
         ensure!(record(&newer) == record(&stage), "{} is for another hand", path.display());
-        let own = task.smoothed_as_in(newer.task.config());
+        let own = task.at_the_stage_of(newer.task.config());
         let mut acting = Rc::new(newer).acting(own);
         // The page shows the settings of the first policy.
         for (key, value) in acting.task.config().unlike(task.config()) {

@@ -88,6 +88,12 @@ impl Lesson {
         Self::default().described().into_iter().map(|(about, _)| about)
     }
 
+    /// Where a target goes from the previous one if this one is asked for.
+    pub(super) fn moved(&self, previous: f64, asked: f64) -> f64 {
+        let alpha = self.act_moving_average;
+        alpha * asked + (1.0 - alpha) * previous
+    }
+
     /// The reward that training adds to a step.
     pub(super) fn reward(&self, step: &Step) -> TrainingReward {
         training_reward(&self.weights, step)

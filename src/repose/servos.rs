@@ -1,4 +1,4 @@
-//! The targets of the actuators: actions become smoothed targets, which take effect after the delay of the episode.
+//! The targets of the actuators: actions become targets, which take effect after the delay of the episode.
 
 use std::collections::VecDeque;
 
@@ -32,11 +32,10 @@ impl Servos {
 
     /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect.
     pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], lesson: &Lesson) {
-        let alpha = lesson.act_moving_average;
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
             let asked = low + (f64::from(*action) + 1.0) / 2.0 * (high - low);
-            *target = (alpha * asked + (1.0 - alpha) * *target).clamp(low, high);
+            *target = lesson.moved(*target, asked).clamp(low, high);
         }
         self.under_way.extend(&self.targets);
         self.due.iter_mut().zip(self.under_way.drain(..self.targets.len())).for_each(|(due, target)| *due = target);

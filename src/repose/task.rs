@@ -93,9 +93,9 @@ impl Task {
         Ok(Arc::new(Self { scene, hand, ..self.clone() }))
     }
 
-    /// The same task, in which actions are smoothed as in `other`.
+    /// The same task at the stage of a run in which `other` is: its actions are smoothed as there.
     #[must_use]
-    pub fn smoothed_as_in(&self, other: &EnvConfig) -> Arc<Self> {
+    pub fn at_the_stage_of(&self, other: &EnvConfig) -> Arc<Self> {
         let act_moving_average = other.act_moving_average;
         Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
     }

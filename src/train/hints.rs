@@ -1,6 +1,7 @@
 //! Notes about settings that are valid but rarely intended, printed before a training run starts.
 
-use crate::config::Config;
+use crate::cli::TrainArgs;
+use crate::config::{Config, short};
 
 /// The number of samples below which a minibatch gives a noisy gradient and a step that is short for its cost.
 const SMALL_MINIBATCH: usize = 1024;
@@ -11,49 +12,85 @@ const LITTLE: f64 = 0.1;
 /// The memory for the models of randomised environments above which there is a note, bytes.
 const MUCH: usize = 2 << 30;
 
+/// Settings that another one leaves without effect: the beginnings of their keys, the other one, and when it does so.
+const WITHOUT_EFFECT: [(&[&str], &str, fn(&Config) -> bool); 8] = [
+    (
+        &[
+            "env.rot_reward_scale",
+            "env.dist_reward_scale",
+            "env.action_penalty_scale",
+            "env.reach_goal_bonus",
+            "env.fall_penalty",
+        ],
+        "training.task_reward",
+        |config| config.training.task_reward.to < LITTLE,
+    ),
+    (&["env.rot_eps"], "env.rot_reward_scale", |config| config.env.rot_reward_scale == 0.0),
+    (&["env.success_hold"], "training.hold", |config| {
+        config.training.hold.to == 1.0 && config.env.max_consecutive_successes == 1
+    }),
+    (&["ppo.learning_rate_range"], "ppo.desired_kl", |config| config.ppo.desired_kl.0.to == 0.0),
+    (&["ppo.away_range"], "ppo.away_std", |config| config.ppo.away_std.from.max(config.ppo.away_std.to) == 0.0),
+    (&["randomization.push_steps"], "randomization.push", |config| config.randomization.push == 0.0),
+    (&["randomization.share"], "run.total_steps", |config| config.randomization.happens() && !randomizes(config)),
+    (&["randomization."], "randomization.share", |config| !randomizes(config)),
+];
+
+/// Whether episodes of the run are randomised before it ends.
+fn randomizes(config: &Config) -> bool {
+    let share = config.randomization.share;
+    [0, config.run.total_steps].into_iter().any(|steps| share.at(steps) > 0.0)
+}
+
 /// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
-pub(super) fn hints(config: &Config, default: &Config, scene: usize) -> Vec<String> {
+pub(super) fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) -> Vec<String> {
     let mut hints = Vec::from_iter(of_ramps(config));
-    let total = config.run.total_steps;
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
         hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
     }
-    let env = &config.env;
-    let usual = &default.env;
-    let weight = config.training.task_reward.to;
-    for (key, value, usual) in [
-        ("env.rot_reward_scale", env.rot_reward_scale, usual.rot_reward_scale),
-        ("env.dist_reward_scale", env.dist_reward_scale, usual.dist_reward_scale),
-        ("env.action_penalty_scale", env.action_penalty_scale, usual.action_penalty_scale),
-        ("env.reach_goal_bonus", env.reach_goal_bonus, usual.reach_goal_bonus),
-        ("env.fall_penalty", env.fall_penalty, usual.fall_penalty),
-    ] {
-        if value != usual && weight < LITTLE {
-            hints.push(format!("{key} = {value}: training.task_reward multiplies it by only {weight}"));
-        }
+    let begins = args.init.is_none() && args.fork.is_none() && args.resume.is_none();
+    if config.ppo.critic_first > 0 && begins {
+        hints.push(format!(
+            "ppo.critic_first = {}: it is for a policy that can do something already (--init); random weights learn nothing in \
+             these iterations",
+            config.ppo.critic_first
+        ));
     }
-    let models = scene.saturating_mul(env.num_envs);
+    hints.extend(without_effect(config, default));
+    let models = scene.saturating_mul(config.env.num_envs);
     let share = config.randomization.share;
-    let randomizes = [0, total].into_iter().any(|steps| share.at(steps) > 0.0);
-    let mut usual = default.randomization.clone();
-    if config.env.model_file().is_some() {
-        // By default, the size of an own object does not vary.
-        usual.cube_size = [1.0; 2];
-    }
-    if config.randomization.happens() && !randomizes && config.randomization != usual {
-        hints.push(format!("randomization.share = {share}: nothing is randomised in {total} steps"));
-    }
-    if randomizes && models > MUCH {
+    if randomizes(config) && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
             "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
              (randomization.share=0 avoids this)",
-            env.num_envs,
+            config.env.num_envs,
             if share.at(0) > 0.0 { 0 } else { share.after }
         ));
     }
     hints
+}
+
+/// A note about each setting that differs from the `default`, but does nothing.
+fn without_effect(config: &Config, default: &Config) -> Vec<String> {
+    let mut usual = default.clone();
+    if config.env.model_file().is_some() {
+        // By default, the size of an own object does not vary.
+        usual.randomization.cube_size = [1.0; 2];
+    }
+    let all = config.dotted();
+    let mut notes = Vec::new();
+    for (key, [_, value]) in usual.compared_with(config) {
+        let is_about = |(keys, other, holds): &&(&[&str], &str, fn(&Config) -> bool)| {
+            keys.iter().any(|begin| key.starts_with(begin)) && *other != key && holds(config)
+        };
+        if let Some((_, other, _)) = WITHOUT_EFFECT.iter().find(is_about) {
+            let [value, cause] = [&value, &all[*other]].map(short);
+            notes.push(format!("{key} = {value} has little or no effect with {other} = {cause}"));
+        }
+    }
+    notes
 }
 
 /// Ramps that may still grow at the end of a run: the penalty for drops and the share of randomised episodes.
@@ -79,14 +116,14 @@ mod tests {
 
     fn hints_for(sets: &[&str]) -> Vec<String> {
         let sets: Vec<Override> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        let default = Config::default();
-        hints(&Settings::new().sets(&sets).resolve().unwrap(), &default, 1 << 20)
+        let config = Settings::new().sets(&sets).resolve().unwrap();
+        hints(&config, &TrainArgs::default(), &Config::default(), 1 << 20)
     }
 
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
-        let ramps = "env.act_moving_average, training.tolerance, training.hold, ppo.horizon";
+        let ramps = "training.tolerance, training.hold, ppo.horizon";
         assert!(line.contains(&format!("{ramps}, which last up to 80000000 steps")), "{line}");
         assert!(!line.contains("assist"), "its ramp ends in time: {line}");
         assert!(hints_for(&["run.total_steps=9000000"])[0].contains("training.assist"));
@@ -94,7 +131,7 @@ mod tests {
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
         let [line] = &hints_for(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
         assert!(
-            line.starts_with("env.dist_reward_scale = -20: training.task_reward multiplies it by only 0.03"),
+            line.starts_with("env.dist_reward_scale = -20 has little or no effect with training.task_reward = 0.03"),
             "{line}"
         );
         assert!(hints_for(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
@@ -109,12 +146,28 @@ mod tests {
         let short = hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]);
         assert!(!short.concat().contains("own model"), "it ends before");
         let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
-        assert!(line.ends_with("nothing is randomised in 200000000 steps"), "{line}");
+        assert!(line.ends_with("has little or no effect with run.total_steps = 200000000"), "{line}");
         let ranges = hints_for(&["randomization.friction=[0.3,2]", "run.total_steps=30_000_000"]);
-        assert!(ranges.concat().contains("nothing is randomised in 30000000 steps"), "{ranges:?}");
-        assert!(
-            hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100: training.task_reward")
-        );
+        assert!(ranges.concat().contains("randomization.friction = [0.3,2] has little or no effect"), "{ranges:?}");
+        assert!(hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100 has little"));
+    }
+
+    #[test]
+    fn a_setting_that_another_one_leaves_without_effect_gets_a_line() {
+        for (sets, begin) in [
+            (
+                ["ppo.desired_kl=0", "ppo.learning_rate_range=[1e-6,1e-2]"],
+                "ppo.learning_rate_range = [0.000001,0.01] has",
+            ),
+            (["ppo.away_std=0", "ppo.away_range=[0.1,0.5]"], "ppo.away_range = [0.1,0.5] has"),
+            (["randomization.push=0", "randomization.push_steps=3"], "randomization.push_steps = 3 has"),
+            (["env.rot_reward_scale=0", "env.rot_eps=0.2"], "env.rot_eps = 0.2 has"),
+            (["randomization.share=0", "randomization.each=0.9"], "randomization.each = 0.9 has"),
+            (["ppo.critic_first=20", "run.seed=3"], "ppo.critic_first = 20: it is for a policy"),
+        ] {
+            let hints = hints_for(&sets);
+            assert!(hints.iter().any(|hint| hint.starts_with(begin)), "{begin}: {hints:?}");
+        }
     }
 
     #[test]
@@ -123,7 +176,8 @@ mod tests {
         for (_, text) in SHIPPED {
             let source = Source::new("x.toml", text);
             let config = Settings::new().file(source).resolve().unwrap();
-            assert_eq!(hints(&config, &default, 1 << 19), [""; 0]);
+            let args = TrainArgs { init: Some("builtin".into()), ..TrainArgs::default() };
+            assert_eq!(hints(&config, &args, &default, 1 << 19), [""; 0]);
         }
     }
 }

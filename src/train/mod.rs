@@ -70,7 +70,7 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     session.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.quiet {
         let default = Config::default();
-        let hints = hints(&session.config, &default, session.task.scene().size());
+        let hints = hints(&session.config, args, &default, session.task.scene().size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
         let mobility = own_scene.then(|| mobility(&session.task, &default.env));
         session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
@@ -170,7 +170,7 @@ impl Session {
 
     /// The task as far as training has come.
     fn task_now(&self) -> Arc<Task> {
-        self.task.smoothed_as_in(&self.config.env.at(self.agent.env_steps))
+        self.task.at_the_stage_of(&self.config.env.at(self.agent.env_steps))
     }
 
     fn evaluation_episodes(&self) -> Episodes {

@@ -32,6 +32,7 @@ mod resume;
 mod run_folder;
 mod runs;
 mod scene;
+mod settings;
 mod support;
 mod survival;
 mod sweep;
