@@ -11,7 +11,7 @@ use shadow_repose::load;
 use shadow_repose::os::StatusLine;
 use shadow_repose::ppo::{Checkpoint, Policy, sealed};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::Task;
+use shadow_repose::repose::{Record, Task};
 use shadow_repose::run::{self, Report};
 use tensorboard_rs::masked_crc32c::masked_crc32c;
 
@@ -77,7 +77,7 @@ pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
         let checkpoint = Checkpoint::parse(bytes)?;
         let config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Player { env_steps: 0 }, &[])?;
         let net = config.ppo.net();
-        let spaces = load::record(&checkpoint)?.spaces();
+        let spaces = Record::parse(&checkpoint.hand)?.spaces();
         let policy = Policy::load(&net, spaces, &checkpoint)?;
         let frozen = policy.freeze();
         let (mut action, mut work) = (vec![0.0; spaces.action_size], frozen.workspace(1));

@@ -151,7 +151,7 @@ impl Loaded {
         };
         let (checkpoint, config) = origin.load(overrides)?;
         let net = config.ppo.net();
-        let record = record(&checkpoint)?;
+        let record = Record::parse(&checkpoint.hand)?;
         let policy = Policy::load(&net, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let policy = Arc::new(policy);
@@ -178,14 +178,6 @@ impl Loaded {
         let config = self.settings(overrides)?;
         Task::new(&config.env, &config.hand)?.for_policy(&self.record)
     }
-}
-
-/// The hand and the object that a policy was trained with.
-///
-/// # Errors
-/// Fails if the record in its file is damaged.
-pub fn record(checkpoint: &Checkpoint) -> Result<Record> {
-    Record::parse(&checkpoint.hand)
 }
 
 /// Reads a checkpoint or a policy.
@@ -273,7 +265,7 @@ fn cannot_use(path: &Path) -> String {
 }
 
 fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
-    checkpoint.expect_policy(net, &record(checkpoint)?.spaces())
+    checkpoint.expect_policy(net, &Record::parse(&checkpoint.hand)?.spaces())
 }
 
 #[cfg(test)]

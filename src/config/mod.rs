@@ -95,7 +95,8 @@ mod tests {
     fn the_files_for_a_trained_policy_are_the_default_with_its_ramps_at_their_ends_and_less_noise_or_a_ramp_to_it() {
         let default = Config::default();
         let ended = |ramp: Ramp| Ramp::constant(ramp.to);
-        let (training, ppo) = (default.training, default.ppo);
+        let training = default.training;
+        let ppo = default.ppo;
         let smoothing = ended(default.env.act_moving_average);
         let TrainingConfig { assist, drop_reward, tolerance, hold, .. } = training;
         let [assist, drop_reward, hold] = [assist, drop_reward, hold].map(ended);

@@ -140,7 +140,7 @@ fn inner(expected: &Table, value: &Value) -> Option<Table> {
     Some(given)
 }
 
-/// Converts `value` to the type of the base's value, or returns a description of that type.
+/// Converts `value` to the type of the base's value. The error describes that type.
 fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     match (expected, value) {
         (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
@@ -158,26 +158,32 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
-        (Value::Boolean(_), _) => Err("true or false".into()),
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
             let reason = format!("value = {}", with_zeros(text)).parse::<Table>().err();
             let reason = reason.map_or_else(String::new, |error| format!(": {}", shortened(error.message().trim())));
             Err(format!("a table of TOML{reason}"))
         }
-        (Value::Float(_), _) => Err("a number".into()),
-        (Value::Integer(_), _) => Err("a whole number, not negative".into()),
-        (Value::String(_), _) => Err("a string".into()),
-        (Value::Array(_), _) => Err(format!("an array, e.g. {expected}")),
-        (Value::Table(table), _) if is_ramp(table) => {
-            Err("a number, or { from = …, to = …, steps = …, after = … }".into())
-        }
-        (Value::Table(table), _) if table.is_empty() => {
-            Err("a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }".into())
-        }
-        (Value::Table(_), _) => Err("a section with keys".into()),
-        _ => Err("of another type".into()),
+        _ => Err(type_of(expected)),
     }
+}
+
+/// What a value in the place of this one must be.
+fn type_of(expected: &Value) -> String {
+    let text = match expected {
+        Value::Boolean(_) => "true or false",
+        Value::Float(_) => "a number",
+        Value::Integer(_) => "a whole number, not negative",
+        Value::String(_) => "a string",
+        Value::Array(_) => return format!("an array, e.g. {expected}"),
+        Value::Table(table) if is_ramp(table) => "a number, or { from = …, to = …, steps = …, after = … }",
+        Value::Table(table) if table.is_empty() => {
+            "a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }"
+        }
+        Value::Table(_) => "a section with keys",
+        Value::Datetime(_) => "of another type",
+    };
+    text.into()
 }
 
 fn unknown(name: &str) -> String {

@@ -9,24 +9,31 @@ use super::settings::{Backend, Config, Precision};
 use crate::os::shortened;
 use crate::sim::Parts;
 
-// The keys of simple rules, separated by spaces. Both ends of a ramp must satisfy the rule, and so must all values by group.
-
-/// Settings that must be above 0.
-const POSITIVE: &str = "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance \
-    env.fall_dist training.tolerance ppo.learning_rate ppo.clip ppo.max_grad_norm ppo.reward_scale ppo.std";
-
-/// Settings that must be at least 0.
-const NOT_NEGATIVE: &str = "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise \
-    env.noise env.bias randomization.noise randomization.bias \
-    randomization.cube_com randomization.gravity randomization.push training.task_reward training.assist \
-    ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.away_std";
-
-/// Settings that must be at least 1.
-const AT_LEAST_1: &str = "env.num_envs env.max_consecutive_successes training.hold ppo.horizon ppo.epochs ppo.minibatches \
-    randomization.push_steps run.total_steps run.checkpoint_every run.eval_every run.eval_episodes";
-
-/// Settings that must be from 0 to 1.
-const SHARES: &str = "randomization.share randomization.each ppo.gamma ppo.lambda";
+/// Keys, separated by spaces, the rule for their numbers, and its text. Both ends of a ramp must satisfy it, and so must all values
+/// by group.
+const RANGES: [(&str, fn(f64) -> bool, &str); 5] = [
+    (
+        "env.sim_dt env.ctrl_dt env.rot_eps env.success_tolerance env.fall_dist training.tolerance ppo.learning_rate ppo.clip \
+         ppo.max_grad_norm ppo.reward_scale ppo.std",
+        |x| x > 0.0,
+        "be above 0",
+    ),
+    (
+        "env.reset_position_noise env.reset_dof_pos_noise env.reset_dof_vel_noise env.noise env.bias randomization.noise \
+         randomization.bias randomization.cube_com randomization.gravity randomization.push training.task_reward training.assist \
+         ppo.desired_kl ppo.value_clip ppo.value_coef ppo.bounds_coef ppo.away_std",
+        |x| x >= 0.0,
+        "not be negative",
+    ),
+    (
+        "env.num_envs env.max_consecutive_successes training.hold ppo.horizon ppo.epochs ppo.minibatches randomization.push_steps \
+         run.total_steps run.checkpoint_every run.eval_every run.eval_episodes",
+        |x| x >= 1.0,
+        "be at least 1",
+    ),
+    ("randomization.share randomization.each ppo.gamma ppo.lambda", |x| (0.0..=1.0).contains(&x), "lie in [0, 1]"),
+    ("env.act_moving_average", |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1"),
+];
 
 /// The largest valid values of settings.
 const AT_MOST: &[(&str, f64)] = &[
@@ -61,17 +68,27 @@ const IN_F32: [f64; 2] = [1e-37, 1e38];
 pub(super) fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
     let table = Table::try_from(config).expect("a configuration is a tree of tables");
-    POSITIVE.split_whitespace().for_each(|key| rules.number(&table, key, |x| x > 0.0, "be above 0"));
-    NOT_NEGATIVE.split_whitespace().for_each(|key| rules.number(&table, key, |x| x >= 0.0, "not be negative"));
-    AT_LEAST_1.split_whitespace().for_each(|key| rules.number(&table, key, |x| x >= 1.0, "be at least 1"));
-    SHARES.split_whitespace().for_each(|key| rules.number(&table, key, |x| (0.0..=1.0).contains(&x), "lie in [0, 1]"));
+    for (keys, holds, rule) in RANGES {
+        for key in keys.split_whitespace() {
+            rules.number(&table, key, holds, rule);
+        }
+    }
     for (key, most) in AT_MOST {
         rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
     }
-    rules.number(&table, "env.act_moving_average", |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1");
+    magnitudes(&table, &mut rules);
+    env(config, &mut rules);
+    hand(config, &mut rules);
+    randomization(config, &table, &mut rules);
+    nets(config, &mut rules);
+    learning(config, &mut rules);
+    rules.0
+}
+
+fn magnitudes(table: &Table, rules: &mut Rules) {
     let limited = ["env.", "training.", "randomization."];
     let [least, most] = IN_F32;
-    for (key, value) in settings(&table).filter(|(key, _)| key != "training.hold") {
+    for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
         let most = if limited.iter().any(|section| key.starts_with(section)) { LARGEST } else { most };
         let values = floats(value);
         if let Some(&x) = values.iter().find(|x| x.abs() > most) {
@@ -81,12 +98,6 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
             rules.check(false, &key, brief(x), &format!("be 0, or at least {least:e} in magnitude"));
         }
     }
-    env(config, &mut rules);
-    hand(config, &mut rules);
-    randomization(config, &table, &mut rules);
-    nets(config, &mut rules);
-    learning(config, &mut rules);
-    rules.0
 }
 
 /// The values of a setting that are not counts.
@@ -130,11 +141,13 @@ fn env(config: &Config, rules: &mut Rules) {
 }
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
-    let (env, drawn) = (&config.env, &config.randomization);
+    let env = &config.env;
+    let drawn = &config.randomization;
     // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
         let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice) else { continue };
-        let (name, range) = (format!("randomization.{key}"), format!("[{low}, {high}]"));
+        let name = format!("randomization.{key}");
+        let range = format!("[{low}, {high}]");
         rules.check(0.0 < *low && low <= high, &name, range, "be [low, high] with 0 < low <= high");
         let scale = format!("{key}_scale");
         let factor = table["env"][&scale].as_float().expect("a factor");

@@ -12,35 +12,19 @@ const LITTLE: f64 = 0.1;
 /// The memory for the models of randomised environments above which there is a note, bytes.
 const MUCH: usize = 2 << 30;
 
-/// Settings that another one leaves without effect: the beginnings of their keys, the other one, and when it does so.
-const WITHOUT_EFFECT: [(&[&str], &str, fn(&Config) -> bool); 8] = [
+/// Settings that another one leaves without effect: the beginnings of their keys, the other one, and its largest value that does so.
+const WITHOUT_EFFECT: [(&str, &str, f64); 6] = [
     (
-        &[
-            "env.rot_reward_scale",
-            "env.dist_reward_scale",
-            "env.action_penalty_scale",
-            "env.reach_goal_bonus",
-            "env.fall_penalty",
-        ],
+        "env.rot_reward_scale env.dist_reward_scale env.action_penalty_scale env.reach_goal_bonus env.fall_penalty",
         "training.task_reward",
-        |config| config.training.task_reward.to < LITTLE,
+        LITTLE,
     ),
-    (&["env.rot_eps"], "env.rot_reward_scale", |config| config.env.rot_reward_scale == 0.0),
-    (&["env.success_hold"], "training.hold", |config| {
-        config.training.hold.to == 1.0 && config.env.max_consecutive_successes == 1
-    }),
-    (&["ppo.learning_rate_range"], "ppo.desired_kl", |config| config.ppo.desired_kl.0.to == 0.0),
-    (&["ppo.away_range"], "ppo.away_std", |config| config.ppo.away_std.from.max(config.ppo.away_std.to) == 0.0),
-    (&["randomization.push_steps"], "randomization.push", |config| config.randomization.push == 0.0),
-    (&["randomization.share"], "run.total_steps", |config| config.randomization.happens() && !randomizes(config)),
-    (&["randomization."], "randomization.share", |config| !randomizes(config)),
+    ("env.rot_eps", "env.rot_reward_scale", 0.0),
+    ("randomization.push_steps", "randomization.push", 0.0),
+    ("randomization.", "randomization.share", 0.0),
+    ("ppo.learning_rate_range", "ppo.desired_kl", 0.0),
+    ("ppo.away_range", "ppo.away_std", 0.0),
 ];
-
-/// Whether episodes of the run are randomised before it ends.
-fn randomizes(config: &Config) -> bool {
-    let share = config.randomization.share;
-    [0, config.run.total_steps].into_iter().any(|steps| share.at(steps) > 0.0)
-}
 
 /// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
 pub(super) fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) -> Vec<String> {
@@ -60,7 +44,7 @@ pub(super) fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: 
     hints.extend(without_effect(config, default));
     let models = scene.saturating_mul(config.env.num_envs);
     let share = config.randomization.share;
-    if randomizes(config) && models > MUCH {
+    if reached(config, "randomization.share") > 0.0 && models > MUCH {
         let gib = models as f64 / f64::from(1 << 30);
         hints.push(format!(
             "[randomization]: each of {} environments gets its own model of this scene, from {} steps on: {gib:.1} GiB in total \
@@ -72,6 +56,14 @@ pub(super) fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: 
     hints
 }
 
+/// The larger of the values of a setting at the beginning and at the end of the run.
+fn reached(config: &Config, key: &str) -> f64 {
+    match config.ramps().into_iter().find(|(ramped, _)| ramped == key) {
+        Some((_, ramp)) => ramp.at(0).max(ramp.at(config.run.total_steps)),
+        None => config.dotted()[key].as_float().expect("a number"),
+    }
+}
+
 /// A note about each setting that differs from the `default`, but does nothing.
 fn without_effect(config: &Config, default: &Config) -> Vec<String> {
     let mut usual = default.clone();
@@ -79,14 +71,14 @@ fn without_effect(config: &Config, default: &Config) -> Vec<String> {
         // By default, the size of an own object does not vary.
         usual.randomization.cube_size = [1.0; 2];
     }
-    let all = config.dotted();
     let mut notes = Vec::new();
     for (key, [_, value]) in usual.compared_with(config) {
-        let is_about = |(keys, other, holds): &&(&[&str], &str, fn(&Config) -> bool)| {
-            keys.iter().any(|begin| key.starts_with(begin)) && *other != key && holds(config)
-        };
-        if let Some((_, other, _)) = WITHOUT_EFFECT.iter().find(is_about) {
-            let [value, cause] = [&value, &all[*other]].map(short);
+        let is_about = |keys: &str| keys.split(' ').any(|begin| key.starts_with(begin));
+        let cause = WITHOUT_EFFECT
+            .iter()
+            .find(|(keys, other, most)| is_about(keys) && *other != key && reached(config, other) <= *most);
+        if let Some((_, other, _)) = cause {
+            let [value, cause] = [&value, &config.dotted()[*other]].map(short);
             notes.push(format!("{key} = {value} has little or no effect with {other} = {cause}"));
         }
     }
@@ -100,7 +92,7 @@ const MAY_GROW: [&str; 2] = ["training.drop_reward", "randomization.share"];
 fn of_ramps(config: &Config) -> Option<String> {
     let total = config.run.total_steps;
     let mut cut = config.ramps();
-    cut.retain(|(key, ramp)| ramp.from != ramp.to && ramp.end() > total && !MAY_GROW.contains(&&**key));
+    cut.retain(|(key, ramp)| ramp.end() > total && (ramp.after >= total || !MAY_GROW.contains(&&**key)));
     let longest = cut.iter().map(|(_, ramp)| ramp.end()).max()?;
     let names: Vec<String> = cut.into_iter().map(|(key, _)| key).collect();
     Some(format!(
@@ -123,7 +115,7 @@ mod tests {
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
         let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
-        let ramps = "training.tolerance, training.hold, ppo.horizon";
+        let ramps = "training.tolerance, training.hold, randomization.share, ppo.horizon";
         assert!(line.contains(&format!("{ramps}, which last up to 80000000 steps")), "{line}");
         assert!(!line.contains("assist"), "its ramp ends in time: {line}");
         assert!(hints_for(&["run.total_steps=9000000"])[0].contains("training.assist"));
@@ -146,7 +138,7 @@ mod tests {
         let short = hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]);
         assert!(!short.concat().contains("own model"), "it ends before");
         let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
-        assert!(line.ends_with("has little or no effect with run.total_steps = 200000000"), "{line}");
+        assert!(line.contains("shorter than the ramps of randomization.share, which"), "{line}");
         let ranges = hints_for(&["randomization.friction=[0.3,2]", "run.total_steps=30_000_000"]);
         assert!(ranges.concat().contains("randomization.friction = [0.3,2] has little or no effect"), "{ranges:?}");
         assert!(hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100 has little"));

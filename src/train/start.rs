@@ -172,7 +172,7 @@ impl Plan {
             let config = &self.config;
             let task = Task::new(&config.env, &config.hand)?;
             let record = match &self.from {
-                Some((_, checkpoint)) => load::record(checkpoint)?,
+                Some((_, checkpoint)) => Record::parse(&checkpoint.hand)?,
                 None => task.record().with(config.ppo.symmetry),
             };
             // What is written must be readable.
@@ -260,7 +260,7 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
 
 /// Checks that a policy with the `stored` settings can begin a training run with these.
 fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig) -> Result<()> {
-    checkpoint.expect_policy(&settings.net(), &load::record(checkpoint)?.spaces())?;
+    checkpoint.expect_policy(&settings.net(), &Record::parse(&checkpoint.hand)?.spaces())?;
     let [found, expected] = [stored, settings].map(|settings| (settings.activation, settings.symmetry));
     ensure!(
         found == expected,

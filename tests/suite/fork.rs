@@ -74,12 +74,9 @@ fn a_fork_goes_on_under_its_own_settings_and_says_where_it_came_from() {
     let first = own.lines().next().unwrap();
     let from = folder.canonicalize().unwrap().join("run/checkpoints/iteration-00000002.safetensors");
     assert_eq!(first, format!("# Forked from {from:?} after 2 iterations, 256 env steps."));
-    for set in [
-        "horizon = { from = 4.0,",
-        "gamma = 0.9\n",
-        "tolerance = { from = 0.4, to = 0.2, steps = 20000000 }",
-        "seed = 7",
-    ] {
+    for set in
+        ["horizon = 4.0\n", "gamma = 0.9\n", "tolerance = { from = 0.4, to = 0.2, steps = 20000000 }", "seed = 7"]
+    {
         assert!(own.contains(set) && !parent.contains(set), "{own}");
     }
     assert!(own.contains("num_envs = 16") && own.contains("hidden = [16, 8]"), "the rest is unchanged: {own}");

@@ -39,7 +39,16 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("env.reach_goal_bonus=5", &["env.success_tolerance=3"]),
     ("env.success_tolerance=3", &[]),
     ("env.max_consecutive_successes=2", &["env.success_tolerance=3"]),
-    ("env.success_hold=consecutive", &["training.tolerance=2", "training.hold=9", "env.max_episode_seconds=1"]),
+    (
+        "env.success_hold=consecutive",
+        &[
+            "training.tolerance=1.5",
+            "training.hold=20",
+            "env.num_envs=64",
+            "env.max_episode_seconds=1",
+            "ppo.horizon=64",
+        ],
+    ),
     ("env.fall_dist=0.03", &[]),
     ("env.fall_penalty=-10", &["env.fall_dist=0.03"]),
     ("env.reset_position_noise=0.03", &[]),
