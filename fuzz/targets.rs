@@ -64,7 +64,7 @@ pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
         checkpoint.finish()?;
         // Learning from untrained values may fail, but nothing else may.
         if let Err(error) = agent.iterate(&AtomicBool::new(false)) {
-            assert!(format!("{error:#}").contains("the training has failed"), "{error:#}");
+            assert!(format!("{error:#}").contains("the training run has failed"), "{error:#}");
         }
         Ok(())
     };

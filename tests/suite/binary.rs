@@ -466,7 +466,7 @@ fn bench_prints_every_figure() {
         assert!(figures[key].as_f64().unwrap() > 0.0, "{key}: {figures}");
     }
     let waits = figures["learner_waits"].as_f64().unwrap();
-    assert!((0.0..1.0).contains(&waits), "a share of the time: {waits}");
+    assert!((0.0..=1.0).contains(&waits), "a share of the time: {waits}");
     // The speed of each number of environments, times what its steps are worth (docs/RECIPES.md).
     let worth = [(512, 0.56), (1024, 1.0), (2048, 0.74)]
         .map(|(envs, share)| (envs, share * figures[format!("steps_per_s_of_{envs}")].as_f64().unwrap()));
