@@ -5,7 +5,6 @@
 
 use std::f64::consts::TAU;
 use std::ops::Range;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,7 +19,7 @@ use crate::ppo::{FrozenPolicy, GROUP, Policy, Workspace};
 use crate::ranks::Exchange;
 use crate::repose::{EpisodeStats, Repose, Score, Task};
 use crate::rng::{self, Rng};
-use crate::schedule::panic_message;
+use crate::schedule::caught;
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
@@ -280,10 +279,8 @@ impl<'a> Lanes<'a> {
         let rows = acted.zip(observations.par_chunks_exact_mut(observation_size)).enumerate();
         rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
             let episode = *first + i;
-            // Unwind safe: a state that a panic left inconsistent is not used again.
-            let step = || catch_unwind(AssertUnwindSafe(|| lane.step(action, row)));
-            let stepped = stepping("episode", episode, step).map(drop);
-            stepped.map_err(|panic| anyhow!("episode {episode} panicked: {}", panic_message(&*panic)))
+            let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
+            stepped.map(drop).map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))
         })?;
         let rows = observations.chunks_exact(observation_size).zip(actions.chunks_exact(action_size));
         let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
@@ -341,10 +338,10 @@ impl Actor<'_> {
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
                 Actor::Mean(_) | Actor::Outside(_) => {}
-                Actor::Stochastic(policy) => {
+                Actor::Stochastic(frozen) => {
                     for action in row {
                         let drawn: f32 = StandardNormal.sample(&mut lane.noise);
-                        *action += policy.std() * drawn;
+                        *action += frozen.policy.std() * drawn;
                     }
                 }
                 Actor::Zero => row.fill(0.0),
@@ -435,7 +432,7 @@ mod tests {
                 spaces.object_and_goal.iter_mut().for_each(|places| places.rotations = 1);
             }
             let ppo = Ppo::new(&config.ppo, spaces, 0, Exchange::alone(1)).unwrap();
-            let actor = Actor::Mean(ppo.policy().freeze());
+            let actor = Actor::Mean(ppo.policy.freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
             let Spaces { observation_size: size, .. } = task.spaces();

@@ -7,6 +7,7 @@
 
 use std::any::Any;
 use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Mutex;
 
 /// The number of items in each block when `items` of a total of `in_all` items are split. There are enough
@@ -14,13 +15,6 @@ use std::sync::Mutex;
 pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
     let size = (in_all / 32).clamp(8, 64);
     (0..items).step_by(size).map(|first| size.min(items - first)).collect()
-}
-
-/// A block that waits for its next round.
-struct Waiting<B> {
-    place: usize,
-    round: usize,
-    block: B,
 }
 
 /// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool, and
@@ -33,25 +27,29 @@ pub fn in_rounds<B: Send>(
     rounds: usize,
     work: impl Fn(&mut B, usize) + Sync,
 ) -> Vec<B> {
-    let wait = |(place, block)| Waiting { place, round: 0, block };
-    let queue: Mutex<VecDeque<Waiting<B>>> = Mutex::new(blocks.into_iter().enumerate().map(wait).collect());
-    let done: Mutex<Vec<Waiting<B>>> = Mutex::new(Vec::new());
-    // Neither lock is held during work, so no panic can occur under them.
+    let mut blocks: Vec<B> = blocks.into_iter().collect();
+    // Each block that waits, with its next round.
+    let waiting: Mutex<VecDeque<(&mut B, usize)>> = Mutex::new(blocks.iter_mut().map(|block| (block, 0)).collect());
+    // The lock is not held during work, so no panic can occur under it.
     rayon::broadcast(|_| {
         loop {
-            let Some(mut next) = queue.lock().expect("no panic under this lock").pop_front() else { break };
-            if next.round == rounds {
-                done.lock().expect("no panic under this lock").push(next);
-                continue;
+            let Some((block, round)) = waiting.lock().expect("no panic under this lock").pop_front() else { break };
+            if round < rounds {
+                work(block, round);
+                waiting.lock().expect("no panic under this lock").push_back((block, round + 1));
             }
-            work(&mut next.block, next.round);
-            next.round += 1;
-            queue.lock().expect("no panic under this lock").push_back(next);
         }
     });
-    let mut done = done.into_inner().expect("no panic under this lock");
-    done.sort_unstable_by_key(|waiting| waiting.place);
-    done.into_iter().map(|waiting| waiting.block).collect()
+    drop(waiting);
+    blocks
+}
+
+/// The result of `work`, or the message with which it panics. What the panic left inconsistent must not be used again.
+///
+/// # Errors
+/// Fails if `work` panics.
+pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+    catch_unwind(AssertUnwindSafe(work)).map_err(|panic| panic_message(&*panic).to_owned())
 }
 
 /// The message of a panic.

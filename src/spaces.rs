@@ -3,7 +3,7 @@
 //! It is separate because the environment creates it and the learner reads it, and neither depends on the other.
 
 /// The sizes of observations and actions, and the parts of an observation that a learner uses.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Spaces {
     /// The number of values in an observation.
     pub observation_size: usize,
@@ -16,7 +16,7 @@ pub struct Spaces {
 }
 
 /// The offsets of orientations (w, x, y, z) in an observation.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct ObjectAndGoal {
     /// The offset of the orientation of the object.
     pub object: usize,

@@ -120,15 +120,14 @@ impl Hands {
     /// The last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
     fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let size = self.observation_size();
-        let blocks = &state.pool.blocks;
+        let members = || state.pool.blocks.iter().flat_map(|block| &block.members);
         let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
-        if self.autoreset != Autoreset::SameStep || !blocks.iter().flat_map(|block| &block.ends).any(is_cut) {
+        if self.autoreset != Autoreset::SameStep || !members().any(|member| is_cut(&member.end)) {
             return Ok(None);
         }
-        let rows = blocks.iter().flat_map(|block| block.ends.iter().zip(block.final_observations.chunks_exact(size)));
         let mut finals = vec![0.0; self.count * size];
-        for (to, (_, row)) in finals.chunks_exact_mut(size).zip(rows).filter(|(_, (end, _))| is_cut(end)) {
-            to.copy_from_slice(row);
+        for (to, member) in finals.chunks_exact_mut(size).zip(members()).filter(|(_, member)| is_cut(&member.end)) {
+            to.copy_from_slice(&member.final_observation);
         }
         self.rows(py, finals).map(Some)
     }
@@ -184,13 +183,13 @@ impl State {
     /// The ends `[N]` of the last step as numbers.
     fn ends(&self) -> Vec<u8> {
         let number = |end: &Option<End>| ENDS.iter().position(|one| one == end).expect("an end") as u8;
-        self.pool.blocks.iter().flat_map(|block| &block.ends).map(number).collect()
+        self.pool.blocks.iter().flat_map(|block| &block.members).map(|member| number(&member.end)).collect()
     }
 
     /// Which environments have finished an episode and have not begun the next one.
     fn waiting(&self) -> Vec<bool> {
-        let ends = self.pool.blocks.iter().flat_map(|block| &block.ends);
-        ends.map(|end| matches!(end, Some(End::Terminated | End::Truncated))).collect()
+        let members = self.pool.blocks.iter().flat_map(|block| &block.members);
+        members.map(|member| matches!(member.end, Some(End::Terminated | End::Truncated))).collect()
     }
 
     /// Restores the environments and their ends, and has them observe `size` values each.
@@ -199,7 +198,7 @@ impl State {
         let sizes = self.pool.block_sizes().into_iter();
         let rows = sizes.map(|block| rest.split_off_mut(..block * size).expect("rows of each block")).collect();
         self.pool.restore(saved, rows)?;
-        let all = self.pool.blocks.iter_mut().flat_map(|block| &mut block.ends);
+        let all = self.pool.members_mut().map(|member| &mut member.end);
         all.zip(ends).for_each(|(own, end)| *own = end);
         self.can_step = Ok(());
         Ok(())

@@ -72,7 +72,7 @@ impl Policy {
         width: usize,
         compute: impl Fn(&FixedPolicy, &[f32]) -> Vec<f32> + Sync,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let size = self.fixed.policy().spaces.observation_size;
+        let size = self.fixed.policy.spaces.observation_size;
         let [rows, found] = [observations.shape()[0], observations.shape()[1]];
         if found != size {
             return Err(PyValueError::new_err(format!("observations of {found} values, this policy reads {size}")));
@@ -130,14 +130,14 @@ impl Policy {
 
     /// The numbers of values in an observation and in an action.
     fn sizes(&self) -> [usize; 2] {
-        let spaces = &self.fixed.policy().spaces;
+        let spaces = &self.fixed.policy.spaces;
         [spaces.observation_size, spaces.action_size]
     }
 
     /// The standard deviation of each action.
     #[getter]
     fn std(&self) -> f32 {
-        self.fixed.policy().std()
+        self.fixed.policy.std()
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`.
@@ -146,7 +146,7 @@ impl Policy {
         py: Python<'py>,
         observations: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let width = self.fixed.policy().spaces.action_size;
+        let width = self.fixed.policy.spaces.action_size;
         self.computed(py, observations, width, FixedPolicy::mean_actions)
     }
 

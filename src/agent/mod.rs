@@ -44,7 +44,7 @@ pub struct Agent<E: Env> {
 }
 
 /// The record of an iteration.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Debug, Default)]
 pub struct Iteration<L> {
     /// The lesson that was trained in it.
     pub lesson: L,
@@ -78,8 +78,8 @@ impl Agent<Repose> {
     /// Fails if this machine does not support the precision, or if the scene cannot be randomised in the way that is asked.
     pub fn for_task(task: &Arc<Task>, config: &Config, exchange: Exchange) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let envs =
-            exchange.own(config.env.num_envs).map(|_| Repose::randomized(task, randomization.as_ref())).collect();
+        let own = exchange.own(config.env.num_envs);
+        let envs = own.map(|_| Repose::randomized(task, randomization.as_ref())).collect();
         let settings = config.clone();
         let lessons = move |env_steps| Lesson::at(env_steps, &settings);
         Self::new(envs, &config.ppo, config.run.seed, exchange, lessons)
@@ -159,9 +159,12 @@ impl<E: Env> Agent<E> {
             }
             acting.act(rollout, t, noise, work);
             *result = step_block(envs, rollout, t);
-            let cut_off = envs.ends.iter().map(|end| matches!(end, Some(End::Truncated | End::Redirected)));
             let row = rollout.step(t, 1);
-            acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, &envs.final_observations, work);
+            let cut_off = envs.members.iter().map(|member| match member.end {
+                Some(End::Truncated | End::Redirected) => Some(&member.final_observation[..]),
+                Some(End::Terminated) | None => None,
+            });
+            acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, work);
             if t + 1 == horizon {
                 acting.finish(rollout, horizon, work);
             }
@@ -190,10 +193,10 @@ impl<E: Resumable> Agent<E> {
     /// # Errors
     /// Fails if no such agent can have saved this state.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
-        let Progress { iteration, env_steps, fork, .. } = &checkpoint.progress;
-        self.iteration = *iteration;
-        self.env_steps = *env_steps;
-        self.fork.clone_from(fork);
+        let progress = &checkpoint.progress;
+        self.iteration = progress.iteration;
+        self.env_steps = progress.env_steps;
+        self.fork.clone_from(&progress.fork);
         self.ppo.begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
         let numbers = checkpoint.take_doubles(NUMBERS)?;
@@ -209,10 +212,10 @@ impl<E: Resumable> Agent<E> {
 pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t: usize) -> Result<()> {
     let Spaces { observation_size, action_size, .. } = envs.spaces;
     let row = rollout.step(t, 1);
-    let acted = rollout.step(t, action_size);
+    let actions = rollout.step(t, action_size);
     let next = rollout.step(t + 1, observation_size);
-    envs.step(&rollout.actions[acted], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
-    rollout.dones[row].iter_mut().zip(&envs.ends).for_each(|(done, end)| *done = end.is_some());
+    envs.step(&rollout.actions[actions], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
+    rollout.dones[row].iter_mut().zip(&envs.members).for_each(|(done, member)| *done = member.end.is_some());
     Ok(())
 }
 
@@ -225,14 +228,12 @@ pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
     let Progress { iteration, env_steps, ref fork, .. } = checkpoint.progress;
     // The parent of a fork may have made a different number of steps in each iteration.
     let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
-    let own = iteration.checked_sub(before).zip(env_steps.checked_sub(steps_before));
+    let own = i128::from(iteration) - i128::from(before);
+    let steps = i128::from(env_steps) - i128::from(steps_before);
     // An iteration makes at least as many steps as the first one, and at most as many as the last one.
-    let least = config.steps_per_iteration();
-    let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as u64;
-    let possible = own.is_some_and(|(own, steps)| {
-        let bounds = own.checked_mul(least).zip(own.checked_mul(most));
-        bounds.is_some_and(|(least, most)| (least..=most).contains(&steps)) && steps.is_multiple_of(least)
-    });
+    let least = i128::from(config.steps_per_iteration());
+    let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as i128;
+    let possible = own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0;
     ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
     for name in [NUMBERS, COUNTERS] {
         let shape = checkpoint.shape(name).context("it holds a policy alone, which can be played but not resumed")?;

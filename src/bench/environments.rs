@@ -8,7 +8,7 @@ use super::measure::{Found, NEVER, median};
 use crate::agent::Agent;
 use crate::config::{Config, Settings, Source};
 use crate::ranks::Exchange;
-use crate::repose::{Repose, Task};
+use crate::repose::Task;
 
 /// The numbers of environments that are compared, the key of their speed in JSON, and how much a step brings compared with a step of
 /// 1024 environments. The worth of a step comes from training runs of 15 M steps with the default settings (`docs/RECIPES.md`).
@@ -18,29 +18,20 @@ const COMPARED: [(usize, &str, f64); 3] =
 /// Whole iterations of each training run that are measured, in turn, after one that is not.
 const ITERATIONS: usize = 2;
 
-/// A training run of a number of environments that is measured.
-struct Candidate {
-    envs: usize,
-    key: &'static str,
-    worth: f64,
-    agent: Agent<Repose>,
-    /// The control steps per second of each iteration.
-    rates: Vec<f64>,
-}
-
 /// Measures training runs with different numbers of environments and tells which learns most in the same time. A number that the
 /// settings do not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
 pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let given = Source::new("the settings", config.to_text());
-    let mut candidates = Vec::new();
+    // The training runs, each with the control steps per second of its iterations.
+    let mut measured = Vec::new();
     for (envs, key, worth) in COMPARED {
         let number = format!("env.num_envs={envs}").parse().expect("a setting");
         let Ok(config) = Settings::new().file(given.clone()).sets(&[number]).resolve() else { continue };
         let agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
-        candidates.push(Candidate { envs, key, worth, agent, rates: Vec::new() });
+        measured.push((envs, key, worth, agent, Vec::new()));
     }
     for round in 0..=ITERATIONS {
-        for Candidate { agent, rates, .. } in &mut candidates {
+        for (.., agent, rates) in &mut measured {
             let speed = agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s();
             rates.extend((round > 0).then_some(speed));
         }
@@ -49,7 +40,7 @@ pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut lines = String::new();
     let mut best = None;
     let mut most = 0.0;
-    for Candidate { envs, key, worth, rates, .. } in candidates {
+    for (envs, key, worth, _, rates) in measured {
         let speed = median(rates);
         let learning = worth * speed;
         figures.push((key, speed));

@@ -153,7 +153,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     agent.collect(&NEVER)?;
     let Agent { ppo, rollout, .. } = &mut agent;
     let size = config.samples_per_minibatch();
-    let flops = flops_per_sample(ppo.policy());
+    let flops = flops_per_sample(&ppo.policy);
     time_gradient_steps(ppo, rollout, 2)?;
     let times = time_gradient_steps(ppo, rollout, REPEATS)?;
     let samples = size as f64 / median(times.seconds);

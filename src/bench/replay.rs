@@ -23,11 +23,13 @@ struct Start {
 }
 
 /// An environment that records the input of its physics and can replay it. This is the only difference from the environment of a
-/// training.
+/// training run.
 pub(super) struct RecordingEnv {
     env: Repose,
     task: Arc<Task>,
     randomization: Option<Arc<Randomization>>,
+    /// The scene of the episodes that have drawn nothing.
+    nominal: Scene,
     starts: Vec<Start>,
     /// The controls of each step, and the random force on the object, if there are such forces.
     steps: Vec<(Vec<f64>, Option<[f64; 3]>)>,
@@ -47,6 +49,7 @@ impl RecordingEnv {
             env: Repose::randomized(task, randomization),
             task: task.clone(),
             randomization: randomization.cloned(),
+            nominal: nominal.clone(),
             starts: Vec::new(),
             steps: Vec::new(),
             bare: Simulation::new(nominal),
@@ -63,9 +66,11 @@ impl RecordingEnv {
     }
 
     fn start(&mut self) {
-        let state = self.env.simulation().state();
-        let draw = self.env.draw().cloned();
-        self.starts.push(Start { after: self.steps.len(), state, draw });
+        self.starts.push(Start {
+            after: self.steps.len(),
+            state: self.env.simulation().state(),
+            draw: self.env.draw().cloned(),
+        });
     }
 
     /// Prepares the scenes of a replay, and begins it.
@@ -75,8 +80,7 @@ impl RecordingEnv {
             if *draw != self.drawn.0 {
                 let scene = match (&self.randomization, draw) {
                     (Some(randomization), Some(draw)) => randomization.scene_of(draw, &self.task),
-                    (Some(randomization), None) => randomization.nominal().clone(),
-                    (None, _) => self.task.scene().clone(),
+                    _ => self.nominal.clone(),
                 };
                 self.drawn = (draw.clone(), scene);
             }
@@ -148,7 +152,9 @@ pub(super) fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
     envs.par_iter_mut().for_each(|env| env.prepare());
     let steps = envs[0].steps.len();
     let start = Instant::now();
-    in_rounds(&mut pool.blocks, steps, |block, step| block.envs_mut().for_each(|env| env.replay(step)));
+    in_rounds(&mut pool.blocks, steps, |block, step| {
+        block.members.iter_mut().for_each(|member| member.env.replay(step));
+    });
     let seconds = start.elapsed().as_secs_f64();
     let same = pool.envs_mut().all(|env| env.bare.qpos() == env.env.simulation().qpos());
     ensure!(same, "the replay of the physics did not end in the states of the environments");

@@ -5,7 +5,7 @@
 mod pool;
 mod state;
 
-pub use pool::{Autoreset, EnvBlock, EnvPool};
+pub use pool::{Autoreset, EnvBlock, EnvPool, Member};
 pub use state::{EnvState, SavedEnv};
 
 use anyhow::Result;
@@ -14,7 +14,7 @@ use crate::rng::Rng;
 use crate::spaces::Spaces;
 
 /// The reason why a return ends at a step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum End {
     /// There is no future: no reward follows this step.
     Terminated,
@@ -26,7 +26,7 @@ pub enum End {
 }
 
 /// The result of one step.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub struct Transition {
     /// Reward, before any scaling.
     pub reward: f32,

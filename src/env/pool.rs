@@ -3,15 +3,13 @@
 //! Environment i reads and writes its own row of each array and owns everything else that it needs. The randomness of an
 //! episode depends on its number alone. The results therefore do not depend on which thread steps which block, or when.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
-
 use anyhow::{Context, Result, anyhow, ensure};
 use rayon::prelude::*;
 
-use super::{End, Env, EnvState, Resumable, Transition};
+use super::{End, Env, EnvState, Resumable};
 use crate::ranks::Exchange;
 use crate::rng;
-use crate::schedule::{block_sizes, panic_message};
+use crate::schedule::{block_sizes, caught};
 use crate::sim::stepping;
 use crate::spaces::Spaces;
 
@@ -25,7 +23,7 @@ pub struct EnvPool<E: Env> {
 }
 
 /// When an environment whose episode ended starts the next one, in the words of Gymnasium.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq)]
 pub enum Autoreset {
     /// In the step that ended the episode, whose observation is then the first one of the next.
     SameStep,
@@ -39,41 +37,28 @@ pub enum Autoreset {
 pub struct EnvBlock<E: Env> {
     /// The number of this block, counted over all ranks.
     pub number: usize,
-    /// The number of its first environment, counted over all ranks.
-    pub first: usize,
-    /// The ends `[n]` of the last step.
-    pub ends: Vec<Option<End>>,
-    /// Final observations `[n, O]` of the episodes that ended in the last step, and under goals that were replaced. Other rows are
-    /// older.
-    pub final_observations: Vec<f32>,
+    /// Its environments in order.
+    pub members: Vec<Member<E>>,
     /// The description of observations and actions.
     pub spaces: Spaces,
-    slots: Vec<Slot<E>>,
-    draw: Draw,
     finished: Vec<E::Episode>,
 }
 
-struct Slot<E: Env> {
-    env: E,
-    next_episode: u64,
-}
-
-/// Where episodes are drawn from.
-#[derive(Clone, Copy)]
-struct Draw {
-    seed: u64,
-    /// The number of all environments, by which the episode numbers of one environment increase.
-    stride: u64,
-}
-
-/// An environment with its part of its block.
-struct Member<'a, E: Env> {
+/// An environment of a block.
+pub struct Member<E: Env> {
+    /// The environment.
+    pub env: E,
+    /// The end of the last step.
+    pub end: Option<End>,
+    /// The final observation `[O]` of the last episode that ended, or under the last goal that was replaced.
+    pub final_observation: Vec<f32>,
     /// Its number, counted over all ranks.
-    number: usize,
-    slot: &'a mut Slot<E>,
-    draw: Draw,
-    end: &'a mut Option<End>,
-    final_observation: &'a mut [f32],
+    pub number: usize,
+    /// The seed of its episodes.
+    seed: u64,
+    next_episode: u64,
+    /// The number of all environments, by which the numbers of its episodes increase.
+    stride: u64,
 }
 
 impl<E: Env> EnvPool<E> {
@@ -92,23 +77,24 @@ impl<E: Env> EnvPool<E> {
             "environments do not divide evenly into {} shards",
             shards.len()
         );
-        let all = in_shard * exchange.shards();
+        let all = in_shard * exchange.shards;
         let sizes = block_sizes(in_shard, all);
         let first_block = shards.start * sizes.len();
-        let mut first = shards.start * in_shard;
-        let mut slots = (first as u64..).zip(envs).map(|(next_episode, env)| Slot { env, next_episode });
-        let block = |(number, size)| {
-            first += size;
-            EnvBlock {
-                number,
-                first: first - size,
-                ends: vec![None; size],
-                final_observations: vec![0.0; size * spaces.observation_size],
-                slots: slots.by_ref().take(size).collect(),
-                spaces,
-                draw: Draw { seed, stride: all as u64 },
-                finished: Vec::new(),
-            }
+        let member = |(number, env)| Member {
+            env,
+            end: None,
+            final_observation: vec![0.0; spaces.observation_size],
+            number,
+            seed,
+            next_episode: number as u64,
+            stride: all as u64,
+        };
+        let mut members = (shards.start * in_shard..).zip(envs).map(member);
+        let block = |(number, size)| EnvBlock {
+            number,
+            members: members.by_ref().take(size).collect(),
+            spaces,
+            finished: Vec::new(),
         };
         Self { blocks: (first_block..).zip(sizes.repeat(shards.len())).map(block).collect() }
     }
@@ -125,7 +111,7 @@ impl<E: Env> EnvPool<E> {
 
     /// The number of environments in each block.
     pub fn block_sizes(&self) -> Vec<usize> {
-        self.blocks.iter().map(EnvBlock::count).collect()
+        self.blocks.iter().map(|block| block.members.len()).collect()
     }
 
     /// Starts the first episode of every environment, and writes the `observations` `[n, O]` of each block. Ages are
@@ -133,17 +119,16 @@ impl<E: Env> EnvPool<E> {
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = self.spaces().observation_size;
         self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
-            for (member, row) in block.members().zip(rows.chunks_exact_mut(size)) {
-                stepping("environment", member.number, || member.slot.start_aged(member.draw, row));
-            }
+            let rows = rows.chunks_exact_mut(size);
+            block.members.iter_mut().zip(rows).for_each(|(member, row)| member.restart(true, row));
         });
     }
 
     /// Makes the first episodes of `seed` start next.
     pub fn reseed(&mut self, seed: u64) {
-        for block in &mut self.blocks {
-            block.draw.seed = seed;
-            (block.first as u64..).zip(&mut block.slots).for_each(|(episode, slot)| slot.next_episode = episode);
+        for member in self.members_mut() {
+            member.seed = seed;
+            member.next_episode = member.number as u64;
         }
     }
 
@@ -151,12 +136,9 @@ impl<E: Env> EnvPool<E> {
     /// `observations` `[N, O]`.
     pub fn restart(&mut self, marked: &[bool], aged: bool, observations: &mut [f32]) {
         let rows = observations.chunks_exact_mut(self.spaces().observation_size);
-        let members = self.blocks.iter_mut().flat_map(EnvBlock::members).zip(rows).zip(marked);
+        let members = self.members_mut().zip(rows).zip(marked);
         let chosen: Vec<_> = members.filter(|(_, marked)| **marked).map(|(member, _)| member).collect();
-        chosen.into_par_iter().for_each(|(Member { number, slot, draw, end, .. }, row)| {
-            *end = None;
-            stepping("environment", number, || if aged { slot.start_aged(draw, row) } else { slot.start(draw, row) });
-        });
+        chosen.into_par_iter().for_each(|(member, row)| member.restart(aged, row));
     }
 
     /// Steps every environment with its row of `actions` `[N, A]`. Writes `rewards` `[N]` and `observations` `[N, O]`, and to the
@@ -174,7 +156,7 @@ impl<E: Env> EnvPool<E> {
         observations: &mut [f32],
     ) -> Result<Vec<(usize, E::Episode)>> {
         let rows = rows(self.spaces(), self.count(), actions, rewards, observations);
-        let members: Vec<_> = self.blocks.iter_mut().flat_map(EnvBlock::members).zip(rows).collect();
+        let members: Vec<_> = self.members_mut().zip(rows).collect();
         let ended = members.into_par_iter().enumerate().with_max_len(MOST_AT_ONCE).map(|(place, (member, row))| {
             let episode = member.step(autoreset, row)?;
             Ok(episode.map(|episode| (place, episode)))
@@ -194,7 +176,12 @@ impl<E: Env> EnvPool<E> {
 
     /// The environments in order.
     pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
-        self.blocks.iter_mut().flat_map(EnvBlock::envs_mut)
+        self.members_mut().map(|member| &mut member.env)
+    }
+
+    /// The environments in order, each with its number.
+    pub fn members_mut(&mut self) -> impl Iterator<Item = &mut Member<E>> {
+        self.blocks.iter_mut().flat_map(|block| &mut block.members)
     }
 }
 
@@ -202,9 +189,9 @@ impl<E: Resumable> EnvPool<E> {
     /// The state of every environment. It does not include finished episodes that have not been taken yet.
     pub fn save(&self) -> EnvState {
         let mut state = EnvState::default();
-        for slot in self.blocks.iter().flat_map(|block| &block.slots) {
-            state.counters.push(slot.next_episode);
-            slot.env.save(&mut state);
+        for member in self.blocks.iter().flat_map(|block| &block.members) {
+            state.counters.push(member.next_episode);
+            member.env.save(&mut state);
         }
         state
     }
@@ -216,16 +203,16 @@ impl<E: Resumable> EnvPool<E> {
     /// Fails if no such pool can have saved this state.
     pub fn restore(&mut self, state: &EnvState, observations: Vec<&mut [f32]>) -> Result<()> {
         let size = self.spaces().observation_size;
-        let first = self.blocks[0].first;
-        let states = state.rows(self.blocks[0].draw.stride as usize)?.skip(first);
-        let slots = self.blocks.iter_mut().flat_map(|block| &mut block.slots);
+        let first = &self.blocks[0].members[0];
+        let states = state.rows(first.stride as usize)?.skip(first.number);
         let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
-        for (number, ((slot, row), mut state)) in (first..).zip(slots.zip(rows).zip(states)) {
+        for (member, (row, mut state)) in self.members_mut().zip(rows.zip(states)) {
+            let number = member.number;
             let restore = || {
                 let [next_episode] = state.counters()?;
                 ensure!(next_episode < 1 << 60, "episode number {next_episode} is out of range");
-                slot.next_episode = next_episode;
-                slot.env.restore(&mut state, row)?;
+                member.next_episode = next_episode;
+                member.env.restore(&mut state, row)?;
                 state.finish()
             };
             stepping("environment", number, restore).with_context(|| format!("environment {number}"))?;
@@ -236,16 +223,6 @@ impl<E: Resumable> EnvPool<E> {
 }
 
 impl<E: Env> EnvBlock<E> {
-    /// The number n of environments in this block.
-    pub fn count(&self) -> usize {
-        self.slots.len()
-    }
-
-    /// The environments in order.
-    pub fn envs_mut(&mut self) -> impl Iterator<Item = &mut E> {
-        self.slots.iter_mut().map(|slot| &mut slot.env)
-    }
-
     /// Steps every environment with its row of `actions` `[n, A]`. Where an episode ended, starts a new one. Where a goal was
     /// replaced, continues under another one. Writes the `rewards` `[n]`, and the `observations` `[n, O]` to act on next. These
     /// belong to the new episode or show the new goal.
@@ -253,27 +230,11 @@ impl<E: Env> EnvBlock<E> {
     /// # Errors
     /// Fails with the environment's number if an environment panics. The pool must not be stepped again.
     pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
-        let rows = rows(self.spaces, self.count(), actions, rewards, observations);
-        let mut finished = std::mem::take(&mut self.finished);
-        for (member, row) in self.members().zip(rows) {
-            finished.extend(member.step(Autoreset::SameStep, row)?);
+        let rows = rows(self.spaces, self.members.len(), actions, rewards, observations);
+        for (member, row) in self.members.iter_mut().zip(rows) {
+            self.finished.extend(member.step(Autoreset::SameStep, row)?);
         }
-        self.finished = finished;
         Ok(())
-    }
-
-    /// The environments in order, each with its part of the block.
-    fn members(&mut self) -> impl Iterator<Item = Member<'_, E>> {
-        let draw = self.draw;
-        let finals = self.final_observations.chunks_exact_mut(self.spaces.observation_size);
-        let own = self.slots.iter_mut().zip(&mut self.ends).zip(finals);
-        (self.first..).zip(own).map(move |(number, ((slot, end), final_observation))| Member {
-            number,
-            slot,
-            draw,
-            end,
-            final_observation,
-        })
     }
 }
 
@@ -296,57 +257,53 @@ fn rows<'a>(
     actions.chunks_exact(action_size).zip(rewards).zip(observations.chunks_exact_mut(observation_size))
 }
 
-impl<E: Env> Member<'_, E> {
+impl<E: Env> Member<E> {
+    /// Starts the next episode, at a random age if `aged`, and writes the observation.
+    fn restart(&mut self, aged: bool, observation: &mut [f32]) {
+        stepping("environment", self.number, || {
+            let mut rng = rng::stream(self.seed, "age", self.next_episode);
+            self.start(observation);
+            if aged {
+                self.env.skip_ahead(rng::uniform(&mut rng, 0.0, 1.0));
+            }
+        });
+    }
+
+    fn start(&mut self, observation: &mut [f32]) {
+        self.end = None;
+        self.env.reset(rng::stream(self.seed, "episode", self.next_episode), observation);
+        self.next_episode += self.stride;
+    }
+
     /// Steps the environment, or starts its next episode where that takes the place of a step. The result is the episode that
     /// ended.
     ///
     /// # Errors
     /// Fails with the environment's number if it panics.
-    fn step(self, autoreset: Autoreset, ((action, reward), observation): Row) -> Result<Option<E::Episode>> {
-        let Self { number, slot, draw, end, final_observation } = self;
+    fn step(&mut self, autoreset: Autoreset, ((action, reward), observation): Row) -> Result<Option<E::Episode>> {
+        let number = self.number;
         let step = || {
-            if autoreset == Autoreset::NextStep && matches!(end, Some(End::Truncated | End::Terminated)) {
+            let is_over = |end| matches!(end, Some(End::Truncated | End::Terminated));
+            if autoreset == Autoreset::NextStep && is_over(self.end) {
                 *reward = 0.0;
-                *end = None;
-                slot.start(draw, observation);
+                self.start(observation);
                 return None;
             }
-            let transition: Transition = slot.env.step(action, observation);
+            let transition = self.env.step(action, observation);
             *reward = transition.reward;
-            *end = transition.end;
-            if end.is_some() {
-                final_observation.copy_from_slice(observation);
+            if transition.end.is_some() {
+                self.final_observation.copy_from_slice(observation);
             }
-            match transition.end {
-                None => None,
-                Some(End::Redirected) => {
-                    slot.env.redirect(observation);
-                    None
-                }
-                Some(End::Truncated | End::Terminated) => {
-                    let episode = slot.env.episode();
-                    if autoreset == Autoreset::SameStep {
-                        slot.start(draw, observation);
-                    }
-                    Some(episode)
-                }
+            let ended = is_over(transition.end).then(|| self.env.episode());
+            if transition.end == Some(End::Redirected) {
+                self.env.redirect(observation);
+            } else if ended.is_some() && autoreset == Autoreset::SameStep {
+                self.start(observation);
             }
+            self.end = transition.end;
+            ended
         };
-        // Unwind safe: a state that a panic left inconsistent is not used again.
-        stepping("environment", number, || catch_unwind(AssertUnwindSafe(step)))
-            .map_err(|panic| anyhow!("environment {number} panicked: {}", panic_message(&*panic)))
-    }
-}
-
-impl<E: Env> Slot<E> {
-    fn start(&mut self, draw: Draw, row: &mut [f32]) {
-        self.env.reset(rng::stream(draw.seed, "episode", self.next_episode), row);
-        self.next_episode += draw.stride;
-    }
-
-    fn start_aged(&mut self, draw: Draw, row: &mut [f32]) {
-        let age = rng::uniform(&mut rng::stream(draw.seed, "age", self.next_episode), 0.0, 1.0);
-        self.start(draw, row);
-        self.env.skip_ahead(age);
+        stepping("environment", number, || caught(step))
+            .map_err(|panic| anyhow!("environment {number} panicked: {panic}"))
     }
 }

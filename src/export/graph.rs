@@ -21,7 +21,7 @@ pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
         None => "obs".into(),
     };
     let seen = match perception.object_and_goal {
-        Some(places) => canonicalize(&mut graph, size, &seen, (places, perception.rotations())),
+        Some(places) => canonicalize(&mut graph, size, &seen, (places, &perception.rotations)),
         None => seen,
     };
     graph.floats("mean", &[size], &mean);

@@ -13,7 +13,7 @@ use crate::spaces::Spaces;
 
 /// The policy that collects a rollout, shared by all threads.
 pub struct Acting<'a> {
-    pub(super) policy: FrozenPolicy<'a>,
+    pub(super) frozen: FrozenPolicy<'a>,
     pub(super) config: &'a PpoConfig,
     /// The noise scale far from the goal.
     pub(super) away_scale: f32,
@@ -22,13 +22,13 @@ pub struct Acting<'a> {
 impl Acting<'_> {
     /// Draws actions for the observations of step `t`. Writes actions, means, noise scales, log-probabilities and values.
     pub fn act(&self, block: &mut RolloutBlock, t: usize, noise: &mut Rng, work: &mut Workspace) {
-        let Spaces { observation_size, action_size, .. } = *self.policy.spaces();
+        let Spaces { observation_size, action_size, .. } = self.frozen.policy.spaces;
         let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
         let actions = &mut block.actions[acted.clone()];
         let means = &mut block.means[acted];
-        self.policy.actions_and_values(observations, (means, &mut block.values[one.clone()]), work);
-        let std = self.policy.std();
+        self.frozen.actions_and_values(observations, (means, &mut block.values[one.clone()]), work);
+        let std = self.frozen.policy.std();
         let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
         let rows = rows.zip(observations.chunks_exact(observation_size));
@@ -55,28 +55,24 @@ impl Acting<'_> {
             return 1.0;
         }
         let [near, far] = self.config.away_range.map(|distance| distance as f32);
-        let spaces = self.policy.spaces();
+        let spaces = &self.frozen.policy.spaces;
         let fraction = (((spaces.distance)(spaces, observation) - near) / (far - near)).clamp(0.0, 1.0);
         1.0 + (self.away_scale - 1.0) * fraction
     }
 
-    /// Scales the rewards of a step. Where the future of an environment was cut off, also adds the discounted value of
-    /// its final observation. So advantages need only one array of ends. `cut_off` `[n]`, `final_observations` `[n,
-    /// O]`.
-    pub fn scale_and_bootstrap(
+    /// Scales the rewards `[n]` of a step. Where the future of an environment was cut off, also adds the discounted value of
+    /// its final observation `[O]`. So advantages need only one array of ends.
+    pub fn scale_and_bootstrap<'o>(
         &self,
         rewards: &mut [f32],
-        cut_off: impl Iterator<Item = bool>,
-        final_observations: &[f32],
+        cut_off: impl Iterator<Item = Option<&'o [f32]>>,
         work: &mut Workspace,
     ) {
-        let size = final_observations.len() / rewards.len();
-        let steps = rewards.iter_mut().zip(cut_off).zip(final_observations.chunks_exact(size));
-        for ((reward, cut_off), observation) in steps {
+        for (reward, cut_off) in rewards.iter_mut().zip(cut_off) {
             *reward *= self.config.reward_scale as f32;
-            if cut_off {
+            if let Some(observation) = cut_off {
                 let mut value = [0.0];
-                self.policy.values(observation, &mut value, work);
+                self.frozen.values(observation, &mut value, work);
                 *reward += self.config.gamma as f32 * value[0];
             }
         }
@@ -84,8 +80,8 @@ impl Acting<'_> {
 
     /// Writes the values of the observations after the last step.
     pub fn finish(&self, block: &mut RolloutBlock, horizon: usize, work: &mut Workspace) {
-        let seen = block.step(horizon, self.policy.spaces().observation_size);
+        let seen = block.step(horizon, self.frozen.policy.spaces.observation_size);
         let one = block.step(horizon, 1);
-        self.policy.values(&block.observations[seen], &mut block.values[one], work);
+        self.frozen.values(&block.observations[seen], &mut block.values[one], work);
     }
 }

@@ -22,7 +22,7 @@ const CHUNK: usize = 8192;
 const NORM_CHUNK: usize = 4096;
 
 /// The Adam optimizer: D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(PartialEq)]
 pub(super) struct Adam {
     /// The running mean of the gradient.
     pub mean: Vec<f32>,

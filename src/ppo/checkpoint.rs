@@ -38,7 +38,7 @@ const LOG_STD: &str = "log_std";
 const LEARNING_RATE: &str = "learning_rate";
 
 /// A checkpoint, or a policy alone, independent of a learner.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Checkpoint {
     /// The configuration of the run, as TOML.
     pub config: String,
@@ -67,9 +67,8 @@ impl Checkpoint {
         let config = text("config")?;
         let long = config.len();
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
-        let progress = serde_json::from_str(&text("progress")?);
-        let progress =
-            progress.map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
+        let progress = serde_json::from_str(&text("progress")?)
+            .map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
         let scene = text(SCENE)?;
         let hand = text(HAND)?;
         let provenance = content.texts.remove(PROVENANCE);
@@ -187,14 +186,13 @@ impl Checkpoint {
         };
         let size = spaces.observation_size;
         let count = self.take_vector("normalizer.count", 1)?[0];
-        let [mean, variance] = ["mean", "variance"].map(|of| self.take_vector(&format!("normalizer.{of}"), size));
-        policy.normalizer = Normalizer { mean: mean?, variance: variance?, count };
-        let Normalizer { mean, variance, .. } = &policy.normalizer;
-        let small = |x: f64| x.abs() < 1e18;
-        let sound = small(count) && mean.iter().chain(variance).copied().all(small);
+        let mean = self.take_vector("normalizer.mean", size)?;
+        let variance = self.take_vector("normalizer.variance", size)?;
+        let sound = mean.iter().chain(&variance).chain([&count]).all(|x| x.abs() < 1e18);
         ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
         ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
+        policy.normalizer = Normalizer { mean, variance, count };
         Ok(policy)
     }
 

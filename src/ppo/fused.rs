@@ -15,7 +15,7 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::backend::{GradientBackend, Losses};
-use super::kernels::{Arithmetic, Net, Purpose, ROWS, Workspace};
+use super::kernels::{Arithmetic, Purpose, ROWS, Workspace};
 use super::loss::{Loss, Sums};
 use super::policy::Policy;
 use super::rollout::{Rollout, RolloutBlock};
@@ -54,51 +54,20 @@ impl Fused {
         Self { config: config.clone(), arithmetic, workspaces: Vec::new(), parts: Vec::new(), seen: Vec::new() }
     }
 
-    /// Makes room for this number of groups of up to `samples` samples. The result is the number of rows that pass through a
-    /// net together, chosen for blocks of equal size as far as possible.
-    fn reserve(&mut self, policy: &Policy, groups: usize, samples: usize) -> usize {
+    /// Makes room for these groups. The result is the number of rows that pass through a net together, chosen for blocks of equal
+    /// size as far as possible.
+    fn reserve(&mut self, policy: &Policy, groups: &[&[u32]]) -> usize {
+        let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows() >= rows);
+        self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
             self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, self.arithmetic)));
         }
-        self.parts.resize_with(groups, Default::default);
+        self.parts.resize_with(groups.len(), Default::default);
         for (part, range) in self.parts.iter_mut().flat_map(|nets| nets.iter_mut().zip(policy.layout.nets())) {
             part.gradient.resize(range.len(), 0.0);
         }
         rows
-    }
-}
-
-/// What all jobs of a minibatch read.
-struct Jobs<'a> {
-    nets: [Net<'a>; 2],
-    loss: Loss<'a>,
-    /// The number of rows that pass through a net together.
-    rows: usize,
-    seen: &'a [f32],
-    workspaces: &'a [Mutex<Workspace>],
-}
-
-impl Jobs<'_> {
-    /// Passes the samples of a group forward and backward through a net.
-    fn run(&self, group: &[u32], role: Role, part: &mut Partial) {
-        let net = &self.nets[role as usize];
-        part.sums = self.loss.of_none();
-        let thread = rayon::current_thread_index().expect("runs on a rayon thread");
-        let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
-        for (i, block) in group.chunks(self.rows).enumerate() {
-            for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
-                row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
-            }
-            net.forward(block.len(), work);
-            let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
-            match role {
-                Role::Actor => self.loss.actor(block, outputs, grad, &mut part.sums),
-                Role::Critic => self.loss.critic(block, outputs, grad, &mut part.sums),
-            }
-            net.backward(block.len(), work, &mut part.gradient, i > 0);
-        }
     }
 }
 
@@ -108,27 +77,43 @@ impl GradientBackend for Fused {
         let size = policy.spaces.observation_size;
         self.seen.resize(rollout.samples() * size, 0.0);
         let mut rest = &mut self.seen[..];
-        let mut seen = |block: &RolloutBlock| rest.split_off_mut(..block.samples() * size).expect("room for all");
-        let parts: Vec<_> = rollout.blocks.iter().map(|block| (seen(block), block)).collect();
-        parts.into_par_iter().for_each(|(seen, block)| transform.apply(block.acted_on(), seen));
+        let mut parts = Vec::new();
+        for raw in rollout.blocks.iter().map(RolloutBlock::acted_on) {
+            parts.push((raw, rest.split_off_mut(..raw.len()).expect("room for all")));
+        }
+        parts.into_par_iter().for_each(|(raw, seen)| transform.apply(raw, seen));
     }
 
     fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>> {
-        let largest = of.groups.iter().map(|group| group.len()).max().unwrap_or(0);
-        let rows = self.reserve(policy, of.groups.len(), largest);
-        let jobs = Jobs {
-            nets: policy.nets(self.arithmetic, Purpose::Learning),
-            loss: Loss::new(policy, rollout, of.count, &self.config),
-            rows,
-            seen: &self.seen,
-            workspaces: &self.workspaces,
+        let rows = self.reserve(policy, &of.groups);
+        let nets = policy.nets(self.arithmetic, Purpose::Learning);
+        let loss = Loss::new(policy, rollout, of.count, &self.config);
+        // Passes the samples of a group forward and backward through a net.
+        let job = |(group, role, part): (&[u32], Role, &mut Partial)| {
+            let net = &nets[role as usize];
+            part.sums = loss.of_none();
+            let thread = rayon::current_thread_index().expect("runs on a rayon thread");
+            let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
+            for (i, block) in group.chunks(rows).enumerate() {
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
+                    row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
+                }
+                net.forward(block.len(), work);
+                let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
+                match role {
+                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
+                    Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
+                }
+                net.backward(block.len(), work, &mut part.gradient, i > 0);
+            }
         };
-        let parts = of.groups.iter().zip(&mut self.parts);
-        let all: Vec<_> = parts
-            .flat_map(|(group, [actor, critic])| [(group, Role::Actor, actor), (group, Role::Critic, critic)])
-            .collect();
-        all.into_par_iter().with_max_len(1).for_each(|(group, role, part)| jobs.run(group, role, part));
-        Ok(self.parts.iter().map(|[actor, critic]| jobs.loss.of_group(&actor.sums, &critic.sums)).collect())
+        let mut jobs = Vec::new();
+        for (&group, [actor, critic]) in of.groups.iter().zip(&mut self.parts) {
+            jobs.push((group, Role::Actor, actor));
+            jobs.push((group, Role::Critic, critic));
+        }
+        jobs.into_par_iter().with_max_len(1).for_each(job);
+        Ok(self.parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
     }
 
     fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {

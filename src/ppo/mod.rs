@@ -54,7 +54,8 @@ use kernels::Arithmetic;
 pub struct Ppo {
     config: PpoConfig,
     seed: u64,
-    policy: Policy,
+    /// The current policy.
+    pub policy: Policy,
     backend: Box<dyn GradientBackend>,
     arithmetic: Arithmetic,
     /// The gradient of all parameters for the last minibatch.
@@ -105,11 +106,6 @@ impl Ppo {
         })
     }
 
-    /// The current policy.
-    pub fn policy(&self) -> &Policy {
-        &self.policy
-    }
-
     /// A checksum (CRC-32) of all parameters.
     pub fn checksum(&self) -> u32 {
         let mut hasher = crc32fast::Hasher::new();
@@ -151,9 +147,8 @@ impl Ppo {
 
     /// The policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
-        let policy = self.policy.freeze_for(self.arithmetic);
-        let away_scale = (self.away_std / policy.std()).max(1.0);
-        Acting { policy, config: &self.config, away_scale }
+        let away_scale = (self.away_std / self.policy.std()).max(1.0);
+        Acting { frozen: self.policy.freeze_for(self.arithmetic), config: &self.config, away_scale }
     }
 
     /// The generator of the action noise for a block of environments in an iteration.

@@ -9,7 +9,7 @@ use crate::ranks::Exchange;
 const ROWS_PER_TASK: usize = 1024;
 
 /// Statistics of each of the O values of an observation.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub struct Normalizer {
     /// `[O]`: means
     pub mean: Vec<f64>,

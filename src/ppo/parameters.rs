@@ -8,7 +8,6 @@ use std::ops::Range;
 use crate::spaces::Spaces;
 
 /// The parameters of a policy, in order: actor and critic, each layer by layer with weights before biases.
-#[derive(Clone, Debug, PartialEq)]
 pub struct ParameterLayout {
     /// The layers of the actor.
     pub actor: Vec<Layer>,
@@ -17,7 +16,6 @@ pub struct ParameterLayout {
 }
 
 /// One layer of a net.
-#[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
     /// The number of inputs.
     pub inputs: usize,
@@ -30,7 +28,6 @@ pub struct Layer {
 }
 
 /// One parameter tensor as it is named in a file.
-#[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// The name, e.g. `actor.0.weight`.
     pub name: String,

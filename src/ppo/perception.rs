@@ -17,12 +17,12 @@ pub const CLIP: f32 = 5.0;
 const EPSILON: f64 = 1e-5;
 
 /// What a policy treats as the same in raw observations.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
     pub object_and_goal: Option<ObjectAndGoal>,
     /// The rotations that map the object onto itself. If there are fewer, the first one fills the rest.
-    rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
+    pub rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
 }
 
 impl Perception {
@@ -34,11 +34,6 @@ impl Perception {
         let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
         rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
         Self { object_and_goal, rotations }
-    }
-
-    /// The rotations that map the object onto itself. The first one may be repeated at the end.
-    pub fn rotations(&self) -> &[[f32; 4]] {
-        &self.rotations
     }
 
     /// Maps one raw observation `[O]`, in place, to the observation that represents all equivalent ones.
@@ -63,7 +58,6 @@ impl Perception {
 }
 
 /// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
-#[derive(Clone, Debug)]
 pub struct InputTransform {
     /// What it treats as the same.
     pub perception: Perception,

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Purpose, Workspace};
-use super::parameters::{Layer, ParameterLayout};
+use super::parameters::ParameterLayout;
 use super::perception::{InputTransform, Perception};
 use crate::config::{Activation, NetConfig};
 use crate::ranks::Exchange;
@@ -39,16 +39,17 @@ pub struct Policy {
 
 /// A policy in its current state, for acting. While it lives, the parameters cannot be written to.
 pub struct FrozenPolicy<'a> {
-    policy: &'a Policy,
-    actor: Net<'a>,
-    critic: Net<'a>,
+    /// The policy.
+    pub policy: &'a Policy,
+    nets: [Net<'a>; 2],
     transform: InputTransform,
 }
 
 /// A policy that never changes, for calls with any number of rows. The results for a row are bit for bit the same whatever the
 /// other rows are, because it always computes [`GROUP`] rows together.
 pub struct FixedPolicy {
-    policy: Arc<Policy>,
+    /// The policy.
+    pub policy: Arc<Policy>,
     /// Copies of the weights of actor and critic, as a net reads them.
     copies: [Vec<Vec<f32>>; 2],
 }
@@ -96,10 +97,15 @@ impl Policy {
         InputTransform::new(self.perception, &self.normalizer)
     }
 
+    /// Actor and critic.
+    fn plain_nets(&self) -> [Net<'_>; 2] {
+        let layout = &self.layout;
+        [&layout.actor, &layout.critic].map(|layers| Net::new(layers, &self.parameters, self.activation))
+    }
+
     /// Actor and critic, prepared for workspaces of this arithmetic.
     pub(super) fn nets(&self, arithmetic: Arithmetic, purpose: Purpose) -> [Net<'_>; 2] {
-        let net = |layers: &Vec<Layer>| Net::new(layers, &self.parameters, self.activation);
-        let mut nets = [&self.layout.actor, &self.layout.critic].map(net);
+        let mut nets = self.plain_nets();
         Net::prepare(&mut nets, arithmetic, purpose);
         nets
     }
@@ -111,8 +117,7 @@ impl Policy {
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        let [actor, critic] = self.nets(arithmetic, Purpose::Acting);
-        FrozenPolicy { policy: self, actor, critic, transform: self.input_transform() }
+        FrozenPolicy { policy: self, nets: self.nets(arithmetic, Purpose::Acting), transform: self.input_transform() }
     }
 }
 
@@ -123,24 +128,14 @@ impl FrozenPolicy<'_> {
         Workspace::new(&self.policy.layout.actor, rows, Arithmetic::F32)
     }
 
-    /// The sizes and the structure of observations and actions.
-    pub fn spaces(&self) -> &Spaces {
-        &self.policy.spaces
-    }
-
-    /// The standard deviation of each action (see [`Policy::std`]).
-    pub fn std(&self) -> f32 {
-        self.policy.std()
-    }
-
     /// Writes the mean actions `[B, A]` for raw observations `[B, O]`.
     pub fn mean_actions(&self, observations: &[f32], means: &mut [f32], work: &mut Workspace) {
-        self.forward(observations, &mut [(&self.actor, means)], work);
+        self.forward(observations, &mut [(&self.nets[0], means)], work);
     }
 
     /// Writes the values `[B]` of raw observations `[B, O]`.
     pub fn values(&self, observations: &[f32], values: &mut [f32], work: &mut Workspace) {
-        self.forward(observations, &mut [(&self.critic, values)], work);
+        self.forward(observations, &mut [(&self.nets[1], values)], work);
     }
 
     /// Writes both, mean actions and values, and reads the observations only once.
@@ -150,13 +145,14 @@ impl FrozenPolicy<'_> {
         (means, values): (&mut [f32], &mut [f32]),
         work: &mut Workspace,
     ) {
-        self.forward(observations, &mut [(&self.actor, means), (&self.critic, values)], work);
+        let [actor, critic] = &self.nets;
+        self.forward(observations, &mut [(actor, means), (critic, values)], work);
     }
 
     fn forward(&self, observations: &[f32], outputs: &mut [(&Net, &mut [f32])], work: &mut Workspace) {
         let size = self.policy.spaces.observation_size;
         let mut done = 0;
-        for raw in observations.chunks(work.rows() * size) {
+        for raw in observations.chunks(work.rows * size) {
             let rows = raw.len() / size;
             self.transform.apply(raw, &mut work.inputs[..raw.len()]);
             for (net, out) in &mut *outputs {
@@ -171,13 +167,7 @@ impl FrozenPolicy<'_> {
 impl FixedPolicy {
     /// Fixes a policy.
     pub fn new(policy: Arc<Policy>) -> Self {
-        let net = |layers: &Vec<Layer>| Net::new(layers, &policy.parameters, policy.activation).copies();
-        Self { copies: [&policy.layout.actor, &policy.layout.critic].map(net), policy }
-    }
-
-    /// The policy.
-    pub fn policy(&self) -> &Policy {
-        &self.policy
+        Self { copies: policy.plain_nets().map(|net| net.copies()), policy }
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`. More than one group is shared among the threads of rayon's
@@ -195,10 +185,9 @@ impl FixedPolicy {
     /// The policy for acting, without copying its weights.
     pub fn frozen(&self) -> FrozenPolicy<'_> {
         let policy = &self.policy;
-        let net = |layers, copies| Net::new(layers, &policy.parameters, policy.activation).with_copies(copies);
-        let actor = net(&policy.layout.actor, &self.copies[0]);
-        let critic = net(&policy.layout.critic, &self.copies[1]);
-        FrozenPolicy { policy, actor, critic, transform: policy.input_transform() }
+        let mut nets = policy.plain_nets();
+        nets.iter_mut().zip(&self.copies).for_each(|(net, copies)| net.set_copies(copies));
+        FrozenPolicy { policy, nets, transform: policy.input_transform() }
     }
 
     fn in_groups(
@@ -238,14 +227,15 @@ mod tests {
         let net = Config::default().ppo.net();
         let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7)));
         let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
-        let (actions, values) = (policy.mean_actions(&observations), policy.values(&observations));
+        let actions = policy.mean_actions(&observations);
+        let values = policy.values(&observations);
         assert_eq!([actions.len(), values.len()], [150 * 20, 150]);
         for rows in [0, 1, 2, 63, 64, 65, 150] {
             let first = &observations[..rows * SIZE];
             assert_eq!(policy.mean_actions(first), actions[..rows * 20], "{rows} rows");
             assert_eq!(policy.values(first), values[..rows], "{rows} rows");
         }
-        let frozen = policy.policy().freeze();
+        let frozen = policy.policy.freeze();
         let mut means = vec![0.0; 64 * 20];
         frozen.mean_actions(&observations[..64 * SIZE], &mut means, &mut frozen.workspace(64));
         assert_eq!(means, actions[..64 * 20], "as a score computes them");

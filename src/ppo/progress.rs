@@ -41,8 +41,11 @@ impl Rise {
     /// Records another evaluation.
     pub fn add(&mut self, figures: [f64; 3]) {
         let of = |[goals, rot_dist, _]: [f64; 3]| Evaluation { goals, rot_dist };
-        let is_best = of(figures).beats(Some(of(self.best)));
-        (self.best, self.since) = if is_best { (figures, 0) } else { (self.best, self.since.saturating_add(1)) };
+        self.since = self.since.saturating_add(1);
+        if of(figures).beats(Some(of(self.best))) {
+            self.best = figures;
+            self.since = 0;
+        }
     }
 }
 

@@ -19,7 +19,6 @@ use crate::ranks::Minibatch;
 use crate::rng;
 
 /// The position of a gradient step among the steps that move the policy. The learning rate follows how far they have moved it.
-#[derive(Clone, Copy, Debug)]
 pub(super) enum Stage {
     /// Before all of them: only the critic learns.
     CriticAlone,
@@ -30,7 +29,7 @@ pub(super) enum Stage {
 }
 
 /// Statistics of an update: means over its minibatches unless stated otherwise.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default)]
 pub struct UpdateStats {
     /// The losses.
     pub losses: Losses,
@@ -168,7 +167,7 @@ impl Ppo {
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
-        let mut own = self.slices.own();
+        let mut own = self.slices.own.clone();
         if let Stage::CriticAlone = stage {
             own = own.start.max(nets[1].start).min(own.end)..own.end;
         }

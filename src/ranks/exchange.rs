@@ -16,7 +16,8 @@ use super::Ranks;
 /// calls in the same order. Copies share the count of their traffic.
 #[derive(Clone)]
 pub struct Exchange {
-    shards: usize,
+    /// The number of all shards.
+    pub shards: usize,
     /// All ranks, if this is not the only one.
     ranks: Option<Arc<dyn Ranks>>,
     /// The nanoseconds spent, and the bytes sent.
@@ -47,11 +48,6 @@ impl Exchange {
         );
         assert!(shards.is_power_of_two(), "{shards} shards");
         Ok(Self { shards, ..self })
-    }
-
-    /// The number of all shards.
-    pub fn shards(&self) -> usize {
-        self.shards
     }
 
     /// The shards of this rank.

@@ -1,6 +1,5 @@
 //! How this process was started: alone, or by a launcher as one of several.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -8,19 +7,10 @@ use anyhow::{Result, anyhow, bail};
 
 use super::Exchange;
 use crate::os;
-use crate::schedule::panic_message;
+use crate::schedule::caught;
 
 /// The time that the first rank has to save and to report an error, before another rank reports it and ends all.
 const PATIENCE: Duration = Duration::from_secs(5);
-
-/// What a launcher has said about this process.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Launched {
-    /// The index of this process.
-    rank: usize,
-    /// The number of processes.
-    size: usize,
-}
 
 /// The variables in which launchers pass size and rank: OpenMPI, MPICH and its relatives, Slurm.
 const TOLD: [(&str, &str); 3] = [
@@ -29,8 +19,8 @@ const TOLD: [(&str, &str); 3] = [
     ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID"),
 ];
 
-/// What a launcher has said, if this process is one of several.
-fn launched() -> Option<Launched> {
+/// The rank of this process and the number of processes, if a launcher has said that this process is one of several.
+fn launched() -> Option<(usize, usize)> {
     told(|name| std::env::var(name).ok())
 }
 
@@ -42,7 +32,7 @@ pub fn launched_by_mpirun() -> bool {
 
 /// Whether this process speaks for all processes that were started together.
 pub fn is_spokesman() -> bool {
-    launched().is_none_or(|launched| launched.rank == 0)
+    launched().is_none_or(|(rank, _)| rank == 0)
 }
 
 /// Checks that no launcher has started several processes, for what only one process can do.
@@ -51,16 +41,16 @@ pub fn is_spokesman() -> bool {
 /// Fails if there are several.
 pub fn expect_one() -> Result<()> {
     match launched() {
-        Some(Launched { size, .. }) => bail!("only `train` runs on several ranks; {size} processes were started"),
+        Some((_, size)) => bail!("only `train` runs on several ranks; {size} processes were started"),
         None => Ok(()),
     }
 }
 
-fn told(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
+fn told(variable: impl Fn(&str) -> Option<String>) -> Option<(usize, usize)> {
     let number = |name| variable(name)?.trim().parse::<usize>().ok();
     TOLD.into_iter().find_map(|(size, rank)| {
         let size = number(size).filter(|&size| size > 1)?;
-        Some(Launched { rank: number(rank).unwrap_or(0), size })
+        Some((number(rank).unwrap_or(0), size))
     })
 }
 
@@ -83,8 +73,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
         os::speak_as(&format!("rank {}", exchange.rank()));
     }
     // Leaving the others means waiting for them, and they may be waiting for this one.
-    let result = catch_unwind(AssertUnwindSafe(|| work(exchange)));
-    let result = result.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))));
+    let result = caught(|| work(exchange)).unwrap_or_else(|panic| Err(anyhow!("panic: {panic}")));
     result.or_else(|error| {
         if !exchange.is_first() {
             // An error that occurs on all ranks at once, such as a loss that is not finite, is reported by the first.
@@ -97,7 +86,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
 
 #[cfg(feature = "mpi")]
 fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
-    let Some(Launched { size, .. }) = launched() else { return Ok((Exchange::alone(1), None)) };
+    let Some((_, size)) = launched() else { return Ok((Exchange::alone(1), None)) };
     let (universe, ranks) = super::mpi::join()?;
     let exchange = Exchange::new(std::sync::Arc::new(ranks));
     if exchange.is_alone() {
@@ -111,7 +100,7 @@ fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
 
 #[cfg(not(feature = "mpi"))]
 fn join() -> Result<(Exchange, ())> {
-    if let Some(Launched { size, .. }) = launched() {
+    if let Some((_, size)) = launched() {
         bail!(
             "{size} processes were started, but this build has no MPI: each would train on its own; build with --features mpi \
              (docs/CLUSTER.md), or start one process"
@@ -131,7 +120,7 @@ mod tests {
         };
         assert_eq!(of(&[]), None);
         assert_eq!(of(&[("PMI_SIZE", "1"), ("PMI_RANK", "0")]), None);
-        let expected = Some(Launched { rank: 3, size: 4 });
+        let expected = Some((3, 4));
         assert_eq!(of(&[("OMPI_COMM_WORLD_SIZE", "4"), ("OMPI_COMM_WORLD_RANK", "3")]), expected);
         assert_eq!(of(&[("PMI_SIZE", "4"), ("PMI_RANK", "3")]), expected);
         assert_eq!(of(&[("SLURM_STEP_NUM_TASKS", "4"), ("SLURM_PROCID", "3")]), expected);

@@ -1,10 +1,8 @@
 //! The samples of each minibatch: equal parts from each shard, so that a rank draws its own without knowing the others'.
 
-use std::ops::Range;
-
 use rand::seq::SliceRandom;
 
-use super::Exchange;
+use super::exchange::{Exchange, part};
 use crate::rng::Rng;
 
 /// The largest number of groups in a minibatch, unless it has more shards. More groups can occupy more threads (there
@@ -15,7 +13,6 @@ const GROUPS: usize = 16;
 const SMALLEST_GROUP: usize = 32;
 
 /// The samples of this rank that one gradient step learns from.
-#[derive(Clone, Debug)]
 pub struct Minibatch<'a> {
     /// Groups whose gradients are added up as a binary tree. Their number is a power of two.
     pub groups: Vec<&'a [u32]>,
@@ -39,7 +36,7 @@ impl Exchange {
     pub fn minibatches(&self, samples: usize, size: usize, rng: impl Fn(u64) -> Rng) -> Minibatches {
         let shuffles = self.own_shards().map(|shard| rng(shard as u64)).collect();
         let order = (0..samples as u32).collect();
-        Minibatches { exchange: self.clone(), order, of_shard: size / self.shards(), shuffles }
+        Minibatches { exchange: self.clone(), order, of_shard: size / self.shards, shuffles }
     }
 
     /// The minibatch of these samples of this rank, shard after shard, equally many of each.
@@ -51,11 +48,10 @@ impl Exchange {
     /// Splits the samples of each shard into groups.
     fn grouped<'a>(&self, shards: Vec<&'a [u32]>) -> Minibatch<'a> {
         let in_shard = shards[0].len();
-        let groups = groups_of_shard(in_shard, self.shards());
-        let bounds: Vec<Range<usize>> =
-            (0..groups).map(|i| in_shard * i / groups..in_shard * (i + 1) / groups).collect();
-        let groups = shards.iter().flat_map(|shard| bounds.iter().map(|bounds| &shard[bounds.clone()])).collect();
-        Minibatch { groups, count: in_shard * self.shards() }
+        let groups = groups_of_shard(in_shard, self.shards);
+        let split = |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
+        let groups = shards.into_iter().flat_map(split).collect();
+        Minibatch { groups, count: in_shard * self.shards }
     }
 }
 
@@ -65,10 +61,10 @@ impl Minibatches {
         let in_shard = self.order.len() / self.shuffles.len();
         let shards = self.order.chunks_mut(in_shard);
         shards.zip(&mut self.shuffles).for_each(|(samples, rng)| samples.shuffle(rng));
-        let Self { exchange, order, of_shard, .. } = &*self;
-        (0..in_shard / of_shard).map(move |part| {
-            let window = part * of_shard..(part + 1) * of_shard;
-            exchange.grouped(order.chunks(in_shard).map(|shard| &shard[window.clone()]).collect())
+        let this = &*self;
+        (0..in_shard / this.of_shard).map(move |part| {
+            let windows = this.order.chunks(in_shard).map(|shard| &shard[part * this.of_shard..][..this.of_shard]);
+            this.exchange.grouped(windows.collect())
         })
     }
 }

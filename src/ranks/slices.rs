@@ -1,6 +1,5 @@
 //! The slices of an array that the ranks work on.
 
-use std::borrow::Cow;
 use std::ops::Range;
 
 use rayon::prelude::*;
@@ -19,7 +18,7 @@ pub struct Slices {
     /// For each rank: its values.
     all: Vec<Range<usize>>,
     /// The values of this rank.
-    own: Range<usize>,
+    pub own: Range<usize>,
 }
 
 impl Exchange {
@@ -31,18 +30,12 @@ impl Exchange {
 
 impl Slices {
     fn new(exchange: Exchange, chunks: &[Range<usize>], (rank, ranks): (usize, usize)) -> Self {
-        let begin =
-            |chunk: usize| chunks.get(chunk).map_or_else(|| chunks.last().map_or(0, |last| last.end), |it| it.start);
+        let end = |count: usize| chunks[..count].last().map_or(0, |chunk| chunk.end);
         let dealt = (0..ranks).map(|rank| part(chunks.len(), rank, ranks));
-        let all: Vec<Range<usize>> = dealt.map(|dealt| begin(dealt.start)..begin(dealt.end)).collect();
+        let all: Vec<Range<usize>> = dealt.map(|dealt| end(dealt.start)..end(dealt.end)).collect();
         let own = all[rank].clone();
         let dealt = part(chunks.len(), rank, ranks);
         Self { exchange, chunks: chunks.to_vec(), dealt, all, own }
-    }
-
-    /// The range of this rank's values.
-    pub fn own(&self) -> Range<usize> {
-        self.own.clone()
     }
 
     /// Writes to `numbers` the sum over all ranks. `sum` adds up a chunk over the shards of this rank, and the sums of the ranks
@@ -63,13 +56,14 @@ impl Slices {
         }
         split(numbers, &self.chunks).into_par_iter().for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all, self.own.len());
-        let parts: Vec<&[f32]> = if self.own.is_empty() { Vec::new() } else { parts.chunks(self.own.len()).collect() };
+        // A rank without values has no chunks either, so the length does not matter.
+        let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
         let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
             let own = chunk.start - self.own.start..chunk.end - self.own.start;
             tree_sum(out, &parts.iter().map(|part| &part[own.clone()]).collect::<Vec<_>>());
             of(out)
         };
-        let own = split(&mut numbers[self.own()], &self.chunks[self.dealt.clone()]);
+        let own = split(&mut numbers[self.own.clone()], &self.chunks[self.dealt.clone()]);
         self.exchange.all_gather(own.into_par_iter().map(add_and_of).collect::<Vec<f64>>()).concat()
     }
 
@@ -79,19 +73,17 @@ impl Slices {
     }
 
     /// The values with the slices of all ranks.
-    pub fn all_gathered<'a>(&self, numbers: &'a [f32]) -> Cow<'a, [f32]> {
-        let mut numbers = Cow::from(numbers);
-        if !self.exchange.is_alone() {
-            self.all_gather(numbers.to_mut());
-        }
-        numbers
+    pub fn all_gathered(&self, numbers: &[f32]) -> Vec<f32> {
+        let mut all = numbers.to_vec();
+        self.all_gather(&mut all);
+        all
     }
 }
 
 /// Splits numbers into the chunks, which follow one another.
 fn split<'a>(mut numbers: &'a mut [f32], chunks: &[Range<usize>]) -> Vec<(Range<usize>, &'a mut [f32])> {
-    let mut next = |chunk: &Range<usize>| (chunk.clone(), numbers.split_off_mut(..chunk.len()).expect("room for all"));
-    chunks.iter().map(&mut next).collect()
+    let next = |chunk: &Range<usize>| (chunk.clone(), numbers.split_off_mut(..chunk.len()).expect("room for all"));
+    chunks.iter().map(next).collect()
 }
 
 #[cfg(test)]

@@ -1,23 +1,19 @@
 //! Error handling shared by the window and the renderer, whose underlying libraries fail in their own ways.
 
 use std::error::Error;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use anyhow::{Result, anyhow};
 
-use crate::schedule::panic_message;
+use crate::schedule::caught;
 
 /// Runs `f` and turns a panic into an error without printing it: the windowing libraries panic e.g. if a shared library is
 /// missing.
 pub(super) fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
-    let result = catch_unwind(AssertUnwindSafe(f));
+    let result = caught(f);
     std::panic::set_hook(hook);
-    match result {
-        Ok(result) => result.map_err(|error| described(&error)),
-        Err(panic) => Err(anyhow!("{}", panic_message(&*panic))),
-    }
+    result.map_err(anyhow::Error::msg)?.map_err(|error| described(&error))
 }
 
 /// Formats an error and its causes on one line, without consecutive duplicates.

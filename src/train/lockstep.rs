@@ -6,6 +6,7 @@ use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
 
 use super::session::Session;
+use crate::env::Member;
 use crate::os::Requests;
 
 /// Why a run ends before all its steps are made.
@@ -80,11 +81,10 @@ impl Session {
             return Vec::new();
         }
         let iteration = self.agent.iteration;
-        let first = self.agent.pool.blocks[0].first;
         let mut own: Vec<(String, String)> = Vec::new();
-        for (env, hand) in (first..).zip(self.agent.pool.envs_mut()) {
+        for Member { env: hand, number: env, .. } in self.agent.pool.members_mut() {
             let Some(diverged) = hand.take_diverged() else { continue };
-            let text = diverged.as_json(&self.config.env, iteration, env);
+            let text = diverged.as_json(&self.config.env, iteration, *env);
             own.push((format!("iteration-{iteration:08}-env-{env}.json"), text));
         }
         self.agent.exchange.all_gather(own).concat()

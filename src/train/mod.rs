@@ -10,7 +10,6 @@ mod saver;
 mod session;
 mod start;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -24,7 +23,7 @@ use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums, Task};
 use crate::run::Histogram;
-use crate::schedule::panic_message;
+use crate::schedule;
 use duties::{Duties, Follower, Lead};
 use hints::hints;
 use lockstep::Stop;
@@ -219,7 +218,7 @@ impl Session {
             return Ok(Some(Score::of(&[], ctrl_dt)));
         }
         let task = self.task_now();
-        let actor = Actor::Mean(self.agent.ppo.policy().freeze());
+        let actor = Actor::Mean(self.agent.ppo.policy.freeze());
         let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
             duties.attend(requests);
@@ -233,8 +232,7 @@ impl Session {
 
 /// Runs what may panic. A panic becomes an error.
 fn caught<T>(run: impl FnOnce() -> Result<T>) -> Result<T> {
-    let caught = catch_unwind(AssertUnwindSafe(run));
-    caught.unwrap_or_else(|panic| Err(anyhow!("panic: {}", panic_message(&*panic))))
+    schedule::caught(run).unwrap_or_else(|panic| Err(anyhow!("panic: {panic}")))
 }
 
 /// The figures by which a run that ends when evaluations no longer rise is compared with its start.

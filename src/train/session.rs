@@ -109,8 +109,8 @@ impl Session {
         let agent = &mut self.agent;
         if let Takes::Policy = takes {
             agent.ppo.begin_with(&checkpoint)?;
-            expect_finite_actions(&self.task, agent.ppo.policy())?;
-            return expect_finite_values(&self.task, agent.ppo.policy());
+            expect_finite_actions(&self.task, &agent.ppo.policy)?;
+            return expect_finite_values(&self.task, &agent.ppo.policy);
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {

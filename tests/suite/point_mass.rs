@@ -152,14 +152,14 @@ fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
     let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
     let settings = PpoConfig { std: Geometric(std), ..settings() };
     let mut ppo = Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).unwrap();
-    assert!((ppo.policy().std() - 0.5).abs() < 1e-6);
+    assert!((ppo.policy.std() - 0.5).abs() < 1e-6);
     for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
         ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
-        assert!((ppo.policy().std() - expected).abs() < 1e-6, "{env_steps}");
+        assert!((ppo.policy.std() - expected).abs() < 1e-6, "{env_steps}");
     }
     let at_once = PpoConfig { std: Geometric(Ramp { steps: 0, ..std }), ..settings };
     let ppo = Ppo::new(&at_once, SPACES, 0, Exchange::alone(1)).unwrap();
-    assert!((ppo.policy().std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
+    assert!((ppo.policy.std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
 }
 
 #[test]
@@ -167,7 +167,7 @@ fn while_the_critic_learns_alone_the_policy_stands_still() {
     for backend in [Backend::Fused, Backend::Candle] {
         let mut agent = agent(&PpoConfig { backend, critic_first: 2, ..settings() }, 3);
         let nets = |agent: &Agent<PointMass>| {
-            let policy = agent.ppo.policy();
+            let policy = &agent.ppo.policy;
             policy.layout.nets().map(|net| policy.parameters[net].to_vec())
         };
         let [actor, mut critic] = nets(&agent);
@@ -190,7 +190,7 @@ fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone()
         let mut agent = agent(&settings, 3);
         (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
         let actor = |agent: &Agent<PointMass>| {
-            let policy = agent.ppo.policy();
+            let policy = &agent.ppo.policy;
             let [actor, _] = policy.layout.nets();
             policy.parameters[actor].to_vec()
         };
@@ -231,7 +231,7 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
 
 /// Returns the mean action of the policy for one observation.
 fn answer(ppo: &Ppo) -> [f32; 2] {
-    let (policy, mut means) = (ppo.policy().freeze(), [0.0; 2]);
+    let (policy, mut means) = (ppo.policy.freeze(), [0.0; 2]);
     policy.mean_actions(&[0.3, -0.4], &mut means, &mut policy.workspace(1));
     means
 }
@@ -258,7 +258,7 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
     agent.pool.envs_mut().next().unwrap().position = [5.0, 5.0];
     agent.pool.envs_mut().skip(1).step_by(2).for_each(|env| env.redirects = 7);
     agent.collect(&NEVER).unwrap().expect("nothing stops it");
-    let policy = agent.ppo.policy().freeze();
+    let policy = agent.ppo.policy.freeze();
     let mut work = policy.workspace(1);
     let (mut truncated, mut redirected, mut terminated) = (0, 0, 0);
     let blocks = agent.rollout.blocks.iter();

@@ -3,7 +3,7 @@
 use std::sync::atomic::AtomicBool;
 
 use rand::RngExt;
-use shadow_repose::env::{Autoreset, End, EnvBlock, EnvPool};
+use shadow_repose::env::{Autoreset, End, EnvBlock, EnvPool, Member};
 use shadow_repose::ppo::RolloutBlock;
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, Repose, Task};
@@ -32,20 +32,21 @@ struct Block<'a> {
 impl Block<'_> {
     /// Steps the block. `actions` belong to all environments.
     fn step(&mut self, actions: &[f32]) {
-        let actions = &actions[self.first * 20..][..self.envs.count() * 20];
+        let actions = &actions[self.first * 20..][..self.rewards.len() * 20];
         self.envs.step(actions, &mut self.rewards, &mut self.observations).unwrap();
         self.seen.push((self.observations.clone(), self.rewards.clone()));
-        for (i, end) in self.envs.ends.iter().enumerate() {
+        for (i, member) in self.envs.members.iter().enumerate() {
+            let end = member.end;
             let rows = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
-            let previous_action = &self.observations[rows.clone()][OBSERVATION_SIZE - 20..];
+            let previous_action = &self.observations[rows][OBSERVATION_SIZE - 20..];
             // Where an episode ended, a new one has begun: only there is the previous action zero.
             assert_eq!(end.is_some(), previous_action.iter().all(|&a| a == 0.0));
             if end.is_some() {
                 // The final observation belongs to this environment: it shows its last action.
                 let action = &actions[i * 20..][..20];
                 let last: Vec<f32> = action.iter().map(|a| a.clamp(-1.0, 1.0)).collect();
-                assert_eq!(self.envs.final_observations[rows][OBSERVATION_SIZE - 20..], last);
-                self.truncated += usize::from(*end == Some(End::Truncated));
+                assert_eq!(member.final_observation[OBSERVATION_SIZE - 20..], last);
+                self.truncated += usize::from(end == Some(End::Truncated));
             }
         }
     }
@@ -63,7 +64,7 @@ fn play(threads: usize, envs: usize, steps: usize, settings: &[&str], action: im
         pool.reset(observations.iter_mut().map(|rows| &mut rows[..]).collect());
         let mut first = 0;
         let blocks = pool.blocks.iter_mut().zip(observations).map(|(envs, observations)| {
-            let n = envs.count();
+            let n = envs.members.len();
             first += n;
             Block { envs, first: first - n, observations, rewards: vec![0.0; n], seen: Vec::new(), truncated: 0 }
         });
@@ -136,12 +137,12 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
             let mut first = 0;
             let mut seen = Vec::new();
             for (block, rows) in pool.blocks.iter_mut().zip(observations) {
-                let n = block.count();
+                let n = block.members.len();
                 let actions: Vec<f32> = (0..n * 20).map(|i| action(step, first + i)).collect();
                 let mut rewards = vec![0.0; n];
                 block.step(&actions, &mut rewards, rows).unwrap();
                 first += n * 20;
-                seen.push((rewards, block.ends.clone(), rows.clone()));
+                seen.push((rewards, ends_of(&block.members), rows.clone()));
             }
             seen
         };
@@ -165,6 +166,10 @@ fn a_pool_goes_on_from_its_saved_state_bit_for_bit_in_the_middle_of_episodes() {
     });
 }
 
+fn ends_of(members: &[Member<Repose>]) -> Vec<Option<End>> {
+    members.iter().map(|member| member.end).collect()
+}
+
 /// A whole pool that is stepped at once.
 struct AtOnce {
     pool: EnvPool<Repose>,
@@ -177,9 +182,9 @@ impl AtOnce {
     fn new(envs: usize, settings: &[&str], aged: bool) -> Self {
         let task = task(settings);
         let mut pool = EnvPool::new(5, (0..envs).map(|_| Repose::new(&task)).collect(), &Exchange::alone(1));
-        let (mut observations, rewards) = (vec![0.0; envs * OBSERVATION_SIZE], vec![0.0; envs]);
+        let mut observations = vec![0.0; envs * OBSERVATION_SIZE];
         pool.restart(&vec![true; envs], aged, &mut observations);
-        Self { pool, observations, rewards, t: 0 }
+        Self { pool, observations, rewards: vec![0.0; envs], t: 0 }
     }
 
     /// Steps with actions that follow from the number of the step, and returns which episodes ended, by place and length.
@@ -196,7 +201,7 @@ impl AtOnce {
     }
 
     fn ends(&self) -> Vec<Option<End>> {
-        self.pool.blocks.iter().flat_map(|block| block.ends.clone()).collect()
+        self.pool.blocks.iter().flat_map(|block| ends_of(&block.members)).collect()
     }
 }
 
@@ -232,7 +237,8 @@ fn an_environment_starts_its_next_episode_in_the_same_step_in_the_next_or_when_i
         pool
     });
     let [same, next, disabled] = &mut pools;
-    let finals: Vec<f32> = same.pool.blocks[0].final_observations.clone();
+    let finals: Vec<f32> =
+        same.pool.blocks[0].members.iter().flat_map(|member| member.final_observation.clone()).collect();
     assert!(next.observations == finals && disabled.observations == finals && same.observations != finals);
     // The action of this step is ignored.
     assert!(next.step(Autoreset::NextStep).is_empty());
@@ -288,7 +294,7 @@ fn a_pool_that_is_stepped_at_once_with_the_actions_of_a_rollout_sees_what_the_ro
         let actions = all(|block| &block.actions, t, 20);
         let scaled = all(|block| &block.rewards, t, 1);
         pool.step(&actions, Autoreset::SameStep, &mut rewards, &mut observations).unwrap();
-        let found: Vec<Option<End>> = pool.blocks.iter().flat_map(|block| block.ends.clone()).collect();
+        let found: Vec<Option<End>> = pool.blocks.iter().flat_map(|block| ends_of(&block.members)).collect();
         for ((end, reward), scaled) in found.iter().zip(&rewards).zip(scaled) {
             // Elsewhere the rollout has added the value of the final observation.
             if !matches!(end, Some(End::Truncated | End::Redirected)) {

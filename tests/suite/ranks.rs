@@ -99,7 +99,7 @@ fn learnt<E: Env>(agent: &mut Agent<E>, iterations: usize) -> Learnt<E::Episode>
         let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
         figures.extend(stats.named().map(|(_, value)| value));
     }
-    let policy = agent.ppo.policy();
+    let policy = &agent.ppo.policy;
     figures.extend(policy.normalizer.mean.iter().chain(&policy.normalizer.variance));
     let weights = policy.parameters.iter().map(|x| x.to_bits()).collect();
     (weights, figures.into_iter().map(f64::to_bits).collect(), agent.pool.take_finished())
@@ -187,14 +187,14 @@ fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
     let never = AtomicBool::new(false);
     for count in [5, 100] {
         let episodes = Episodes { seed: 3, purpose: "evaluation", first: 10, count };
-        let alone = Actor::Mean(ppo.policy().freeze());
+        let alone = Actor::Mean(ppo.policy.freeze());
         let alone =
             Trial { task: &task, actor: &alone, episodes, stop: &never }.play(&mut |_| Ok(())).unwrap().unwrap();
         assert_eq!(alone.len(), count);
         for ranks in [1, 4] {
             let work = |_, exchange: Exchange| {
                 let ppo = Ppo::new(&config.ppo, task.spaces(), 0, Exchange::alone(1)).unwrap();
-                let actor = Actor::Mean(ppo.policy().freeze());
+                let actor = Actor::Mean(ppo.policy.freeze());
                 let trial = Trial { task: &task, actor: &actor, episodes, stop: &never };
                 trial.play_together(&exchange, &mut |_| Ok(())).unwrap().unwrap()
             };
@@ -210,7 +210,7 @@ fn all_ranks_together_send_no_more_than_a_ring_would() {
         let mut agent = of_ranks(8, &settings(), 5, exchange);
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let steps = settings().epochs * settings().minibatches;
-        (agent.exchange.take_traffic()[1].1, agent.ppo.policy().parameters.len(), steps)
+        (agent.exchange.take_traffic()[1].1, agent.ppo.policy.parameters.len(), steps)
     };
     for ranks in [2, 4] {
         let all = on_ranks(ranks, 8, work);

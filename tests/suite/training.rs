@@ -174,7 +174,7 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
         let record = task.record().with(config.ppo.symmetry);
         let mut agent = started_agent(&task.for_policy(&record).unwrap(), &config);
         agent.collect(&AtomicBool::new(false)).unwrap().expect("nothing stops it");
-        let (policy, mut shown) = (agent.ppo.policy().freeze(), vec![0.0; OBSERVATION_SIZE]);
+        let (policy, mut shown) = (agent.ppo.policy.freeze(), vec![0.0; OBSERVATION_SIZE]);
         let block = &agent.rollout.blocks[0];
         let last = block.observations[block.step(4, OBSERVATION_SIZE)].chunks_exact(OBSERVATION_SIZE);
         for (env, row) in agent.pool.envs_mut().zip(last) {
@@ -206,13 +206,15 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
     for _ in 0..200 {
         let before: Vec<_> = pool.envs_mut().map(|env| (env.goal(), env.episode().length)).collect();
         pool.blocks[0].step(&[0.0; 160], &mut [0.0; 8], &mut observations).unwrap();
-        let (ends, last) = (pool.blocks[0].ends.clone(), pool.blocks[0].final_observations.clone());
+        let members = &pool.blocks[0].members;
+        let last: Vec<_> = members.iter().map(|member| (member.end, member.final_observation.clone())).collect();
         for (i, (env, (goal, length))) in pool.envs_mut().zip(before).enumerate() {
             let row = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
-            let (seen, under_the_old) = (&observations[row.clone()], &last[row]);
+            let seen = &observations[row];
+            let (end, under_the_old) = &last[i];
             let shown = quat::canonical(env.goal()).map(|x| x as f32);
             assert_eq!(seen[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
-            if ends[i] != Some(End::Redirected) {
+            if *end != Some(End::Redirected) {
                 continue;
             }
             redirected += 1;

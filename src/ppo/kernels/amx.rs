@@ -9,13 +9,12 @@
 use std::arch::asm;
 use std::arch::x86_64::{__cpuid, __cpuid_count};
 
-use super::bf16::{DEPTH, LINES, Packed, Tile, Unit, depth_of_block, in_blocks};
+use super::bf16::{DEPTH, LINES, Packed, Tile, Unit, in_blocks};
 
 /// Bytes in a row of a tile, both in memory and in the processor.
 const ROW_BYTES: usize = 64;
 
 /// The permission to use the tiles.
-#[derive(Debug)]
 struct Tiles(());
 
 /// Checks that there are tiles for bf16, and requests the kernel's permission for this process to use them.
@@ -73,7 +72,7 @@ impl Unit for Tiles {
         // them. The compiler uses no tiles itself, so the configuration stays loaded until `_configured` is dropped.
         unsafe { asm!("ldtilecfg [{}]", in(reg) &SETUP, options(readonly, nostack)) };
         let _configured = Configured;
-        // SAFETY: the tiles are configured.
+        // SAFETY: the tiles are configured. `in_blocks` ensures the rest.
         in_blocks(out, columns, operands, add, |out, columns, tiles, add| unsafe {
             multiply(out, columns, tiles, add)
         });
@@ -83,9 +82,10 @@ impl Unit for Tiles {
 /// Writes a block of a product, or adds it if `add` is set (see [`in_blocks`]).
 ///
 /// # Safety
-/// The tiles of this thread must be configured.
+/// The tiles of this thread must be configured. `out` must have room for a block. Each operand must have twice as many tiles as
+/// there are along a line, at least two, and both equally many.
 unsafe fn multiply(out: &mut [f32], columns: usize, [lhs, rhs]: [&[Tile]; 2], add: bool) {
-    let depth = depth_of_block(out, columns, [lhs, rhs]);
+    let depth = lhs.len() / 2;
     const { assert!(size_of::<Tile>() == LINES * ROW_BYTES && DEPTH * 2 == ROW_BYTES && size_of::<Setup>() == 64) };
     // SAFETY: the caller has configured the tiles. Each operand is 2 × `depth` consecutive tiles of 1024 bytes, and each of
     // the `depth` iterations of the loop reads one tile of each half. `out` has 32 rows of 32 values at that distance.

@@ -10,7 +10,7 @@ use std::arch::x86_64::{
 };
 use std::mem::transmute;
 
-use super::bf16::{BLOCK, DEPTH, LINES, Order, Packed, Tile, Unit, depth_of_block, in_blocks};
+use super::bf16::{BLOCK, DEPTH, LINES, Order, Packed, Tile, Unit, in_blocks};
 use super::product::Matrix;
 
 /// Rows of a block that are computed together. With the two columns of tiles of a block, sums take 16 of the 32 registers.
@@ -18,7 +18,6 @@ use super::product::Matrix;
 const ROWS: usize = 8;
 
 /// The permission to use the dot products.
-#[derive(Debug)]
 struct Dots(());
 
 /// Asks the processor for the dot products.
@@ -40,12 +39,12 @@ impl Unit for Dots {
     fn product(&self, out: &mut [f32], columns: usize, operands: [&Packed; 2], add: bool) {
         let left = operands[0].order;
         in_blocks(out, columns, operands, add, |out, columns, [lhs, rhs], add| {
-            let depth = depth_of_block(out, columns, [lhs, rhs]);
+            let depth = lhs.len() / 2;
             for first in (0..BLOCK).step_by(ROWS) {
                 let lhs = &lhs[first / LINES * depth..][..depth];
                 let out = &mut out[first * columns..];
-                // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `out` has
-                // eight more rows of 32 values at that distance. Both halves of `rhs` have as many tiles as `lhs`.
+                // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `in_blocks`
+                // ensures that `out` has eight more rows of 32 values at that distance, and `rhs` twice as many tiles as `lhs`.
                 unsafe {
                     match left {
                         Order::Lines => rows::<DEPTH, 2>(out, columns, lhs, first % LINES, rhs, add),

@@ -1,7 +1,5 @@
 //! bf16, the upper half of an f32: rounding, packing of operands into tiles, and products of tiles block by block.
 
-use std::fmt::Debug;
-
 use super::product::Matrix;
 use super::widest::widest;
 
@@ -12,7 +10,7 @@ pub(super) const LINES: usize = 16;
 pub(super) const DEPTH: usize = 32;
 
 /// A tile, at the start of a cache line.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 #[repr(C, align(64))]
 pub(super) struct Tile(pub [u16; LINES * DEPTH]);
 
@@ -34,7 +32,7 @@ pub(super) fn rounded(x: f32) -> f32 {
 pub(super) const BLOCK: usize = 2 * LINES;
 
 /// A unit of the processor that multiplies bf16 matrices. A value proves that the unit is there and may be used.
-pub trait Unit: Debug + Sync {
+pub trait Unit: Sync {
     /// The order in which it reads this left operand best. The right operand is always in pairs.
     fn order_of_left(&self, _lhs: Matrix) -> Order {
         Order::Lines
@@ -48,7 +46,8 @@ pub trait Unit: Debug + Sync {
 }
 
 /// Computes a product block by block. `multiply` writes [`BLOCK`] × [`BLOCK`] values, whose rows are as far apart as its second
-/// argument says, or adds them if its last argument is set. Its operands are two rows of tiles each: lines 0-15, then 16-31.
+/// argument says, or adds them if its last argument is set. There is room for them. Its operands are two rows of tiles each: lines
+/// 0-15, then 16-31. Each row has as many tiles, at least one.
 ///
 /// # Panics
 /// Panics if the sizes do not match.
@@ -59,7 +58,7 @@ where
     let rows = out.len() / columns;
     let depth = lhs.depth;
     assert_eq!(out.len(), rows * columns, "elements of the product");
-    assert_eq!(depth, rhs.depth, "tiles along the lines of both matrices");
+    assert!(depth > 0 && depth == rhs.depth, "tiles along the lines of both matrices");
     assert_eq!(rhs.order, Order::Pairs, "order of the right matrix");
     let pair = 2 * depth;
     assert_eq!(lhs.tiles.len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
@@ -87,16 +86,8 @@ where
     }
 }
 
-/// Panics unless these are the operands of a block, and `out` has room for it. Returns the tiles along a line.
-pub(super) fn depth_of_block(out: &[f32], columns: usize, [lhs, rhs]: [&[Tile]; 2]) -> usize {
-    let depth = lhs.len() / 2;
-    assert!(depth > 0 && lhs.len() == 2 * depth && rhs.len() == lhs.len(), "tiles of a block");
-    assert!(columns >= BLOCK && out.len() >= (BLOCK - 1) * columns + BLOCK, "room for a block");
-    depth
-}
-
 /// The order of the values in a tile.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Order {
     /// 16 lines of 32 values.
     #[default]
@@ -117,59 +108,39 @@ pub struct Packed {
 }
 
 impl Packed {
-    /// Packs a right operand.
-    pub fn pack_right(&mut self, rhs: Matrix) {
-        self.pack(rhs.transposed(), Order::Pairs);
-    }
-
     /// Packs the lines of an operand, which are the rows of `matrix`, reusing the memory of the previous one.
     pub fn pack(&mut self, matrix: Matrix, order: Order) {
-        self.parts(matrix, order).for_each(TileChunk::pack);
+        self.jobs(matrix, order).for_each(|pack| pack());
     }
 
-    /// Makes room for a right operand, and returns its parts, each of which is to be packed.
-    pub(super) fn parts_of_right<'a>(&'a mut self, rhs: Matrix<'a>) -> impl Iterator<Item = TileChunk<'a>> {
-        self.parts(rhs.transposed(), Order::Pairs)
-    }
-
-    fn parts<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = TileChunk<'a>> {
+    /// Makes room for the same. Each of the jobs packs a part of it.
+    pub(super) fn jobs<'a>(
+        &'a mut self,
+        matrix: Matrix<'a>,
+        order: Order,
+    ) -> impl Iterator<Item = impl FnOnce() + Send + 'a> {
         let [lines, numbers] = matrix.size();
         self.depth = numbers.div_ceil(DEPTH);
         self.order = order;
         let groups = lines.div_ceil(2 * LINES) * 2;
         let depth = self.depth;
         self.tiles.resize(groups * depth, Tile([0; LINES * DEPTH]));
-        let parts = self.tiles.chunks_mut(PART).enumerate();
-        parts.map(move |(i, tiles)| TileChunk { tiles, first: i * PART, depth, matrix, order })
-    }
-}
-
-/// TileChunk that are packed together.
-const PART: usize = 32;
-
-/// Some of the tiles of a matrix that is packed.
-pub(super) struct TileChunk<'a> {
-    tiles: &'a mut [Tile],
-    /// The number of the first of them.
-    first: usize,
-    /// The number of tiles along a line.
-    depth: usize,
-    matrix: Matrix<'a>,
-    order: Order,
-}
-
-impl TileChunk<'_> {
-    /// Fills the tiles.
-    pub(super) fn pack(self) {
-        widest!({
-            for (i, Tile(tile)) in (self.first..).zip(self.tiles) {
-                let line = i / self.depth * LINES;
-                let number = i % self.depth * DEPTH;
-                pack_tile(tile, self.matrix, [line, number], self.order);
+        self.tiles.chunks_mut(PART).enumerate().map(move |(part, tiles)| {
+            move || {
+                widest!({
+                    for (i, Tile(tile)) in (part * PART..).zip(tiles) {
+                        let line = i / depth * LINES;
+                        let number = i % depth * DEPTH;
+                        pack_tile(tile, matrix, [line, number], order);
+                    }
+                });
             }
-        });
+        })
     }
 }
+
+/// The number of tiles that are packed together.
+const PART: usize = 32;
 
 /// Fills a tile, starting at this line and this position in the line.
 #[inline(always)]
@@ -262,7 +233,8 @@ mod tests {
 
     #[test]
     fn every_number_of_a_matrix_is_in_its_tile_whichever_way_it_lies_in_memory() {
-        let (rows, columns) = (37, 70);
+        let rows = 37;
+        let columns = 70;
         let number = |row: usize, column: usize| ((row * columns + column) % 251) as f32;
         let by_rows: Vec<f32> = (0..rows * columns).map(|i| number(i / columns, i % columns)).collect();
         let by_columns: Vec<f32> = (0..rows * columns).map(|i| number(i % rows, i / rows)).collect();
@@ -275,12 +247,15 @@ mod tests {
                 let groups = rows.div_ceil(2 * LINES) * 2;
                 assert_eq!(packed.tiles.len(), groups * packed.depth);
                 for (i, &x) in packed.tiles.iter().flat_map(|Tile(tile)| tile).enumerate() {
-                    let (tile, row, cell) = (i / (LINES * DEPTH), i % (LINES * DEPTH) / DEPTH, i % DEPTH);
+                    let tile = i / (LINES * DEPTH);
+                    let row = i % (LINES * DEPTH) / DEPTH;
+                    let cell = i % DEPTH;
                     let (line, along) = match order {
                         Order::Lines => (row, cell),
                         Order::Pairs => (cell / 2, 2 * row + cell % 2),
                     };
-                    let (line, along) = (tile / packed.depth * LINES + line, tile % packed.depth * DEPTH + along);
+                    let line = tile / packed.depth * LINES + line;
+                    let along = tile % packed.depth * DEPTH + along;
                     let inside = line < rows && along < columns;
                     let expected = if inside { number(line, along) } else { 0.0 };
                     assert_eq!(x, round(expected), "{order:?}: {line}, {along}");

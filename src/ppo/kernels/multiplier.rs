@@ -2,13 +2,13 @@
 
 use anyhow::{Context, Result};
 
-use super::bf16::{Packed, Unit, rounded};
+use super::bf16::{Order, Packed, Unit, rounded};
 use super::product::{Matrix, product};
 use super::units;
 use crate::config::Precision;
 
 /// An arithmetic that this machine supports.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub enum Arithmetic {
     /// f32 throughout.
     F32,
@@ -32,11 +32,6 @@ impl Arithmetic {
             ),
         })
     }
-
-    /// Whether right operands have to be rearranged for its products.
-    pub(super) fn packs(self) -> bool {
-        matches!(self, Self::Bf16(_))
-    }
 }
 
 /// A matrix multiplier with reusable buffers for its operands.
@@ -58,8 +53,6 @@ impl Multiplier {
     /// # Panics
     /// Panics if the sizes do not match.
     pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, ready: Option<&Packed>, add: bool) {
-        assert_eq!(lhs.size()[1], rhs.size()[0], "columns of the first and rows of the second matrix");
-        assert_eq!(out.len(), lhs.size()[0] * rhs.size()[1], "elements of the product");
         match self.arithmetic {
             Arithmetic::F32 => product(out, lhs, rhs, add),
             Arithmetic::Rounded => {
@@ -70,7 +63,7 @@ impl Multiplier {
                 let [left, right] = &mut self.packed;
                 left.pack(lhs, unit.order_of_left(lhs));
                 let right = ready.unwrap_or_else(|| {
-                    right.pack_right(rhs);
+                    right.pack(rhs.transposed(), Order::Pairs);
                     right
                 });
                 unit.product(out, rhs.size()[1], [left, right], add);

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::super::parameters;
 use super::activation::{add_bias, slopes_and_sums};
-use super::bf16::{Packed, TileChunk};
+use super::bf16::{Order, Packed};
 use super::multiplier::{Arithmetic, Multiplier};
 use super::product::Matrix;
 use crate::config::Activation;
@@ -52,7 +52,8 @@ pub struct Workspace {
     /// `[rows, widest layer]`: gradients with respect to the outputs of a layer and of the layer below it.
     grads: [Vec<f32>; 2],
     multiplier: Multiplier,
-    rows: usize,
+    /// The largest number of rows that it holds.
+    pub rows: usize,
 }
 
 impl Workspace {
@@ -65,11 +66,6 @@ impl Workspace {
             multiplier: Multiplier::new(arithmetic),
             rows,
         }
-    }
-
-    /// The largest number of rows that it holds.
-    pub fn rows(&self) -> usize {
-        self.rows
     }
 
     /// The outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
@@ -99,31 +95,31 @@ impl<'a> Net<'a> {
     /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. The results are the same, bit
     /// for bit.
     pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, purpose: Purpose) {
-        let mut parts = Vec::new();
+        let mut jobs = Vec::new();
         let learns = purpose == Purpose::Learning;
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
             if !learns {
                 layer.weight_t = Some(layer.transposed().into());
             }
-            let read = [Some(layer.weight.transposed()), learns.then_some(layer.weight)];
-            for (packed, read) in layer.packed.iter_mut().zip(read).filter(|_| arithmetic.packs()) {
-                if let Some(read) = read {
-                    parts.extend(packed.insert(Packed::default()).parts_of_right(read));
+            if let Arithmetic::Bf16(_) = arithmetic {
+                // The lines of the right operands of the forward and of the backward pass.
+                let lines = [Some(layer.weight), learns.then_some(layer.weight.transposed())];
+                for (packed, lines) in layer.packed.iter_mut().zip(lines.into_iter().flatten()) {
+                    jobs.extend(packed.insert(Packed::default()).jobs(lines, Order::Pairs));
                 }
             }
         }
-        parts.into_par_iter().for_each(TileChunk::pack);
+        jobs.into_par_iter().for_each(|pack| pack());
     }
 
-    /// Copies of its weights for [`Self::with_copies`].
+    /// Copies of its weights for [`Self::set_copies`].
     pub(crate) fn copies(&self) -> Vec<Vec<f32>> {
         self.layers.iter().map(Dense::transposed).collect()
     }
 
-    /// The net with copies of its weights, as [`Self::prepare`] makes them for acting.
-    pub(crate) fn with_copies(mut self, copies: &'a [Vec<f32>]) -> Self {
+    /// Gives it copies of its weights, as [`Self::prepare`] makes them for acting.
+    pub(crate) fn set_copies(&mut self, copies: &'a [Vec<f32>]) {
         self.layers.iter_mut().zip(copies).for_each(|(layer, copy)| layer.weight_t = Some(copy.into()));
-        self
     }
 
     /// The number of inputs.

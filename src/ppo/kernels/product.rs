@@ -84,7 +84,8 @@ mod tests {
 
     #[test]
     fn products_are_those_worked_out_by_hand() {
-        let (a, b) = ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, -1.0, 2.0, 0.5, 0.0, 3.0]);
+        let a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+        let b = [1.0, -1.0, 2.0, 0.5, 0.0, 3.0];
         let mut out = [9.0; 4];
         product(&mut out, Matrix::new(&a, 2, 3), Matrix::new(&b, 3, 2), false);
         assert_eq!(out, [5.0, 9.0, 14.0, 16.5]);

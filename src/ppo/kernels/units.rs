@@ -8,7 +8,7 @@ use anyhow::{Result, anyhow};
 use super::amx::request as tiles;
 #[cfg(target_arch = "x86_64")]
 use super::avx512::request as dots;
-use super::bf16::{Packed, Unit};
+use super::bf16::{Order, Packed, Unit};
 use super::product::Matrix;
 
 /// A unit, or why there is none.
@@ -57,7 +57,7 @@ fn multiplies_rightly(unit: &dyn Unit) -> bool {
         let mut lhs = Packed::default();
         let mut rhs = Packed::default();
         lhs.pack(a, unit.order_of_left(a));
-        rhs.pack_right(Matrix::new(&b, depth, columns));
+        rhs.pack(Matrix::new(&b, depth, columns).transposed(), Order::Pairs);
         let mut out = vec![1.0; rows * columns];
         unit.product(&mut out, columns, [&lhs, &rhs], true);
         let [down, right] = a.strides().map(|stride| stride as usize);
@@ -101,16 +101,19 @@ mod tests {
         {
             let mut random =
                 |count: usize| -> Vec<f32> { (0..count).map(|_| rng::uniform(&mut rng, -2.0, 2.0) as f32).collect() };
-            let (a, b, before) = (random(rows * depth), random(depth * columns), random(rows * columns));
+            let a = random(rows * depth);
+            let b = random(depth * columns);
+            let before = random(rows * columns);
             for add in [false, true] {
                 // Both operands, once stored by rows and once by columns.
                 for (lhs, rhs) in [
                     (Matrix::new(&a, rows, depth), Matrix::new(&b, depth, columns)),
                     (Matrix::new(&a, depth, rows).transposed(), Matrix::new(&b, columns, depth).transposed()),
                 ] {
-                    let (mut left, mut right) = (Packed::default(), Packed::default());
+                    let mut left = Packed::default();
+                    let mut right = Packed::default();
                     left.pack(lhs, unit.order_of_left(lhs));
-                    right.pack_right(rhs);
+                    right.pack(rhs.transposed(), Order::Pairs);
                     let mut out = before.clone();
                     unit.product(&mut out, columns, [&left, &right], add);
                     let at = |m: Matrix, i: usize, j: usize| {
