@@ -13,6 +13,7 @@ use crate::sim::Quality;
 /// What to do.
 pub(super) enum Plan {
     /// Play in a window.
+    #[cfg_attr(not(feature = "viewer"), expect(dead_code, reason = "a build without windows refuses them"))]
     Window(Shot),
     /// Play at this port for a browser.
     Web(u16, Shot),
@@ -32,6 +33,7 @@ pub(super) struct Outputs {
     /// What is seen in film and page.
     pub shot: Shot,
     /// The frames of the film per second of simulated time.
+    #[cfg_attr(not(feature = "video"), expect(dead_code, reason = "a build without films refuses them"))]
     pub fps: u32,
     /// Whether the score is printed as JSON.
     pub json: bool,
