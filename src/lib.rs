@@ -71,7 +71,7 @@
 //! A training run may be spread over several processes. [`ranks`] describes what they exchange.
 //!
 //! # Recovery
-//! At the end of each iteration, [`train`] calls [`agent::Agent::checkpoint`]. It copies the state of the learner and of
+//! At the end of each iteration, [`mod@train`] puts a checkpoint together. It copies the state of the learner and of
 //! the environments into a [`ppo::Checkpoint`]: everything that the next iteration depends on. If that iteration fails or
 //! is stopped (a signal, a panic, a loss that is not finite), this checkpoint is written. [`run`] writes it whole or not
 //! at all, under its number. Such files are read only by [`load`], which also finds the newest undamaged one.

@@ -59,7 +59,7 @@ impl Replay {
         self.add(moment.episode, row, end);
     }
 
-    /// Records the first [`MOST_EPISODES`] episodes of a trace, and returns how many more it has.
+    /// Records the first `MOST_EPISODES` episodes of a trace, and returns how many more it has.
     ///
     /// # Errors
     /// Fails if the text is no trace, or one of another scene.
