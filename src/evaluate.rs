@@ -168,8 +168,7 @@ impl Trial<'_> {
     /// # Errors
     /// Fails if the observer does, if an action is not finite, or, with the episode's number, if an episode panics.
     pub fn play(&self, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
-        let played = self.play_lanes(0..LANES, observer)?;
-        Ok(played.map(|played| played.into_iter().map(|(_, episode)| episode).collect()))
+        self.play_together(&Exchange::alone(1), observer)
     }
 
     /// Plays the episodes and returns their score, or `None` if they were interrupted. `bar` counts them.
@@ -193,20 +192,13 @@ impl Trial<'_> {
     /// # Errors
     /// Fails as [`Trial::play`] does.
     pub fn play_together(&self, exchange: &Exchange, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
-        let own = exchange.own(LANES.min(self.episodes.count));
-        let Some(own) = self.play_lanes(own, observer)? else { return Ok(None) };
-        let mut all = exchange.all_gather(own).concat();
-        all.sort_unstable_by_key(|(number, _)| *number);
-        Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
-    }
-
-    /// Plays the episodes of the lanes `own`, and returns them with their numbers. Idle lanes still fill the batch, so that an
-    /// episode's result does not depend on who plays it.
-    fn play_lanes(&self, own: Range<usize>, observer: &mut Observer) -> Result<Option<Vec<(usize, EpisodeStats)>>> {
         let Episodes { first, count, .. } = self.episodes;
-        let mut group = Lanes::new(self, own.start..own.end.min(count));
+        let own = exchange.own(LANES.min(count));
+        let groups = (first + own.start..first + count).step_by(LANES);
+        // Idle lanes still fill the batch, so that an episode's result does not depend on who plays it.
+        let mut group = Lanes::new(self, own);
         let mut results = Vec::with_capacity(count);
-        for first in (first + own.start..first + count).step_by(LANES) {
+        for first in groups {
             group.start(first, observer)?;
             while group.lanes.iter().any(|lane| lane.running) {
                 if self.stop.load(Ordering::Relaxed) {
@@ -216,7 +208,9 @@ impl Trial<'_> {
             }
             results.extend((first..).zip(group.lanes[..group.count].iter_mut().map(Lane::episode)));
         }
-        Ok(Some(results))
+        let mut all = exchange.all_gather(results).concat();
+        all.sort_unstable_by_key(|(number, _)| *number);
+        Ok(Some(all.into_iter().map(|(_, episode)| episode).collect()))
     }
 }
 
@@ -323,15 +317,12 @@ impl Actor<'_> {
         }
     }
 
-    /// Writes the actions of these lanes, one row each. Actions of lanes that have ended are not used.
+    /// Writes the actions of these lanes, of which there is at least one, one row each. Actions of lanes that have ended are not used.
     fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.mean_actions(observations, actions, work);
         }
-        let Some(Spaces { observation_size, action_size: size, .. }) = lanes.first().map(|lane| lane.env.spaces())
-        else {
-            return;
-        };
+        let Spaces { observation_size, action_size: size, .. } = lanes[0].env.spaces();
         if let Actor::Outside(act) = self {
             act(&observations[..lanes.len() * observation_size], &mut actions[..lanes.len() * size]);
         }

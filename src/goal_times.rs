@@ -66,10 +66,9 @@ impl GoalTimes {
     pub fn named(&self) -> [(&'static str, Value); 3] {
         let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
         steps.sort_by(f64::total_cmp);
-        let known = |value: f64| if steps.is_empty() { f64::NAN } else { value };
-        let at = |fraction: f64| known(percentile(&steps, fraction));
+        let at = |fraction: f64| percentile(&steps, fraction);
         let to_goal = json!({
-            "mean": known(steps.iter().sum::<f64>() / steps.len() as f64),
+            "mean": steps.iter().sum::<f64>() / steps.len() as f64,
             "p10": at(0.1), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99),
         });
         let turning = |goal: &Goal| [goal.angle, f64::from(goal.steps) - f64::from(self.hold)];
@@ -82,7 +81,7 @@ impl GoalTimes {
     }
 }
 
-/// The value below which the `fraction` of the `sorted` values lies, interpolated linearly.
+/// The value below which the `fraction` of the `sorted` values lies, interpolated linearly, or `NaN` if there are none.
 fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     let place = fraction * sorted.len().saturating_sub(1) as f64;
     let below = place as usize;

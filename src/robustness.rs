@@ -86,10 +86,11 @@ pub fn robustness(
     let Episodes { seed, count, .. } = episodes;
     let rows = played(playable(task)?, actor, episodes, requests)?;
     let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
-    match report.json {
-        true => os::print(&format!("{}\n", as_json(&rows, count, seed, place)))?,
-        false => os::print(&table(&rows, count, seed, place))?,
-    }
+    let text = match report.json {
+        true => format!("{}\n", as_json(&rows, count, seed, place)),
+        false => table(&rows, count, seed, place),
+    };
+    os::print(&text)?;
     match output {
         Some(file) if interrupted => {
             os::say(&format!("{}: interrupted, not written", file.output.path().display()));

@@ -44,7 +44,7 @@ pub(super) struct RecordingEnv {
 impl RecordingEnv {
     /// Creates an environment of `task`.
     pub(super) fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let nominal = randomization.map_or(task.scene(), |randomization| randomization.nominal());
+        let nominal = randomization.map_or(task.scene(), |randomization| &randomization.nominal);
         Self {
             env: Repose::randomized(task, randomization),
             task: task.clone(),

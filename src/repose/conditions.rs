@@ -8,13 +8,13 @@ use super::sensing;
 use super::task::Task;
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Scene, Simulation};
+use crate::sim::Simulation;
 
 /// The conditions of the current episode of one environment.
 pub(super) struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
-    draw: Option<EpisodePhysics>,
+    pub(super) draw: Option<EpisodePhysics>,
     /// The fraction of the largest assistance that the episode gets. It is 0 in half of the episodes.
     assisted: f64,
     /// Whether the last torque was not zero.
@@ -26,11 +26,6 @@ pub(super) struct Conditions {
 impl Conditions {
     pub(super) fn new(randomization: Option<&Arc<Randomization>>) -> Self {
         Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, twisted: false, bias: Vec::new() }
-    }
-
-    /// The scene of the episodes that are not randomised.
-    pub(super) fn nominal<'a>(&'a self, task: &'a Task) -> &'a Scene {
-        self.randomization.as_ref().map_or(&task.scene, |randomization| randomization.nominal())
     }
 
     /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`. Gives the simulation its
@@ -51,11 +46,6 @@ impl Conditions {
         }
     }
 
-    /// What the episode has drawn, if it is randomised.
-    pub(super) fn draw(&self) -> Option<&EpisodePhysics> {
-        self.draw.as_ref()
-    }
-
     /// The control steps between an action and its effect.
     pub(super) fn delay(&self, task: &Task) -> usize {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
@@ -63,7 +53,7 @@ impl Conditions {
 
     /// The largest delay of any episode.
     pub(super) fn most_delay(&self, task: &Task) -> usize {
-        let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.most_delay());
+        let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.config.delay[1]);
         (task.config.action_delay + drawn) as usize
     }
 

@@ -61,7 +61,7 @@ pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
 const STEPS: usize = 16;
 
 /// The data needed to replay the end of an episode in any MuJoCo.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Tail {
     /// The state before the first of these steps.
     pub start: Box<[f64]>,
@@ -85,12 +85,6 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Forgets the episode.
-    pub(super) fn clear(&mut self) {
-        self.before = None;
-        self.now = None;
-    }
-
     /// Records a step that is about to be taken, after its controls have been set.
     pub(super) fn record(
         &mut self,
@@ -101,16 +95,7 @@ impl Recorder {
     ) {
         let width = action.len();
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
-            let controls = Vec::with_capacity(STEPS * width);
-            let actions = Vec::with_capacity(STEPS * width);
-            self.before = self.now.replace(Tail {
-                start: sim.state(),
-                controls,
-                actions,
-                width,
-                pushes: Vec::new(),
-                torques: Vec::new(),
-            });
+            self.before = self.now.replace(Tail { start: sim.state(), width, ..Tail::default() });
         }
         let tail = self.now.as_mut().expect("just begun");
         tail.controls.extend(sim.ctrl());

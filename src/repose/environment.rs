@@ -52,11 +52,11 @@ impl Repose {
 
     /// Creates an environment of `task` some of whose episodes are randomised.
     pub fn randomized(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let conditions = Conditions::new(randomization);
+        let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
-            sim: Simulation::new(conditions.nominal(task)),
+            sim: Simulation::new(scene),
             servos: Servos::new(task.hand.actuators.len()),
-            conditions,
+            conditions: Conditions::new(randomization),
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
@@ -109,7 +109,7 @@ impl Repose {
 
     /// What this episode has drawn, if it is randomised.
     pub fn draw(&self) -> Option<&EpisodePhysics> {
-        self.conditions.draw()
+        self.conditions.draw.as_ref()
     }
 
     /// The settings of the task.
@@ -143,7 +143,7 @@ impl Repose {
 
     fn send(&mut self) {
         let ctrl = self.sim.ctrl_mut();
-        for (actuator, target) in self.task.hand.actuators.iter().zip(self.servos.due()) {
+        for (actuator, target) in self.task.hand.actuators.iter().zip(&self.servos.due) {
             ctrl[actuator.ctrl] = *target;
         }
     }
@@ -182,8 +182,8 @@ impl Repose {
     }
 
     /// Updates the hold counter after a step, and returns whether the goal has now been held long enough.
-    fn hold(&mut self, within: bool) -> bool {
-        if within {
+    fn hold(&mut self) -> bool {
+        if self.last.within {
             self.held += 1;
         } else if self.task.config.success_hold == SuccessHold::Consecutive {
             self.held = 0;
@@ -253,8 +253,8 @@ impl Env for Repose {
         self.send();
         self.last.action.fill(0.0);
         self.age = 0;
-        self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..Default::default() };
-        self.recorder.clear();
+        self.episode = EpisodeStats { randomized: self.conditions.draw.is_some(), ..Default::default() };
+        self.recorder = Recorder::default();
         self.show(observation);
     }
 
@@ -271,13 +271,13 @@ impl Env for Repose {
         self.sums.steps += 1;
         self.sums.diverged += u64::from(self.last.diverged);
         let reached = if self.last.diverged {
-            let draw = self.conditions.draw().cloned();
+            let draw = self.conditions.draw.clone();
             let length = self.episode.length;
             self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
             false
         } else {
             self.pay();
-            self.hold(self.last.within)
+            self.hold()
         };
         let end = if self.last.diverged || self.episode.dropped {
             Some(End::Terminated)
@@ -325,7 +325,7 @@ impl Resumable for Repose {
         state.put_list(self.sim.state());
         state.numbers.extend(self.goal);
         state.numbers.extend(self.last.action.iter().copied().map(f64::from));
-        state.numbers.extend(self.servos.last());
+        state.numbers.extend(&self.servos.targets);
         self.episode.save(state);
         // As long as it can become, so that all environments of a run have equally many values.
         state.put_list(self.servos.under_way(self.conditions.most_delay(&self.task)));
@@ -349,12 +349,12 @@ impl Resumable for Repose {
         let clipped = self.last.action.iter().all(|action| (-1.0..=1.0).contains(action));
         ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.last.action);
         let targets = state.next(actuators)?;
-        self.episode = EpisodeStats { randomized: self.conditions.draw().is_some(), ..EpisodeStats::saved(state)? };
+        self.episode = EpisodeStats { randomized: self.conditions.draw.is_some(), ..EpisodeStats::saved(state)? };
         let under_way = state.list()?;
         ensure!(under_way.len().is_multiple_of(actuators), "it has {} targets under way", under_way.len());
         self.servos.restore(targets, under_way, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
-        self.recorder.clear();
+        self.recorder = Recorder::default();
         self.show(observation);
         Ok(())
     }

@@ -61,20 +61,29 @@ impl Lesson {
     }
 
     fn described(&self) -> Vec<(Description, f64)> {
-        let Self { act_moving_average, assist, tolerance, hold, task_reward, randomized, ref weights, .. } = *self;
         let mut all = vec![
-            (Description("tolerance", "The rotation error, rad, up to which a goal counts in training."), tolerance),
-            (Description("hold", "The steps within the tolerance that reach a goal in training."), f64::from(hold)),
-            (Description("task_reward", "The weight of the task's reward in training."), task_reward),
+            (
+                Description("tolerance", "The rotation error, rad, up to which a goal counts in training."),
+                self.tolerance,
+            ),
+            (
+                Description("hold", "The steps within the tolerance that reach a goal in training."),
+                f64::from(self.hold),
+            ),
+            (Description("task_reward", "The weight of the task's reward in training."), self.task_reward),
         ];
-        all.extend(ramped(weights));
-        let smoothing = Description("act_moving_average", "The weight of the new target in the smoothed one.");
-        all.push((Description("randomized", "Probability that a new episode is randomised."), randomized));
-        all.push((smoothing, act_moving_average));
-        all.push((
-            Description("assist", "The largest angular acceleration towards the goal for each rad of error, 1/s²."),
-            assist,
-        ));
+        all.extend(ramped(&self.weights));
+        all.extend([
+            (Description("randomized", "Probability that a new episode is randomised."), self.randomized),
+            (
+                Description("act_moving_average", "The weight of the new target in the smoothed one."),
+                self.act_moving_average,
+            ),
+            (
+                Description("assist", "The largest angular acceleration towards the goal for each rad of error, 1/s²."),
+                self.assist,
+            ),
+        ]);
         all
     }
 
@@ -86,12 +95,6 @@ impl Lesson {
     /// The descriptions of these values.
     pub fn descriptions() -> impl Iterator<Item = Description> {
         Self::default().described().into_iter().map(|(about, _)| about)
-    }
-
-    /// Where a target goes from the previous one if this one is asked for.
-    pub(super) fn moved(&self, previous: f64, asked: f64) -> f64 {
-        let alpha = self.act_moving_average;
-        alpha * asked + (1.0 - alpha) * previous
     }
 
     /// The reward that training adds to a step.

@@ -52,10 +52,6 @@ const SIZES: usize = 5;
 /// change what is drawn for the others.
 pub(super) const SHARED: usize = 10;
 
-fn none(_: &Hand, _: &[f64]) -> Vec<Change> {
-    Vec::new()
-}
-
 /// The changes of each of these parts, given one value for all of them or one for each.
 fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
     parts.iter().zip(values.iter().cycle()).map(|(&part, &value)| change(part, value)).collect()
@@ -78,9 +74,9 @@ pub const QUANTITIES: [Quantity; 10] = [
         task: |env| vec![env.hand_mass_scale], law: Law::Uniform(|drawn| drawn.hand_mass),
         change: |hand, x| each(&hand.roots, x, Change::Mass) },
     Quantity { name: "cube_size", setting: "cube_size_scale", unit: "1",
-        task: |env| vec![env.cube_size_scale], law: Law::Size(|drawn| drawn.cube_size), change: none },
+        task: |env| vec![env.cube_size_scale], law: Law::Size(|drawn| drawn.cube_size), change: |_, _| vec![] },
     Quantity { name: "delay", setting: "action_delay", unit: "control steps",
-        task: |env| vec![f64::from(env.action_delay)], law: Law::Whole(|drawn| drawn.delay), change: none },
+        task: |env| vec![f64::from(env.action_delay)], law: Law::Whole(|drawn| drawn.delay), change: |_, _| vec![] },
     Quantity { name: "cube_com", setting: "cube_com", unit: "m",
         task: |env| env.cube_com.into(), law: Law::Within(|drawn| drawn.cube_com),
         change: |hand, x| vec![Change::CentreOfMass(hand.object.body, vector(x))] },
@@ -110,9 +106,9 @@ impl Quantity {
     /// The number of values in an episode of this hand.
     fn count(&self, hand: &Hand) -> usize {
         match self.law {
-            Law::Uniform(_) | Law::Size(_) | Law::Whole(_) => 1,
             Law::Within(_) | Law::Normal(_) => 3,
             Law::Each(count, _) => count(hand),
+            _ => 1,
         }
     }
 
@@ -156,9 +152,9 @@ pub(super) fn normal(rng: &mut Rng, std: f64) -> f64 {
     std * Distribution::<f64>::sample(&StandardNormal, rng)
 }
 
-/// The values of all quantities.
+/// The values of all quantities, in the order of [`QUANTITIES`].
 #[derive(Clone, Debug, PartialEq)]
-pub struct Physics(Vec<Vec<f64>>);
+pub struct Physics(pub(super) Vec<Vec<f64>>);
 
 impl Physics {
     /// The physics of the scene as it is.
@@ -169,11 +165,6 @@ impl Physics {
     /// The physics that a task sets.
     pub(super) fn of_task(config: &EnvConfig) -> Self {
         Self(QUANTITIES.iter().map(|quantity| (quantity.task)(config)).collect())
-    }
-
-    /// Sets the values of a quantity, by its place in the table.
-    pub(super) fn set(&mut self, place: usize, values: Vec<f64>) {
-        self.0[place] = values;
     }
 
     /// What it changes in a scene.
@@ -188,7 +179,7 @@ impl Physics {
             let value = match quantity.law {
                 Law::Whole(_) => json!(values[0] as u64),
                 Law::Uniform(_) | Law::Size(_) => json!(values[0]),
-                Law::Within(_) | Law::Normal(_) | Law::Each(..) => json!(values),
+                _ => json!(values),
             };
             (quantity.name.to_owned(), value)
         };

@@ -17,9 +17,9 @@ use crate::sim::{Scene, Simulation, Variants, origin};
 
 /// The random physics, noise and delays of a training run.
 pub struct Randomization {
-    config: RandomizationConfig,
+    pub(super) config: RandomizationConfig,
     /// The scene of the episodes that are not randomised. It has the physics of the task.
-    nominal: Scene,
+    pub nominal: Scene,
     variants: Variants,
     /// The factor on the lengths of the object in each variant. The last one is the nominal scene.
     sizes: Vec<f64>,
@@ -69,16 +69,6 @@ impl Randomization {
         Ok(Some(Arc::new(Self { variants, config, nominal, sizes, noise, bias })))
     }
 
-    /// The scene of the episodes that are not randomised.
-    pub fn nominal(&self) -> &Scene {
-        &self.nominal
-    }
-
-    /// The most control steps between an action and its effect, in addition to the delay of the task.
-    pub fn most_delay(&self) -> u32 {
-        self.config.delay[1]
-    }
-
     /// Draws the physics of the episode that owns `rng`. The generator's position does not matter. Returns `None` if the episode is
     /// not randomised, which happens with probability 1 - `probability`. All numbers are drawn in any case, so that one setting
     /// does not change what is drawn for another.
@@ -96,7 +86,7 @@ impl Randomization {
                 (quantity.draw(&self.config, hand, own), is_varied(own))
             };
             if varied {
-                physics.set(i, drawn);
+                physics.0[i] = drawn;
             }
         }
         let [.., has_noise, has_bias, has_pushes] = flags;

@@ -120,8 +120,8 @@ impl Record {
     pub(super) fn warning(&self, there: &Self) -> Option<String> {
         let sum = |of: &Self, i: usize| of.driven[i].iter().map(|(_, coefficient)| *coefficient).collect::<Vec<_>>();
         let apart = |i: &usize| {
-            let ends = self.ranges[*i].iter().zip(there.ranges[*i]);
-            ends.into_iter().any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
+            let mut ends = self.ranges[*i].iter().zip(there.ranges[*i]);
+            ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
         };
         let others: Vec<&str> = (0..self.ranges.len()).filter(apart).map(|i| &*there.actuators[i]).collect();
         (!others.is_empty()).then(|| {

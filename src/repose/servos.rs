@@ -8,9 +8,9 @@ use crate::sim::Actuator;
 /// The targets of the servos of one hand: for each actuator in action order, in the unit of its control range.
 pub(super) struct Servos {
     /// The last targets.
-    targets: Vec<f64>,
+    pub(super) targets: Vec<f64>,
     /// The targets that take effect now.
-    due: Vec<f64>,
+    pub(super) due: Vec<f64>,
     /// The targets that have not taken effect yet, the oldest first: as many sets as there are control steps of delay.
     under_way: VecDeque<f64>,
 }
@@ -32,23 +32,14 @@ impl Servos {
 
     /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect.
     pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], lesson: &Lesson) {
+        let alpha = lesson.act_moving_average;
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
             let asked = low + (f64::from(*action) + 1.0) / 2.0 * (high - low);
-            *target = lesson.moved(*target, asked).clamp(low, high);
+            *target = (alpha * asked + (1.0 - alpha) * *target).clamp(low, high);
         }
         self.under_way.extend(&self.targets);
         self.due.iter_mut().zip(self.under_way.drain(..self.targets.len())).for_each(|(due, target)| *due = target);
-    }
-
-    /// The targets that take effect now.
-    pub(super) fn due(&self) -> &[f64] {
-        &self.due
-    }
-
-    /// The last targets.
-    pub(super) fn last(&self) -> &[f64] {
-        &self.targets
     }
 
     /// `count` sets of targets: those under way and, in front of them, the oldest one again.
