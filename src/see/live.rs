@@ -84,11 +84,7 @@ impl Live {
         let key = page.key();
         let seed = about.seed.unwrap_or(0);
         let episodes = Episodes::scored(seed, usize::MAX);
-        let hand = |episode| {
-            let player = Player::new(task, Episodes { first: episode, ..episodes });
-            LiveHand { player, acting: acting.clone(), episode, has_ended: false, reward: TaskReward::default() }
-        };
-        let hands: Vec<LiveHand> = (0..hands).map(hand).collect();
+        let hands: Vec<_> = (0..hands).map(|episode| LiveHand::new(acting.clone(), episode, episodes)).collect();
         let hello = hello(&key, seed, &hands, sliders.as_ref());
         let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
         let port = server.port();
@@ -134,13 +130,8 @@ impl Live {
     }
 
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
-        let own = &mut self.hands[hand];
-        own.player = Player::new(&acting.task, Episodes { first: episode, ..self.episodes });
-        own.acting = acting;
-        own.episode = episode;
-        own.has_ended = false;
-        own.reward = TaskReward::default();
-        let mut about = own.about(self.episodes.seed);
+        self.hands[hand] = LiveHand::new(acting, episode, self.episodes);
+        let mut about = self.hands[hand].about(self.episodes.seed);
         about["hand"] = hand.into();
         // First, so that a viewer who comes in between knows it.
         self.greet();
@@ -163,6 +154,12 @@ impl Live {
 }
 
 impl LiveHand {
+    /// Begins one of these episodes, by its number.
+    fn new(acting: LiveActor, episode: usize, episodes: Episodes) -> Self {
+        let player = Player::new(&acting.task, Episodes { first: episode, ..episodes });
+        Self { player, acting, episode, has_ended: false, reward: TaskReward::default() }
+    }
+
     /// What the page says of its episode, which is drawn from this seed.
     fn about(&self, seed: u64) -> Value {
         let mut about = json!({ "seed": format!("{seed}, episode {}", self.episode) });

@@ -38,10 +38,9 @@ impl Replay {
     /// Fails if they are longer than a page can count, or than a browser opens soon.
     pub fn new(task: &Arc<Task>, camera: Option<Camera>, episodes: usize) -> Result<Self> {
         let steps = task.config().max_episode_steps();
-        let longest = steps <= MOST;
         let all = steps as usize * episodes;
         ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
-        ensure!(longest, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
+        ensure!(steps <= MOST, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
         ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes");
         Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
     }

@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use anyhow::{Result, anyhow};
+use anyhow::{Chain, Result, anyhow};
 
 use crate::schedule::caught;
 
@@ -18,23 +18,20 @@ pub(super) fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -
 
 /// Formats an error and its causes on one line, without consecutive duplicates.
 pub(super) fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
-    let mut causes = vec![error.to_string()];
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        causes.push(error.to_string());
-        cause = error.source();
-    }
+    let mut causes: Vec<String> = Chain::new(error).map(ToString::to_string).collect();
     causes.dedup();
     anyhow!("{}", without_place(&causes.join(": ")))
 }
 
 /// Removes the location in winit's source code that winit puts before an error's description.
 fn without_place(text: &str) -> String {
-    let place = text.split_once("os error at ").and_then(|(before, rest)| Some((before, rest.split_once(".rs:")?.1)));
-    match place.and_then(|(before, rest)| Some((before, rest.split_once(": ")?.1))) {
-        Some((before, what)) => format!("{before}{what}"),
-        None => text.to_owned(),
-    }
+    let shortened = || {
+        let (before, place) = text.split_once("os error at ")?;
+        let (_, line) = place.split_once(".rs:")?;
+        let (_, what) = line.split_once(": ")?;
+        Some(format!("{before}{what}"))
+    };
+    shortened().unwrap_or_else(|| text.to_owned())
 }
 
 #[cfg(test)]
