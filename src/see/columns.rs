@@ -54,7 +54,7 @@ impl Columns {
         }
         let positions = drawing.positions();
         let quaternions = drawing.quaternions();
-        let goal = positions + 7 * task.hand().goal.number();
+        let goal = positions + 7 * task.hand().goal.0;
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
         Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
     }

@@ -70,10 +70,8 @@ impl Compilation {
     /// # Errors
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
-        let is_folder = file.is_some_and(Path::is_dir);
-        ensure!(!is_folder, "env.model must name a MuJoCo scene, but this is a folder");
-        let exists = file.is_none_or(Path::is_file);
-        ensure!(exists, "env.model must name a MuJoCo scene, but there is no such file");
+        ensure!(!file.is_some_and(Path::is_dir), "env.model must name a MuJoCo scene, but this is a folder");
+        ensure!(file.is_none_or(Path::is_file), "env.model must name a MuJoCo scene, but there is no such file");
         if self.keeps_all() {
             let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
             if let Ok(model) = model {

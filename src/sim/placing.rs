@@ -21,13 +21,11 @@ pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> 
 
 /// The geoms of the bodies that have a pose, each with its own in the same frame.
 pub(super) fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
-    let mut geoms = Vec::new();
-    for geom in 0..model.ngeom() as usize {
-        if let Some(frame) = frames[model.geom_bodyid()[geom] as usize] {
-            geoms.push((geom, inside(frame, model.geom_pos()[geom], model.geom_quat()[geom])));
-        }
-    }
-    geoms
+    let placed = |geom: usize| {
+        let frame = frames[model.geom_bodyid()[geom] as usize]?;
+        Some((geom, inside(frame, model.geom_pos()[geom], model.geom_quat()[geom])))
+    };
+    (0..model.ngeom() as usize).filter_map(placed).collect()
 }
 
 /// A pose that is given in a frame as a pose in the surroundings of that frame.

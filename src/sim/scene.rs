@@ -64,16 +64,9 @@ pub enum Frame {
     Site(usize),
 }
 
-/// A mocap body, whose pose is set directly.
+/// A mocap body, whose pose is set directly, by its number among the mocap bodies.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Mocap(pub(super) usize);
-
-impl Mocap {
-    /// Its number among the mocap bodies.
-    pub fn number(self) -> usize {
-        self.0
-    }
-}
+pub struct Mocap(pub usize);
 
 /// An actuator with one control.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -47,8 +47,8 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
     let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
     let changed = |x: usize, y: usize| previous.get(pixel(x, y)) != rgb.get(pixel(x, y));
     let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
-    let top = rows.first().copied().unwrap_or(0);
-    let bottom = rows.last().copied().unwrap_or(0);
+    let top = *rows.first().unwrap_or(&0);
+    let bottom = *rows.last().unwrap_or(&0);
     let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
     let left = (0..width).find(in_column).unwrap_or(0);
     let right = (left..width).rev().find(in_column).unwrap_or(left);

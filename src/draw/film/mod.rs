@@ -48,10 +48,12 @@ impl FilmWriter {
         let [width, height] = format.size;
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
         ensure!(to.ending == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
-        let steady = format.fps <= 50;
-        ensure!(to.ending == "mp4" || steady, "{} fps: a GIF has at most 50 frames per second", format.fps);
-        let fits = format.longest <= MOST_FRAMES;
-        ensure!(fits, "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes", format.longest);
+        ensure!(to.ending == "mp4" || format.fps <= 50, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        ensure!(
+            format.longest <= MOST_FRAMES,
+            "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes",
+            format.longest
+        );
         let file = OutputFile::create(&to.path)?;
         let (frames, incoming) = sync_channel(WAITING);
         let encode = move || encode(file, format, &mut captioned(incoming, format));
