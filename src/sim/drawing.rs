@@ -10,7 +10,7 @@ use super::constants::*;
 use super::look::{Camera, HIDDEN, is_of};
 
 /// A scene as a page draws it. Lengths in m, quaternions w, x, y, z. A pose is in the frame of the parent or of the body.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Serialize)]
 pub struct Drawing {
     /// Every body after its parent. The first is the world.
     pub bodies: Vec<DrawnBody>,
@@ -28,7 +28,7 @@ pub struct Drawing {
 }
 
 /// A body.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Serialize)]
 pub struct DrawnBody {
     parent: usize,
     pos: [f64; 3],
@@ -40,7 +40,7 @@ pub struct DrawnBody {
 }
 
 /// A joint: which numbers move it, and its number at rest.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Serialize)]
 struct DrawnJoint {
     r#type: &'static str,
     at: usize,
@@ -50,7 +50,7 @@ struct DrawnJoint {
 }
 
 /// A shape of a body.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Serialize)]
 pub struct DrawnGeom {
     r#type: &'static str,
     body: usize,
@@ -70,7 +70,7 @@ pub struct DrawnGeom {
 }
 
 /// From where a page shows the scene.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Serialize)]
 pub struct DrawnCamera {
     /// Viewing direction around the vertical.
     pub azimuth: f64,
@@ -87,7 +87,7 @@ pub struct DrawnCamera {
 }
 
 /// A mesh, or a part of one: corners, each with its normal, and triangles of corners.
-#[derive(Clone, Debug, Default)]
+#[derive(Default)]
 pub struct DrawnMesh {
     /// Points and normals.
     pub corners: Vec<([f32; 3], [f32; 3])>,

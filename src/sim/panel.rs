@@ -14,7 +14,6 @@ use mujoco_rs::viewer::egui::{
 pub const SPEEDS: std::ops::RangeInclusive<f64> = 0.05..=4.0;
 
 /// A quantity shown as a bar.
-#[derive(Clone, Debug, Default)]
 pub struct Gauge {
     /// The name of the quantity.
     pub name: &'static str,
@@ -27,7 +26,7 @@ pub struct Gauge {
 }
 
 /// The recent history of a quantity.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Trend {
     /// The name and unit of the quantity.
     pub name: &'static str,
@@ -38,7 +37,7 @@ pub struct Trend {
 }
 
 /// The contents of the panel.
-#[derive(Clone, Debug, Default)]
+#[derive(Default)]
 pub struct Readout {
     /// Rows of a name and a value.
     pub rows: Vec<(&'static str, String)>,
@@ -49,7 +48,7 @@ pub struct Readout {
 }
 
 /// The user's input.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub struct Controls {
     /// Whether time is stopped except for single steps.
     pub paused: bool,

@@ -1,7 +1,7 @@
 //! The common interface of the film encoders.
 
 /// The parameters of a film file.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct FilmFormat {
     /// Width and height in pixels.
     pub size: [u32; 2],
