@@ -37,10 +37,11 @@ impl Graph {
         let node = node.text(2, output).text(3, output).text(4, operation);
         let node = attributes.iter().fold(node, |node, (name, value)| {
             let attribute = Message::default().text(1, name);
-            node.message(5, &match *value {
-                Attribute::Float(value) => attribute.float(2, value).int(20, 1),
-                Attribute::Int(value) => attribute.int(3, value).int(20, 2),
-            })
+            let attribute = match value {
+                Attribute::Float(value) => attribute.float(2, *value).int(20, 1),
+                Attribute::Int(value) => attribute.int(3, *value).int(20, 2),
+            };
+            node.message(5, &attribute)
         });
         self.add(1, &node);
         output.to_owned()

@@ -40,7 +40,10 @@ impl Replay {
         let steps = task.config().max_episode_steps();
         let all = steps as usize * episodes;
         ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
-        ensure!(steps <= MOST, "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}");
+        ensure!(
+            steps <= MOST,
+            "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}"
+        );
         ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes");
         Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
     }
