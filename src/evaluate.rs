@@ -90,8 +90,10 @@ impl Moment<'_> {
     }
 }
 
-struct Lane {
-    env: Repose,
+/// An environment whose episodes are played.
+pub struct Lane {
+    /// The environment.
+    pub env: Repose,
     noise: Rng,
     running: bool,
     end: Option<End>,
@@ -183,7 +185,7 @@ impl Trial<'_> {
             }
             Ok(())
         };
-        Ok(self.play(&mut observer)?.map(|played| Score::of(&played, self.task.config().ctrl_dt)))
+        Ok(self.play(&mut observer)?.map(|played| Score::of(&played, self.task.config.ctrl_dt)))
     }
 
     /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,
@@ -351,7 +353,8 @@ impl Actor<'_> {
 
 /// One environment played episode after episode, one step at a time, by an actor that may change.
 pub struct Player {
-    lane: Lane,
+    /// The environment that it plays.
+    pub lane: Lane,
     observation: Vec<f32>,
     action: Vec<f32>,
     /// The policy's workspace, from the first step of an episode on.
@@ -393,16 +396,6 @@ impl Player {
     /// Draws another goal.
     pub fn new_goal(&mut self) {
         self.lane.env.redirect(&mut self.observation);
-    }
-
-    /// The environment.
-    pub fn env(&self) -> &Repose {
-        &self.lane.env
-    }
-
-    /// The environment for the window, which lets the user pull at it.
-    pub fn env_mut(&mut self) -> &mut Repose {
-        &mut self.lane.env
     }
 }
 

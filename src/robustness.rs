@@ -122,7 +122,7 @@ fn played(
     episodes: Episodes,
     requests: &Requests,
 ) -> Result<Vec<Scored>> {
-    let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config().clone()).collect();
+    let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config.clone()).collect();
     let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
     let bar = os::progress_bar((different * episodes.count) as u64, "episodes", "robustness");
     let mut rows: Vec<Scored> = Vec::new();

@@ -22,8 +22,8 @@ impl Trace {
     /// Creates an empty trace of a task, played by the `actor` of this name, with the policy in `checkpoint`, in episodes drawn from
     /// `seed`.
     pub fn new(task: &Task, actor: &str, checkpoint: Option<&str>, seed: u64) -> Self {
-        let config = task.config();
-        let hand = task.hand();
+        let config = &task.config;
+        let hand = &task.hand;
         let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
@@ -83,19 +83,19 @@ impl Trace {
 
 fn record(moment: &Moment) -> Value {
     let env = moment.env;
-    let simulation = env.simulation();
+    let simulation = &env.sim;
     let qpos = simulation.qpos();
     let qvel = simulation.qvel();
     let obs = doubles(moment.observation);
     let episode = moment.episode;
     let step = env.episode().length;
     let Some((action, end)) = moment.step else {
-        let goal = env.goal();
+        let goal = env.goal;
         return json!({
             "episode": episode, "step": step, "qpos": qpos, "qvel": qvel, "reset": true, "goal": goal, "obs": obs,
         });
     };
-    let details = env.last_step();
+    let details = &env.last;
     let mut reward = Map::from_iter(details.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
     reward.insert("total".into(), json!(details.reward.total()));
     json!({
@@ -109,7 +109,7 @@ fn record(moment: &Moment) -> Value {
         "reward": reward,
         "rot_dist": details.rot_dist,
         "goal_dist": details.goal_dist,
-        "held": env.held(),
+        "held": env.held,
         "goals": env.episode().goals,
         "terminated": end == Some(End::Terminated),
         "truncated": end == Some(End::Truncated),

@@ -61,7 +61,7 @@ fn task_for_display(config: &Config, shot: &see::Shot) -> Result<Arc<Task>> {
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
 fn show_on_page(port: u16, task: &Arc<Task>, choice: usize, seed: u64, camera: Option<Camera>) -> Result<()> {
     let sliders = see::Sliders::new(task);
-    let title = task.config().model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
+    let title = task.config.model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
     let about = see::About { title, policy: None, seed: Some(seed) };
     let own = sliders.clone();
     let step = move |player: &mut Player| {

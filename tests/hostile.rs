@@ -40,7 +40,7 @@ fn a_checkpoint() -> Checkpoint {
     let mut checkpoint = Checkpoint::default();
     agent.save(&mut checkpoint);
     checkpoint.config = config.to_text();
-    checkpoint.scene = task.scene().fingerprint();
+    checkpoint.scene = task.scene.fingerprint();
     checkpoint.hand = task.record().to_text();
     checkpoint
 }

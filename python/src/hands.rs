@@ -102,7 +102,7 @@ impl Hands {
     fn lesson(&self, env_steps: u64) -> Lesson {
         let mut lesson = match self.training {
             true => Lesson::at(env_steps, &self.config),
-            false => Lesson::task(self.task.config()),
+            false => Lesson::task(&self.task.config),
         };
         lesson.goals_end = true;
         lesson
@@ -158,7 +158,7 @@ impl Hands {
         let steps = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
             true => (TaskReward::default(), TrainingReward::default(), hand.rot_dist()),
             false => {
-                let step = hand.last_step();
+                let step = &hand.last;
                 (step.reward, step.training, step.rot_dist)
             }
         });
@@ -272,7 +272,7 @@ impl Hands {
 
     /// The groups of an observation: (name, first index, length, unit).
     fn layout(&self) -> Vec<(&'static str, usize, usize, &'static str)> {
-        self.task.hand().layout.groups.iter().map(|group| (group.name, group.start, group.length, group.unit)).collect()
+        self.task.hand.layout.groups.iter().map(|group| (group.name, group.start, group.length, group.unit)).collect()
     }
 
     /// The number of values in an action.
@@ -284,7 +284,7 @@ impl Hands {
     /// The length of an episode that no drop ends.
     #[getter]
     fn max_episode_steps(&self) -> u32 {
-        self.task.config().max_episode_steps()
+        self.task.config.max_episode_steps()
     }
 
     /// The settings of the task and the names of the hand's parts, as JSON.
@@ -295,7 +295,7 @@ impl Hands {
     /// Warnings where the policy does not fit well.
     #[getter]
     fn warnings(&self) -> Vec<String> {
-        self.task.warnings().to_vec()
+        self.task.warnings.to_vec()
     }
 
     /// What the settings replace in the user's scene, and what was found in it.

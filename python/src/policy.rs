@@ -61,7 +61,7 @@ impl Policy {
         } else {
             Config::default()
         };
-        Ok((Config { env: task.config().clone(), ..whole }, task))
+        Ok((Config { env: task.config.clone(), ..whole }, task))
     }
 
     /// Computes rows of `width` values for the observations.
@@ -230,7 +230,7 @@ pub(crate) fn evaluate(
         let actor = loaded.map_or(Actor::Outside(&outside), |loaded| Actor::Mean(loaded.policy.freeze()));
         let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
         if let Some(path) = &trace {
-            run::expect_output(path, loaded.and_then(|loaded| loaded.origin.file()), task.config().model_file())?;
+            run::expect_output(path, loaded.and_then(|loaded| loaded.origin.file()), task.config.model_file())?;
         }
         let trial = Trial { task: &task, actor: &actor, episodes: Episodes::scored(seed, episodes), stop };
         let failed = || raised.lock().expect("no panic while it is held").is_some();
@@ -248,7 +248,7 @@ fn played(
     trace: Option<&Path>,
     failed: &dyn Fn() -> bool,
 ) -> anyhow::Result<String> {
-    let config = trial.task.config();
+    let config = &trial.task.config;
     let output = trace.map(OutputFile::create).transpose()?;
     let mut output = output.map(|file| (file, Trace::new(trial.task, trial.actor.name(), checkpoint, seed)));
     let mut goal_times = GoalTimes::new(config);

@@ -33,10 +33,10 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 pub(crate) fn resolve(config: Option<&Path>, overrides: &[Override]) -> Result<(Config, Arc<Task>)> {
     let config = Settings::new().user_file(config)?.sets(overrides).resolve()?;
     let task = Task::new(&config.env, &config.hand)?;
-    Ok((Config { env: task.config().clone(), ..config }, task))
+    Ok((Config { env: task.config.clone(), ..config }, task))
 }
 
 /// The settings of a task as JSON: an object of sections.
 pub(crate) fn text(task: &Task) -> String {
-    json!({ "env": task.config().at(0), "hand": task.hand().parts }).to_string()
+    json!({ "env": task.config.at(0), "hand": task.hand.parts }).to_string()
 }

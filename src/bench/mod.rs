@@ -56,7 +56,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let task = Task::new(&config.env, &config.hand)?;
     let record = task.record().with(config.ppo.symmetry);
     let task = task.for_policy(&record)?;
-    config.env = task.config().clone();
+    config.env = task.config.clone();
     let threads = rayon::current_num_threads();
     let num_envs = config.env.num_envs;
     let hidden = &config.ppo.hidden;

@@ -44,7 +44,7 @@ pub(super) struct RecordingEnv {
 impl RecordingEnv {
     /// Creates an environment of `task`.
     pub(super) fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
-        let nominal = randomization.map_or(task.scene(), |randomization| &randomization.nominal);
+        let nominal = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             env: Repose::randomized(task, randomization),
             task: task.clone(),
@@ -68,7 +68,7 @@ impl RecordingEnv {
     fn start(&mut self) {
         self.starts.push(Start {
             after: self.steps.len(),
-            state: self.env.simulation().state(),
+            state: self.env.sim.state(),
             draw: self.env.draw().cloned(),
         });
     }
@@ -92,10 +92,10 @@ impl RecordingEnv {
     fn replay(&mut self, step: usize) {
         let (ctrl, push) = &self.steps[step];
         if let Some(force) = *push {
-            self.bare.push(self.task.hand().object.body, force);
+            self.bare.push(self.task.hand.object.body, force);
         }
         self.bare.ctrl_mut().copy_from_slice(ctrl);
-        self.bare.step_whole(self.task.config().substeps());
+        self.bare.step_whole(self.task.config.substeps());
         self.go_on(step + 1);
     }
 
@@ -129,7 +129,7 @@ impl Env for RecordingEnv {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         let transition = self.env.step(action, observation);
-        self.steps.push((self.env.simulation().ctrl().to_vec(), self.env.last_step().push));
+        self.steps.push((self.env.sim.ctrl().to_vec(), self.env.last.push));
         transition
     }
 
@@ -156,7 +156,7 @@ pub(super) fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
         block.members.iter_mut().for_each(|member| member.env.replay(step));
     });
     let seconds = start.elapsed().as_secs_f64();
-    let same = pool.envs_mut().all(|env| env.bare.qpos() == env.env.simulation().qpos());
+    let same = pool.envs_mut().all(|env| env.bare.qpos() == env.env.sim.qpos());
     ensure!(same, "the replay of the physics did not end in the states of the environments");
     Ok(seconds)
 }

@@ -25,11 +25,11 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = loaded.task(&args.set).context("the file needs the actuator ranges of the scene")?;
-    task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
-    run::expect_output(&args.out, loaded.origin.file(), task.config().model_file())?;
-    let parts = &task.hand().parts;
+    run::expect_output(&args.out, loaded.origin.file(), task.config.model_file())?;
+    let parts = &task.hand.parts;
     let mut names = [&parts.joints, &parts.actuators, &parts.fingertips].into_iter().flatten();
     if let Some(name) = names.find(|name| name.contains(',')) {
         bail!("`{name}`: an exported file separates names by commas, so a name must not contain one");
@@ -46,8 +46,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 /// The names follow mjlab's runners where they define one. `joint_names` are what an action drives, here the actuators. Their
 /// target is `action_offset + action_scale * action`, smoothed with `ema_alpha`.
 fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
-    let config = task.config();
-    let hand = task.hand();
+    let config = &task.config;
+    let hand = &task.hand;
     let parts = &hand.parts;
     let groups = &hand.layout.groups;
     let ranges = || hand.actuators.iter().map(|actuator| actuator.range);

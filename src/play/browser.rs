@@ -94,10 +94,10 @@ pub(super) fn live(
         let newer = Stage { choice: stage.choice, ..Stage::find(Some(path), set)? };
         let record = |stage: &Stage| stage.loaded().map(|loaded| loaded.record.clone());
         ensure!(record(&newer) == record(&stage), "{} is for another hand", path.display());
-        let own = task.at_the_stage_of(newer.task.config());
+        let own = task.at_the_stage_of(&newer.task.config);
         let mut acting = Rc::new(newer).acting(own);
         // The page shows the settings of the first policy.
-        for (key, value) in acting.task.config().unlike(task.config()) {
+        for (key, value) in acting.task.config.unlike(&task.config) {
             acting.policy.iter_mut().for_each(|name| *name += &format!(", {key} {}", short(&value)));
         }
         Ok(acting)
@@ -134,9 +134,9 @@ pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Over
     let stored = settings(path, &header).with_context(cannot)?;
     let config = Settings::new().stored(stored, Reader::Run).sets(set).resolve().with_context(cannot)?;
     let task = Task::new(&config.env, &config.hand)?;
-    let joints = json!(task.hand().parts.joints);
+    let joints = json!(task.hand.parts.joints);
     ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
-    run::expect_output(&to.path, Some(path), task.config().model_file())?;
+    run::expect_output(&to.path, Some(path), task.config.model_file())?;
     let mut page = PageFile::begin(to, &task, shot, 0)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {

@@ -28,7 +28,7 @@ pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, reques
     let actor = &stage.actor();
     let place = stage.loaded().map(|loaded| loaded.origin.to_string());
     let mut files = Files::begin(stage, episodes, outputs)?;
-    let mut goal_times = GoalTimes::new(task.config());
+    let mut goal_times = GoalTimes::new(&task.config);
     let mut observe = |moment: &Moment| {
         goal_times.observe(moment);
         files.observe(moment);
@@ -97,5 +97,5 @@ fn film(
         }
     }
     os::say(&format!("{}: {}", to.path.display(), film.finish()?));
-    Ok((played.len() == count).then(|| Score::of(&played, task.config().ctrl_dt)))
+    Ok((played.len() == count).then(|| Score::of(&played, task.config.ctrl_dt)))
 }

@@ -37,12 +37,12 @@ impl Stage {
             stage.choice = 1;
         }
         let file = stage.loaded().and_then(|loaded| loaded.origin.file());
-        expect_outputs(&args.out, file, stage.task.config().model_file())?;
+        expect_outputs(&args.out, file, stage.task.config.model_file())?;
         os::start_threads(args.threads)?;
         if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
             os::say(&format!("playing {}", loaded.name));
         }
-        stage.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+        stage.task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
         if !args.json {
             stage.task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
         }

@@ -16,7 +16,7 @@ use super::reward::{Step, task_reward};
 use super::servos::Servos;
 use super::task::Task;
 use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward};
-use crate::config::{EnvConfig, SuccessHold};
+use crate::config::SuccessHold;
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
@@ -25,18 +25,22 @@ use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
 pub struct Repose {
-    task: Arc<Task>,
+    /// Its task.
+    pub task: Arc<Task>,
     lesson: Lesson,
-    sim: Simulation,
+    /// The physics state. Call [`Simulation::refresh`] after a modification.
+    pub sim: Simulation,
     rng: Rng,
-    goal: Quat,
-    /// The last step. Observations show its action as the previous one.
-    last: Step,
+    /// The goal orientation of the next step.
+    pub goal: Quat,
+    /// The last step, which may have ended the episode before this one. Observations show its action as the previous one.
+    pub last: Step,
     servos: Servos,
     conditions: Conditions,
     /// Control steps since the reset, plus those skipped by `skip_ahead`.
     age: u32,
-    held: u32,
+    /// The steps within the tolerance that count towards the current goal.
+    pub held: u32,
     episode: EpisodeStats,
     /// The sums since they were last taken.
     sums: StepSums,
@@ -77,44 +81,14 @@ impl Repose {
         }
     }
 
-    /// The last step, which may have ended the episode before this one.
-    pub fn last_step(&self) -> &Step {
-        &self.last
-    }
-
-    /// The goal orientation of the next step.
-    pub fn goal(&self) -> Quat {
-        self.goal
-    }
-
-    /// The steps within the tolerance that count towards the current goal.
-    pub fn held(&self) -> u32 {
-        self.held
-    }
-
     /// The current rotation error, rad.
     pub fn rot_dist(&self) -> f64 {
         quat::angle_between(self.object().orientation, self.goal)
     }
 
-    /// The physics state.
-    pub fn simulation(&self) -> &Simulation {
-        &self.sim
-    }
-
-    /// The physics state for modification. Call [`Simulation::refresh`] afterwards.
-    pub fn simulation_mut(&mut self) -> &mut Simulation {
-        &mut self.sim
-    }
-
     /// What this episode has drawn, if it is randomised.
     pub fn draw(&self) -> Option<&EpisodePhysics> {
         self.conditions.draw.as_ref()
-    }
-
-    /// The settings of the task.
-    pub fn config(&self) -> &EnvConfig {
-        &self.task.config
     }
 
     /// The sums since the last call.

@@ -21,10 +21,13 @@ const GOAL: &str = "goal of shadow-repose";
 /// A scene, the hand in it, and the settings.
 #[derive(Clone)]
 pub struct Task {
-    pub(super) scene: Scene,
+    /// The scene.
+    pub scene: Scene,
     compilation: Compilation,
-    pub(super) hand: Hand,
-    pub(super) config: EnvConfig,
+    /// The hand in the scene.
+    pub hand: Hand,
+    /// The settings.
+    pub config: EnvConfig,
     /// The standard deviation of white noise on an observation.
     pub(super) noise: NoiseStd,
     /// The standard deviation of the offset of an observation that lasts an episode.
@@ -34,7 +37,7 @@ pub struct Task {
     /// What turns observations into observations of the policy's hand, if that is on the other side.
     pub(super) mirror: Option<Mirror>,
     /// Where the policy does not fit well.
-    warnings: Vec<String>,
+    pub warnings: Vec<String>,
 }
 
 impl Task {
@@ -98,21 +101,6 @@ impl Task {
     pub fn at_the_stage_of(&self, other: &EnvConfig) -> Arc<Self> {
         let act_moving_average = other.act_moving_average;
         Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
-    }
-
-    /// The settings.
-    pub fn config(&self) -> &EnvConfig {
-        &self.config
-    }
-
-    /// The hand in the scene.
-    pub fn hand(&self) -> &Hand {
-        &self.hand
-    }
-
-    /// The scene.
-    pub fn scene(&self) -> &Scene {
-        &self.scene
     }
 
     /// Notes on the side of the hand and on a user's scene: what the settings replace in it, and whether the goal and the start of its
@@ -202,11 +190,6 @@ impl Task {
         }
         let symmetry = policy.symmetry.clone();
         Ok(Arc::new(Self { mirror, symmetry, warnings, ..Arc::unwrap_or_clone(self) }))
-    }
-
-    /// Where the policy that it is prepared for does not fit well.
-    pub fn warnings(&self) -> &[String] {
-        &self.warnings
     }
 
     /// The record of its hand and object.

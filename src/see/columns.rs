@@ -47,14 +47,14 @@ pub(super) struct Columns {
 
 impl Columns {
     pub(super) fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
-        let is_builtin = task.config().model_file().is_none();
-        let mut drawing = task.scene().drawing(task.hand().side().filter(|_| is_builtin), camera);
+        let is_builtin = task.config.model_file().is_none();
+        let mut drawing = task.scene.drawing(task.hand.side().filter(|_| is_builtin), camera);
         if is_builtin && camera.is_none() {
             drawing.camera = NEAR;
         }
         let positions = drawing.positions();
         let quaternions = drawing.quaternions();
-        let goal = positions + 7 * task.hand().goal.0;
+        let goal = positions + 7 * task.hand.goal.0;
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
         Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
     }
@@ -81,11 +81,11 @@ impl Columns {
 
     /// The row of an environment after a reset or a step, with these terms of the reward.
     pub(super) fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
-        let last = env.last_step();
+        let last = &env.last;
         let episode = env.episode();
-        let (goal, error) = if episode.length == 0 { (env.goal(), env.rot_dist()) } else { (last.goal, last.rot_dist) };
-        let scalars = [episode.length.into(), error, env.held().into(), episode.goals.into()];
-        self.row(env.simulation().qpos(), &goal, scalars, &reward.values())
+        let (goal, error) = if episode.length == 0 { (env.goal, env.rot_dist()) } else { (last.goal, last.rot_dist) };
+        let scalars = [episode.length.into(), error, env.held.into(), episode.goals.into()];
+        self.row(env.sim.qpos(), &goal, scalars, &reward.values())
     }
 
     /// The row of a record of a trace.
@@ -157,7 +157,7 @@ impl Columns {
     }
 
     fn meta(&self, about: &About) -> Value {
-        let config = self.task.config();
+        let config = &self.task.config;
         json!({
             "format": 1,
             "title": about.title,

@@ -29,7 +29,7 @@ pub struct Shot {
 pub fn task_for_display(task: &Task, shot: &Shot) -> Result<Arc<Task>> {
     let note = |error: &Error| os::say(&format!("note: {error:#}; primitives are shown instead"));
     // Only the built-in hand has meshes.
-    let prefix = task.hand().side().filter(|_| !shot.plain && task.config().model_file().is_none());
+    let prefix = task.hand.side().filter(|_| !shot.plain && task.config.model_file().is_none());
     let meshes =
         |prefix: &str| os::hand_meshes(&mesh_files()).inspect_err(note).ok().map(|meshes| dress(prefix, meshes));
     let Shot { size, camera, quality, .. } = *shot;

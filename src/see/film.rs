@@ -32,11 +32,11 @@ impl Film {
     /// # Errors
     /// Fails if there is no EGL, if it is no kind of film, or if the path cannot be written to.
     pub fn create(to: &Destination, task: &Task, fps: u32, episodes: u64) -> Result<Self> {
-        let config = task.config();
+        let config = &task.config;
         let seconds = f64::from(config.max_episode_steps()) * config.ctrl_dt;
         let longest = ((seconds * f64::from(fps)).ceil() as u64).saturating_add(1);
         let all = episodes.saturating_mul(longest);
-        let renderer = Renderer::new(task.scene())?;
+        let renderer = Renderer::new(&task.scene)?;
         let writer = FilmWriter::create(to, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
         let bar = progress_bar(all, "frames", "film");
         Ok(Self { renderer, writer, fps, longest, drawn: 0, all_frames: 0, bar, begun: Instant::now() })
@@ -52,11 +52,11 @@ impl Film {
         if moment.step.is_none() {
             self.drawn = 0;
         }
-        let time = f64::from(env.episode().length) * env.config().ctrl_dt;
+        let time = f64::from(env.episode().length) * env.task.config.ctrl_dt;
         // A frame exactly at the end belongs to what follows.
         let until = time + if moment.ends() { -1e-9 } else { 1e-9 };
         while self.drawn < self.longest && self.drawn as f64 / f64::from(self.fps) <= until {
-            let picture = self.renderer.draw(env.simulation())?.to_vec();
+            let picture = self.renderer.draw(&env.sim)?.to_vec();
             self.writer.push((picture, caption(env, moment.episode, time)));
             self.drawn += 1;
             self.all_frames += 1;
@@ -90,10 +90,10 @@ impl Film {
 
 /// The lines of text for a frame.
 fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
-    let tolerance = env.config().success_tolerance.to_degrees();
+    let tolerance = env.task.config.success_tolerance.to_degrees();
     vec![
         format!("episode {episode}  {time:5.2} s"),
-        format!("goals {}  held {}/{}", env.episode().goals, env.held(), env.config().max_consecutive_successes),
+        format!("goals {}  held {}/{}", env.episode().goals, env.held, env.task.config.max_consecutive_successes),
         format!("error {:5.1}° (goal {tolerance:.1}°)", env.rot_dist().to_degrees()),
     ]
 }
@@ -110,15 +110,15 @@ pub fn screenshot(
     episodes: Episodes,
     seconds: f64,
 ) -> Result<[u32; 2]> {
-    let mut renderer = Renderer::new(task.scene())?;
+    let mut renderer = Renderer::new(&task.scene)?;
     let mut player = Player::new(task, episodes);
-    for _ in 0..(seconds / task.config().ctrl_dt).round() as u64 {
+    for _ in 0..(seconds / task.config.ctrl_dt).round() as u64 {
         if player.step(actor).is_some() {
             break;
         }
     }
     let size = renderer.size();
-    let picture = renderer.draw(player.env().simulation())?;
+    let picture = renderer.draw(&player.lane.env.sim)?;
     write_png(output, size, picture)?;
     Ok(size)
 }

@@ -75,7 +75,7 @@ impl Live {
     ) -> Result<Self> {
         let task = &acting.task;
         let mut columns = Columns::new(task, camera);
-        let every = (BETWEEN_ROWS / task.config().ctrl_dt).round().max(1.0) as u64;
+        let every = (BETWEEN_ROWS / task.config.ctrl_dt).round().max(1.0) as u64;
         let mut more = json!({ "live": true, "hands": hands, "every": every });
         if let Some(sliders) = &sliders {
             more["sliders"] = sliders.described();
@@ -99,7 +99,7 @@ impl Live {
     /// Shows the hands for as long as the program runs. `next` says who acts in each further episode.
     pub fn show(mut self, next: &mut dyn FnMut() -> LiveActor) -> ! {
         let start = Instant::now();
-        let mut clock = Clock::new(self.hands[0].acting.task.config().ctrl_dt);
+        let mut clock = Clock::new(self.hands[0].acting.task.config.ctrl_dt);
         let mut steps = 0_u64;
         let mut begun = self.hands.len();
         loop {
@@ -146,7 +146,7 @@ impl Live {
     fn row(&mut self) -> String {
         let rows = self.hands.iter_mut().flat_map(|hand| {
             let reward = std::mem::take(&mut hand.reward);
-            self.columns.of(hand.player.env(), reward)
+            self.columns.of(&hand.player.lane.env, reward)
         });
         let bytes: Vec<u8> = rows.flat_map(|value| (value as f32).to_le_bytes()).collect();
         BASE64_STANDARD.encode(bytes)
@@ -172,7 +172,7 @@ impl LiveHand {
     fn step(&mut self) {
         let end = (self.acting.step)(&mut self.player);
         self.has_ended = end.is_some();
-        self.reward += self.player.env().last_step().reward;
+        self.reward += self.player.lane.env.last.reward;
     }
 }
 
@@ -207,7 +207,7 @@ mod tests {
         let about = About { title: "A hand".into(), policy: None, seed: None };
         let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
         let mut live = Live::open(0, (&about, None), 1, &acting(&first), None).unwrap();
-        let seconds = |live: &Live| live.hands[0].player.env().config().max_episode_seconds;
+        let seconds = |live: &Live| live.hands[0].player.lane.env.task.config.max_episode_seconds;
         assert_eq!(seconds(&live), 10.0);
         live.begin(0, 1, acting(&second));
         assert_eq!(seconds(&live), 3.0);

@@ -37,7 +37,7 @@ impl Replay {
     /// # Errors
     /// Fails if they are longer than a page can count, or than a browser opens soon.
     pub fn new(task: &Arc<Task>, camera: Option<Camera>, episodes: usize) -> Result<Self> {
-        let steps = task.config().max_episode_steps();
+        let steps = task.config.max_episode_steps();
         let all = steps as usize * episodes;
         ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
         ensure!(
@@ -50,7 +50,7 @@ impl Replay {
 
     /// Records a moment of an episode.
     pub fn observe(&mut self, moment: &Moment) {
-        let last = moment.env.last_step();
+        let last = &moment.env.last;
         let begins = moment.step.is_none();
         let row = self.columns.of(moment.env, if begins { TaskReward::default() } else { last.reward });
         let end = moment.step.and_then(|(_, end)| end).map(|end| match end {

@@ -36,7 +36,7 @@ impl Slider {
 impl Sliders {
     /// Creates a slider for each actuator of a task's hand.
     pub fn new(task: &Task) -> Self {
-        let hand = task.hand();
+        let hand = &task.hand;
         let sliders = hand.parts.actuators.iter().zip(&hand.actuators);
         let sliders = sliders.map(|(name, actuator)| Slider { name: name.clone(), range: actuator.range, value: None });
         Self(Arc::new(Mutex::new(SliderStates { sliders: sliders.collect(), moved: false })))
@@ -106,7 +106,7 @@ mod tests {
         let task = Task::new(&config.env, &config.hand).unwrap();
         let sliders = Sliders::new(&task);
         let post = sliders.on_post();
-        let [low, high] = task.hand().actuators[3].range;
+        let [low, high] = task.hand.actuators[3].range;
         let acted = || {
             let mut action = [0.25; 20];
             sliders.change(&mut action);

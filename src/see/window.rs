@@ -35,7 +35,7 @@ impl<'a> Window<'a> {
     /// Fails if there is no display or a library is missing. The message names the packages that provide it.
     pub fn open(task: &Task, actors: Vec<(&'static str, Actor<'a>)>, first: usize) -> Result<Self> {
         let (names, actors) = actors.into_iter().unzip();
-        let viewer = Viewer::open(task.scene(), "shadow-repose", names, first)?;
+        let viewer = Viewer::open(&task.scene, "shadow-repose", names, first)?;
         os::say(KEYS);
         Ok(Self { viewer, actors })
     }
@@ -48,10 +48,10 @@ impl<'a> Window<'a> {
         let mut player = Player::new(task, episodes);
         let mut tally = Tally::default();
         let mut curves = curves(task);
-        let mut clock = Clock::new(task.config().ctrl_dt);
+        let mut clock = Clock::new(task.config.ctrl_dt);
         // Ends the episode and starts the next one, if there is one.
         let next = |player: &mut Player, tally: &mut Tally, is_complete: bool| {
-            tally.add(player.env(), is_complete);
+            tally.add(&player.lane.env, is_complete);
             let is_left = tally.episodes < episodes.count;
             if is_left {
                 player.start(episodes, episodes.first + tally.episodes);
@@ -60,8 +60,8 @@ impl<'a> Window<'a> {
         };
         while self.viewer.is_open() {
             let frame = Instant::now();
-            let readout = readout(player.env(), episodes.first + tally.episodes, &tally, &curves);
-            let asked = self.viewer.show(player.env_mut().simulation_mut(), readout)?;
+            let readout = readout(&player.lane.env, episodes.first + tally.episodes, &tally, &curves);
+            let asked = self.viewer.show(&mut player.lane.env.sim, readout)?;
             if asked.reset && !next(&mut player, &mut tally, false) {
                 return Ok(tally.summary());
             }
@@ -78,14 +78,14 @@ impl<'a> Window<'a> {
             for _ in 0..due {
                 let end = player.step(&self.actors[asked.choice]);
                 tally.steps += 1;
-                extend(&mut curves, player.env(), tally.steps);
+                extend(&mut curves, &player.lane.env, tally.steps);
                 if end.is_some() && !next(&mut player, &mut tally, true) {
                     return Ok(tally.summary());
                 }
             }
             sleep(FRAME.saturating_sub(frame.elapsed()));
         }
-        tally.add(player.env(), false);
+        tally.add(&player.lane.env, false);
         Ok(tally.summary())
     }
 }
@@ -128,7 +128,7 @@ impl Tally {
 
 /// The curves of the error and the reward, without points.
 fn curves(task: &Task) -> [Trend; 2] {
-    let level = Some(task.config().success_tolerance.to_degrees());
+    let level = Some(task.config.success_tolerance.to_degrees());
     [
         Trend { name: "rotation error, degrees (line: tolerance)", level, ..Trend::default() },
         Trend { name: "reward of a step", ..Trend::default() },
@@ -137,9 +137,9 @@ fn curves(task: &Task) -> [Trend; 2] {
 
 /// Adds the last of so many steps to the curves.
 fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
-    let step = env.last_step();
+    let step = &env.last;
     for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.total()]) {
-        curve.points.push_back([steps as f64 * env.config().ctrl_dt, value]);
+        curve.points.push_back([steps as f64 * env.task.config.ctrl_dt, value]);
         if curve.points.len() > HISTORY {
             curve.points.pop_front();
         }
@@ -147,9 +147,9 @@ fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
 }
 
 fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Readout {
-    let config = env.config();
+    let config = &env.task.config;
     let stats = env.episode();
-    let reward = if stats.length == 0 { TaskReward::default() } else { env.last_step().reward };
+    let reward = if stats.length == 0 { TaskReward::default() } else { env.last.reward };
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
     let extreme = Step { goal_dist: config.fall_dist, action: vec![1.0; env.spaces().action_size], ..Step::default() };
@@ -158,8 +158,8 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
         let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };
         Gauge { name, fraction, signed: true, text: format!("{value:+.3}") }
     });
-    let fraction = env.held() as f32 / asked as f32;
-    let hold = Gauge { name: "held", fraction, signed: false, text: format!("{} of {asked} steps", env.held()) };
+    let fraction = env.held as f32 / asked as f32;
+    let hold = Gauge { name: "held", fraction, signed: false, text: format!("{} of {asked} steps", env.held) };
     let angle = |radians: f64| format!("{:.1}° = {radians:.3} rad", radians.to_degrees());
     Readout {
         rows: vec![

@@ -66,10 +66,10 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     os::say(&format!("run folder: {place}"));
-    session.task.warnings().iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    session.task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
     if !args.quiet {
         let default = Config::default();
-        let hints = hints(&session.config, args, &default, session.task.scene().size());
+        let hints = hints(&session.config, args, &default, session.task.scene.size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
         let mobility = own_scene.then(|| mobility(&session.task, &default.env));
         session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
@@ -213,7 +213,7 @@ impl Session {
 
     /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
     fn evaluate(&self, due: bool, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Score>> {
-        let ctrl_dt = self.task.config().ctrl_dt;
+        let ctrl_dt = self.task.config.ctrl_dt;
         if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
         }

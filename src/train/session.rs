@@ -96,7 +96,7 @@ impl Session {
             config.run.shards = config.shards();
             let agent = Agent::for_task(&task, &config, exchange)?;
             let mut session =
-                Self { scene: task.scene().fingerprint(), hand, config, task, agent, best, rise: None, dumps };
+                Self { scene: task.scene.fingerprint(), hand, config, task, agent, best, rise: None, dumps };
             from.map_or(Ok(()), |(takes, checkpoint)| session.start(takes, checkpoint))?;
             Ok(session)
         };

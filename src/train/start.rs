@@ -181,7 +181,7 @@ impl Plan {
         };
         let loaded: Result<_> = load();
         let loaded = if let Some(context) = &self.context { loaded.context(context.clone()) } else { loaded }?;
-        self.config.env = loaded.0.config().clone();
+        self.config.env = loaded.0.config.clone();
         Ok(loaded)
     }
 
@@ -283,7 +283,7 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
     let mut before = parent.env.clone();
     before.model.clone_from(&config.env.model);
-    let here = Task::new(&before, &config.hand)?.scene().fingerprint();
+    let here = Task::new(&before, &config.hand)?.scene.fingerprint();
     ensure!(
         checkpoint.scene == here,
         "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",

@@ -30,7 +30,7 @@ fn documents() -> Vec<PathBuf> {
 #[test]
 fn the_table_of_the_observation_is_the_one_of_the_program() {
     let text = read("docs/OBSERVATION.md");
-    let groups = task(&[]).hand().layout.groups;
+    let groups = task(&[]).hand.layout.groups;
     for Group { name, start, length, unit, .. } in groups {
         let row = format!("| {start} … {} | `{name}` | {length} | {unit} |", start + length - 1);
         assert!(text.contains(&row), "{row}");

@@ -16,7 +16,7 @@ fn how_long_goals_take_is_what_the_trace_shows() {
     let score: Value = serde_json::from_slice(&succeeded(program(place.path(), &args)).stdout).unwrap();
     let text = fs::read_to_string(place.path().join("trace.jsonl")).unwrap();
     let records: Vec<Value> = text.lines().skip(1).map(|line| serde_json::from_str(line).unwrap()).collect();
-    let object = task(&[]).scene().free_body("cube").unwrap().qpos;
+    let object = task(&[]).scene.free_body("cube").unwrap().qpos;
     let orientation = |of: &Value| -> Quat { std::array::from_fn(|i| of[i].as_f64().unwrap()) };
 
     // Step and angle at which the goal in force was given. Then episode, steps and angle of each goal that was reached.

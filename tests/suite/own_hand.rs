@@ -159,7 +159,7 @@ fn a_mocap_body_that_guides_something_is_not_the_goal() {
     ] {
         let scene = THREE_FINGERS.replace("</worldbody>", &bodies).replace("</mujoco>", &tied(constraint));
         let (_folder, model) = placed(&scene);
-        assert_eq!(task(&[&model]).hand().parts.goal, "goal of shadow-repose", "{constraint}");
+        assert_eq!(task(&[&model]).hand.parts.goal, "goal of shadow-repose", "{constraint}");
     }
 }
 
@@ -218,7 +218,7 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
     let (_folder, model) = placed(&both);
     let config = crate::support::config(&[&model, "hand.object=other", "hand.goal=g2"]);
     let task = Task::new(&config.env, &config.hand).unwrap();
-    assert_eq!((&*task.hand().parts.object, &*task.hand().parts.goal), ("other", "g2"));
+    assert_eq!((&*task.hand.parts.object, &*task.hand.parts.goal), ("other", "g2"));
 }
 
 #[test]
@@ -228,10 +228,10 @@ fn a_scene_that_shows_no_goal_gets_one_that_touches_nothing() {
     let mut env = Repose::new(&task);
     let mut observation = vec![0.0; task.spaces().observation_size];
     env.reset(rng::stream(0, "test", 0), &mut observation);
-    let goal = task.scene().frame(&task.hand().parts.goal).unwrap();
-    let pose = env.simulation().pose(goal);
+    let goal = task.scene.frame(&task.hand.parts.goal).unwrap();
+    let pose = env.sim.pose(goal);
     assert!((pose.position[2] - 0.445).abs() < 1e-9, "{pose:?}");
-    assert_eq!(pose.orientation.map(|x| x as f32), env.goal().map(|x| x as f32));
+    assert_eq!(pose.orientation.map(|x| x as f32), env.goal.map(|x| x as f32));
 }
 
 #[test]

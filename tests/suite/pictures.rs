@@ -203,7 +203,7 @@ fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
         assert_eq!(transitions[0], transitions[1]);
         assert_eq!(plain.1, dressed.1);
     }
-    assert_eq!(plain.0.simulation().qpos(), dressed.0.simulation().qpos());
+    assert_eq!(plain.0.sim.qpos(), dressed.0.sim.qpos());
 }
 
 #[test]
@@ -221,7 +221,7 @@ fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit(
     let plain = task(&[&format!("env.model={}", path.display())]);
     let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast };
     let furnished = plain.for_display(&look).unwrap();
-    let geoms = [&plain, &furnished].map(|task| task.scene().geoms());
+    let geoms = [&plain, &furnished].map(|task| task.scene.geoms());
     assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
     same_physics(&plain, &furnished);
     if can_draw() {
@@ -237,7 +237,7 @@ fn a_plain_box_and_a_goal_that_is_added_have_faces_that_can_be_told_apart() {
     let model = concat!("env.model=", env!("CARGO_MANIFEST_DIR"), "/tests/suite/three_fingers.xml");
     let plain = task(&[model]);
     let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast };
-    let geoms = [&plain, &plain.for_display(&look).unwrap()].map(|task| task.scene().geoms());
+    let geoms = [&plain, &plain.for_display(&look).unwrap()].map(|task| task.scene.geoms());
     assert_eq!(geoms[1], geoms[0] + 12);
 }
 

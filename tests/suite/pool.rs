@@ -268,7 +268,7 @@ fn the_rewards_of_a_step_outlive_the_start_of_the_next_episode() {
     let mut pool = AtOnce::new(1, &["env.max_episode_seconds=0.02", "env.fall_dist=10"], false);
     for _ in 0..4 {
         pool.step(Autoreset::SameStep);
-        let last = pool.pool.envs_mut().next().unwrap().last_step().reward.total();
+        let last = pool.pool.envs_mut().next().unwrap().last.reward.total();
         assert!(last != 0.0 && (last - f64::from(pool.rewards[0])).abs() < 1e-6, "{last} {:?}", pool.rewards);
     }
 }

@@ -48,7 +48,7 @@ fn after_steps(steps: u32, settings: &[&str]) -> Vec<f64> {
     for step in 0..steps {
         let _ = env.step(&[0.3 * (step as f32 / 15.0).sin(); 20], &mut observation);
     }
-    env.simulation().qpos().to_vec()
+    env.sim.qpos().to_vec()
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn a_fork_without_forces_on_the_cube_drops_the_one_of_its_parent() {
         observation
     };
     let pushed = after_a_step(&env);
-    env.simulation_mut().push(task(&[]).hand().object.body, [0.0; 3]);
+    env.sim.push(task(&[]).hand.object.body, [0.0; 3]);
     assert_eq!(pushed, after_a_step(&env));
 }
 
@@ -135,10 +135,10 @@ fn an_action_takes_effect_after_the_delay() {
     let controls = |delay: u32| {
         let task = task(&[&format!("env.action_delay={delay}")]);
         let (mut env, mut observation) = started(&task);
-        let mut sent = vec![env.simulation().ctrl().to_vec()];
+        let mut sent = vec![env.sim.ctrl().to_vec()];
         for step in 0..12 {
             let _ = env.step(&[0.1 * step as f32; 20], &mut observation);
-            sent.push(env.simulation().ctrl().to_vec());
+            sent.push(env.sim.ctrl().to_vec());
         }
         sent
     };
@@ -155,9 +155,9 @@ fn noise_and_bias_are_seen_but_the_hand_is_where_it_is() {
         let mut seen = Vec::new();
         for _ in 0..200 {
             let _ = env.step(&[0.1; 20], &mut observation);
-            let joints = &task.hand().joints;
-            let off = |i: usize| f64::from(observation[i]) - env.simulation().qpos()[joints[i].qpos];
-            seen.push((off(0), observation[30], env.simulation().qpos().to_vec()));
+            let joints = &task.hand.joints;
+            let off = |i: usize| f64::from(observation[i]) - env.sim.qpos()[joints[i].qpos];
+            seen.push((off(0), observation[30], env.sim.qpos().to_vec()));
         }
         seen
     };
@@ -188,7 +188,7 @@ fn randomized(settings: &[&str]) -> (Repose, impl Fn(u64) -> Option<EpisodePhysi
     env.set_lesson(lesson);
     let draw = move |episode| {
         let rng = rng::stream(0, "episode", episode);
-        randomization.as_ref().and_then(|randomization| randomization.draw(&rng, lesson.randomized, task.hand()))
+        randomization.as_ref().and_then(|randomization| randomization.draw(&rng, lesson.randomized, &task.hand))
     };
     (env, draw)
 }
@@ -391,7 +391,7 @@ fn evaluations_stay_nominal_while_training_is_randomised() {
         let (task, actor) = (loaded.task(&sets).unwrap(), Actor::Mean(loaded.policy.freeze()));
         let trial = Trial { task: &task, actor: &actor, episodes, stop: &AtomicBool::new(false) };
         let played = trial.play(&mut |_| Ok(())).unwrap().unwrap();
-        Score::of(&played, task.config().ctrl_dt)["rot_dist"]
+        Score::of(&played, task.config.ctrl_dt)["rot_dist"]
     };
     assert_eq!(rot_dist(&[]), logged);
     assert_ne!(rot_dist(&["env.friction_scale=0.9"]), logged);

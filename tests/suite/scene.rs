@@ -91,9 +91,9 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
         // Until the cube lies in the hand, so that the steps have contacts.
         let _ = env.step(&[0.3; 20], &mut observation);
     }
-    let mut bare = Simulation::new(task.scene());
-    bare.start_replay(&env.simulation().state(), task.scene());
-    let simulation = env.simulation_mut();
+    let mut bare = Simulation::new(&task.scene);
+    bare.start_replay(&env.sim.state(), &task.scene);
+    let simulation = &mut env.sim;
     for step in 0..50 {
         let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();
         simulation.ctrl_mut().copy_from_slice(&ctrl);
@@ -112,13 +112,13 @@ fn bodies_are_of_the_same_instant_as_joints() {
         let _ = env.step(&[0.5; 20], &mut observation);
     }
     // Another simulation with the same joint positions and velocities, whose bodies are computed from these alone.
-    let tip = task.scene().frame("rh_ffdistal").unwrap();
-    let mut other = Simulation::new(task.scene());
-    other.qpos_mut().copy_from_slice(env.simulation().qpos());
-    other.qvel_mut().copy_from_slice(env.simulation().qvel());
+    let tip = task.scene.frame("rh_ffdistal").unwrap();
+    let mut other = Simulation::new(&task.scene);
+    other.qpos_mut().copy_from_slice(env.sim.qpos());
+    other.qvel_mut().copy_from_slice(env.sim.qvel());
     other.refresh();
-    assert_eq!(other.pose(tip), env.simulation().pose(tip));
-    assert_eq!(other.velocity(tip), env.simulation().velocity(tip));
+    assert_eq!(other.pose(tip), env.sim.pose(tip));
+    assert_eq!(other.velocity(tip), env.sim.velocity(tip));
     let position: Vec<f32> = other.pose(tip).position.iter().map(|&x| x as f32).collect();
     assert_eq!(observation[72..75], position);
     let linear: Vec<f32> = other.velocity(tip).linear.iter().map(|&x| x as f32).collect();
@@ -139,7 +139,7 @@ fn an_own_scene_may_list_its_parts_in_any_order() {
         let (mut env, mut observation) = started(&task);
         let action: Vec<f32> = (0..20).map(|i| (i as f32 - 10.0) / 12.0).collect();
         let rewards: Vec<f32> = (0..20).map(|_| env.step(&action, &mut observation).reward).collect();
-        (rewards, observation, env.simulation().ctrl().to_vec())
+        (rewards, observation, env.sim.ctrl().to_vec())
     };
     let (builtin, own) = (run(&[]), run(&[&setting]));
     // Summing forces in another order rounds differently.
@@ -217,9 +217,9 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
 fn the_program_decides_the_timestep() {
     let task = task(&["env.sim_dt=0.002"]);
     let (mut env, mut observation) = started(&task);
-    let before = env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
+    let before = env.sim.qpos()[task.scene.free_body("cube").unwrap().qpos + 2];
     let _ = env.step(&[0.0; 20], &mut observation);
-    let fallen = before - env.simulation().qpos()[task.scene().free_body("cube").unwrap().qpos + 2];
+    let fallen = before - env.sim.qpos()[task.scene.free_body("cube").unwrap().qpos + 2];
     // In five steps of 2 ms the cube falls by g · dt² · (1 + 2 + 3 + 4 + 5).
     assert!((fallen - 9.81 * 0.002 * 0.002 * 15.0).abs() < 1e-6, "fell by {fallen}");
 }

@@ -143,7 +143,7 @@ fn ignored(change: &str, more: &[&str]) -> Option<String> {
 
 #[test]
 fn no_setting_is_ignored_without_a_word() {
-    let hand = task(&[]).hand().parts.clone();
+    let hand = task(&[]).hand.parts.clone();
     let reversed = |key: &str, names: &[String]| format!("hand.{key}={:?}", Vec::from_iter(names.iter().rev()));
     let lists = [
         reversed("joints", &hand.joints),

@@ -15,13 +15,13 @@ use crate::support::{OBSERVATION_SIZE, config, env_config, started, started_agen
 const STILL: [f32; 20] = [0.0; 20];
 
 fn object_at(task: &Task) -> usize {
-    task.scene().free_body("cube").unwrap().qpos
+    task.scene.free_body("cube").unwrap().qpos
 }
 
 /// Puts the cube at the goal position, turned to `orientation`, at rest.
 fn put_object(env: &mut Repose, task: &Task, orientation: Quat) {
-    let object = task.scene().free_body("cube").unwrap();
-    let simulation = env.simulation_mut();
+    let object = task.scene.free_body("cube").unwrap();
+    let simulation = &mut env.sim;
     simulation.qpos_mut()[object.qpos..object.qpos + 3].copy_from_slice(&[0.33, 0.0, 0.295]);
     simulation.qpos_mut()[object.qpos + 3..object.qpos + 7].copy_from_slice(&orientation);
     simulation.qvel_mut()[object.dof..object.dof + 6].fill(0.0);
@@ -39,18 +39,18 @@ fn assert_close(found: &[f32], expected: &[f64]) {
 fn observations_land_at_their_indices() {
     let task = task(&[]);
     let (mut env, mut observation) = started(&task);
-    let hand = task.hand();
+    let hand = &task.hand;
     let object = hand.object;
     // A quarter turn about z, with w < 0: the observation shows the opposite sign.
     let orientation = [-FRAC_1_SQRT_2, 0.0, 0.0, -FRAC_1_SQRT_2];
     put_object(&mut env, &task, orientation);
     for i in 0..24 {
         let (low, high) = (hand.joints[i].range[0], hand.joints[i].range[1]);
-        env.simulation_mut().qpos_mut()[hand.joints[i].qpos] = low + (high - low) * (i as f64 + 1.0) / 30.0;
-        env.simulation_mut().qvel_mut()[hand.joints[i].dof] = 0.1 * i as f64;
+        env.sim.qpos_mut()[hand.joints[i].qpos] = low + (high - low) * (i as f64 + 1.0) / 30.0;
+        env.sim.qvel_mut()[hand.joints[i].dof] = 0.1 * i as f64;
     }
-    env.simulation_mut().qvel_mut()[object.dof..object.dof + 6].copy_from_slice(&[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
-    env.simulation_mut().refresh();
+    env.sim.qvel_mut()[object.dof..object.dof + 6].copy_from_slice(&[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
+    env.sim.refresh();
     env.observe(&mut observation);
 
     let order = [
@@ -58,9 +58,9 @@ fn observations_land_at_their_indices() {
         "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
     ];
     for (i, name) in order.iter().enumerate() {
-        let joint = task.scene().hinge(&format!("rh_{name}")).unwrap();
-        assert_close(&observation[i..=i], &[env.simulation().qpos()[joint.qpos]]);
-        assert_close(&observation[24 + i..=24 + i], &[0.2 * env.simulation().qvel()[joint.dof]]);
+        let joint = task.scene.hinge(&format!("rh_{name}")).unwrap();
+        assert_close(&observation[i..=i], &[env.sim.qpos()[joint.qpos]]);
+        assert_close(&observation[24 + i..=24 + i], &[0.2 * env.sim.qvel()[joint.dof]]);
     }
     assert_close(&observation[48..51], &[0.33, 0.0, 0.295]);
     assert_close(&observation[51..55], &[FRAC_1_SQRT_2, 0.0, 0.0, FRAC_1_SQRT_2]);
@@ -68,13 +68,13 @@ fn observations_land_at_their_indices() {
     // Body frame (1, 2, 3), a quarter turn about z: (-2, 1, 3) in the world, times 0.2.
     assert_close(&observation[58..61], &[-0.4, 0.2, 0.6]);
     assert_close(&observation[61..64], &[0.33, 0.0, 0.295]);
-    assert_close(&observation[64..68], &quat::canonical(env.goal()));
-    let relative = quat::canonical(quat::mul(orientation, quat::conj(env.goal())));
+    assert_close(&observation[64..68], &quat::canonical(env.goal));
+    let relative = quat::canonical(quat::mul(orientation, quat::conj(env.goal)));
     assert_close(&observation[68..72], &relative);
     for (i, name) in ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"].iter().enumerate() {
-        let body = task.scene().frame(name).unwrap();
-        let Pose { position, orientation: turned } = env.simulation().pose(body);
-        let Velocity { linear, angular } = env.simulation().velocity(body);
+        let body = task.scene.frame(name).unwrap();
+        let Pose { position, orientation: turned } = env.sim.pose(body);
+        let Velocity { linear, angular } = env.sim.velocity(body);
         let expected: Vec<f64> = position.into_iter().chain(turned).chain(linear).chain(angular).collect();
         assert_close(&observation[72 + 13 * i..85 + 13 * i], &expected);
         assert!(linear.iter().any(|v| v.abs() > 1e-3), "{name} moves");
@@ -86,9 +86,9 @@ fn observations_land_at_their_indices() {
 fn fingertip_velocities_are_those_of_the_frames_origin() {
     let task = task(&[]);
     let (mut env, _) = started(&task);
-    let tip = task.scene().frame("rh_mfdistal").unwrap();
-    let joint = task.scene().hinge("rh_MFJ3").unwrap();
-    let simulation = env.simulation_mut();
+    let tip = task.scene.frame("rh_mfdistal").unwrap();
+    let joint = task.scene.hinge("rh_MFJ3").unwrap();
+    let simulation = &mut env.sim;
     simulation.qvel_mut().fill(0.0);
     simulation.qvel_mut()[joint.dof] = 2.0;
     simulation.refresh();
@@ -107,12 +107,12 @@ fn fingertip_velocities_are_those_of_the_frames_origin() {
 #[test]
 fn actions_are_clipped_and_scaled_to_the_control_ranges() {
     let task = task(&["env.act_moving_average=1"]);
-    let hand = task.hand();
+    let hand = &task.hand;
     let (mut env, mut observation) = started(&task);
     let mut action = [0.0f32; 20];
     (action[0], action[7], action[19]) = (3.0, -1.5, 0.5);
     let _ = env.step(&action, &mut observation);
-    let ctrl = |i: usize| env.simulation().ctrl()[hand.actuators[i].ctrl];
+    let ctrl = |i: usize| env.sim.ctrl()[hand.actuators[i].ctrl];
     assert_eq!(ctrl(0), 1.0472);
     assert_eq!(ctrl(7), 0.0);
     let [low, high] = hand.actuators[19].range;
@@ -123,19 +123,19 @@ fn actions_are_clipped_and_scaled_to_the_control_ranges() {
         expected
     });
     // The penalty is computed from the clipped action.
-    assert!((env.last_step().reward["action"] - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
+    assert!((env.last.reward["action"] - -0.0002 * (1.0 + 1.0 + 0.25)).abs() < 1e-12);
 }
 
 #[test]
 fn smoothing_averages_targets_and_begins_at_the_reset_joints() {
     let task = task(&["env.act_moving_average=0.25"]);
-    let hand = task.hand();
+    let hand = &task.hand;
     let (mut env, mut observation) = started(&task);
-    let angle = |env: &Repose, name: &str| env.simulation().qpos()[task.scene().hinge(name).unwrap().qpos];
+    let angle = |env: &Repose, name: &str| env.sim.qpos()[task.scene.hinge(name).unwrap().qpos];
     let (single, coupled) = (angle(&env, "rh_FFJ3"), angle(&env, "rh_FFJ2") + angle(&env, "rh_FFJ1"));
     assert!(coupled > 0.0, "the noise has moved the coupled joints");
     let _ = env.step(&[1.0; 20], &mut observation);
-    let ctrl = |env: &Repose, i: usize| env.simulation().ctrl()[hand.actuators[i].ctrl];
+    let ctrl = |env: &Repose, i: usize| env.sim.ctrl()[hand.actuators[i].ctrl];
     assert!((ctrl(&env, 6) - (0.25 * 1.5708 + 0.75 * single)).abs() < 1e-12);
     let first = 0.25 * 3.1415 + 0.75 * coupled;
     assert!((ctrl(&env, 7) - first).abs() < 1e-12);
@@ -147,23 +147,23 @@ fn smoothing_averages_targets_and_begins_at_the_reset_joints() {
 fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on() {
     let task = task(&["env.max_consecutive_successes=3"]);
     let (mut env, mut observation) = started(&task);
-    let goal = env.goal();
+    let goal = env.goal;
     for held in [1, 2, 0] {
         put_object(&mut env, &task, goal);
         let transition = env.step(&STILL, &mut observation);
-        let details = env.last_step().clone();
+        let details = env.last.clone();
         assert_eq!((details.goal, details.reward["bonus"], transition.end), (goal, 2.0, None));
         assert!(details.rot_dist < 0.1);
         // The reward is computed against the goal in force.
         let rotation = 1.0 / (details.rot_dist + 0.1);
         assert!((details.reward["rotation"] - rotation).abs() < 1e-12);
         assert!((f64::from(transition.reward) - details.reward.total()).abs() < 1e-5);
-        assert_eq!(env.held(), held);
+        assert_eq!(env.held, held);
     }
     assert_eq!((env.episode().goals, env.episode().in_tolerance), (1, 3));
-    assert_ne!(env.goal(), goal);
+    assert_ne!(env.goal, goal);
     // The observation already shows the next goal.
-    assert_close(&observation[64..68], &quat::canonical(env.goal()));
+    assert_close(&observation[64..68], &quat::canonical(env.goal));
 }
 
 #[test]
@@ -171,13 +171,13 @@ fn steps_outside_the_tolerance_leave_a_cumulative_counter_alone_and_clear_a_cons
     for (mode, held) in [("cumulative", 2), ("consecutive", 1)] {
         let task = task(&[&format!("env.success_hold={mode}")]);
         let (mut env, mut observation) = started(&task);
-        let goal = env.goal();
+        let goal = env.goal;
         let away = quat::mul(goal, [FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0, 0.0]);
         for orientation in [goal, away, goal] {
             put_object(&mut env, &task, orientation);
             let _ = env.step(&STILL, &mut observation);
         }
-        assert_eq!(env.held(), held, "{mode}");
+        assert_eq!(env.held, held, "{mode}");
         assert_eq!(env.episode().in_tolerance, 2);
     }
 }
@@ -187,13 +187,13 @@ fn a_dropped_cube_terminates_and_pays_the_penalty() {
     let task = task(&["env.fall_penalty=-5"]);
     let (mut env, mut observation) = started(&task);
     let height = object_at(&task) + 2;
-    env.simulation_mut().qpos_mut()[height] = 0.295 - 0.241;
-    env.simulation_mut().refresh();
+    env.sim.qpos_mut()[height] = 0.295 - 0.241;
+    env.sim.refresh();
     let transition = env.step(&STILL, &mut observation);
     assert_eq!(transition.end, Some(End::Terminated));
     assert!(env.episode().dropped && !env.episode().diverged);
-    assert_eq!(env.last_step().reward["fall"], -5.0);
-    assert!((env.last_step().reward["distance"] + 10.0 * env.last_step().goal_dist).abs() < 1e-12);
+    assert_eq!(env.last.reward["fall"], -5.0);
+    assert!((env.last.reward["distance"] + 10.0 * env.last.goal_dist).abs() < 1e-12);
 }
 
 #[test]
@@ -214,14 +214,14 @@ fn a_diverged_state_terminates_pays_nothing_and_leaves_no_trace_in_the_next_epis
     let (mut env, mut observation) = started(&task);
     for (poison, name) in [(f64::NAN, "NaN"), (1e12, "a huge number")] {
         let (mut fresh, mut expected) = started(&task);
-        env.simulation_mut().qpos_mut()[3] = poison;
+        env.sim.qpos_mut()[3] = poison;
         let transition = env.step(&[0.5; 20], &mut observation);
         assert_eq!(transition.end, Some(End::Terminated), "{name}");
         assert_eq!(transition.reward, 0.0);
-        assert!(env.episode().diverged && env.last_step().diverged && !env.episode().dropped);
+        assert!(env.episode().diverged && env.last.diverged && !env.episode().dropped);
         assert!(observation.iter().all(|x| x.is_finite()));
         assert_eq!(env.take_sums().diverged, 1);
-        assert!(env.simulation().ctrl().iter().any(|&c| c != 0.0), "the controls that were sent are still there");
+        assert!(env.sim.ctrl().iter().any(|&c| c != 0.0), "the controls that were sent are still there");
         env.reset(rng::stream(7, "test", 0), &mut observation);
         for _ in 0..10 {
             let _ = env.step(&[0.2; 20], &mut observation);
@@ -245,13 +245,13 @@ fn an_action_that_is_not_a_number_ends_the_episode_as_diverged() {
 #[test]
 fn resets_stay_within_the_noise_and_the_joints_limits() {
     let task = task(&["env.reset_dof_vel_noise=0.3"]);
-    let hand = task.hand();
+    let hand = &task.hand;
     let mut env = Repose::new(&task);
     let mut observation = vec![0.0; OBSERVATION_SIZE];
     let (mut angles, mut starts) = (Vec::new(), Vec::new());
     for episode in 0..200 {
         env.reset(rng::stream(1, "test", episode), &mut observation);
-        let (qpos, qvel) = (env.simulation().qpos(), env.simulation().qvel());
+        let (qpos, qvel) = (env.sim.qpos(), env.sim.qvel());
         for joint in &hand.joints {
             let angle = qpos[joint.qpos];
             assert!(angle.abs() <= 0.2 && (joint.range[0]..=joint.range[1]).contains(&angle));
@@ -263,7 +263,7 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
         }
         assert!(qvel[hand.object.dof..hand.object.dof + 6].iter().all(|&v| v == 0.0));
         let orientation: Quat = object[3..].try_into().unwrap();
-        angles.push(quat::angle_between(orientation, env.goal()));
+        angles.push(quat::angle_between(orientation, env.goal));
         starts.push(qpos[hand.joints[0].qpos]);
     }
     let mean = angles.iter().sum::<f64>() / angles.len() as f64;
@@ -279,7 +279,7 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
     for iteration in 1..=6 {
         let poison = [f64::NAN, f64::INFINITY, -1e200][iteration % 3];
         for env in [iteration, 100 + iteration] {
-            let simulation = agent.pool.envs_mut().nth(env).unwrap().simulation_mut();
+            let simulation = &mut agent.pool.envs_mut().nth(env).unwrap().sim;
             simulation.qpos_mut()[7] = poison;
             simulation.qvel_mut()[20] = poison;
         }
@@ -328,11 +328,11 @@ fn where_cube_and_target_are_and_how_an_episode_begins_are_settings() {
     let (mut env, mut observation) = started(&task);
     assert_close(&observation[48..51], &[0.3, 0.02, 0.31]);
     assert_close(&observation[61..64], &[0.3, 0.02, 0.31]);
-    let target = env.simulation().pose(task.scene().frame("target").unwrap()).position;
+    let target = env.sim.pose(task.scene.frame("target").unwrap()).position;
     assert_close(&target.map(|x| x as f32), &[0.3, 0.02, 0.71]);
     assert_close(&observation[..24], &[0.0; 24]);
-    let joint = task.hand().joints[3];
-    env.simulation_mut().qvel_mut()[joint.dof] = 3.0;
+    let joint = task.hand.joints[3];
+    env.sim.qvel_mut()[joint.dof] = 3.0;
     env.observe(&mut observation);
     assert_close(&observation[27..28], &[1.5]);
 }

@@ -41,16 +41,16 @@ fn start(env: &mut Repose, episode: u64) -> Vec<f32> {
 fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy() {
     // The hand moves slowly while the cube falls onto it.
     let task = task(&["env.act_moving_average=0.05"]);
-    let object = task.scene().free_body("cube").unwrap().qpos;
+    let object = task.scene.free_body("cube").unwrap().qpos;
     let (half, root) = (0.5, std::f64::consts::FRAC_1_SQRT_2);
     for (episode, turn) in
         [[root, 0.0, root, 0.0], [half, -half, half, half], [0.0, 0.0, root, -root]].iter().enumerate()
     {
         let (mut one, mut other) = (Repose::new(&task), Repose::new(&task));
         let (mut seen, mut other_seen) = (start(&mut one, episode as u64), start(&mut other, episode as u64));
-        let orientation = *other.simulation().qpos()[object + 3..].first_chunk().unwrap();
-        other.simulation_mut().qpos_mut()[object + 3..object + 7].copy_from_slice(&quat::mul(orientation, *turn));
-        other.simulation_mut().refresh();
+        let orientation = *other.sim.qpos()[object + 3..].first_chunk().unwrap();
+        other.sim.qpos_mut()[object + 3..object + 7].copy_from_slice(&quat::mul(orientation, *turn));
+        other.sim.refresh();
         // Contacts amplify rounding errors: after some more steps of a moving hand, the two cubes no longer agree.
         for step in 0..15 {
             let action = [0.3 * (step as f32 / 5.0).sin(); 20];
@@ -106,11 +106,11 @@ fn a_lesson_changes_what_is_learned_from_and_not_what_is_scored() {
         let before = shaped.rot_dist();
         let expected = plain.step(&[0.3; 20], &mut observation);
         let found = shaped.step(&[0.3; 20], &mut observation);
-        let progress = 100.0 * (before - shaped.last_step().rot_dist);
-        let paid = 0.5 * plain.last_step().reward.total() + progress;
+        let progress = 100.0 * (before - shaped.last.rot_dist);
+        let paid = 0.5 * plain.last.reward.total() + progress;
         assert!((f64::from(found.reward) - paid).abs() < 1e-4, "{found:?} {paid}");
         assert_eq!(found.end, expected.end);
-        assert_eq!(shaped.last_step().reward, plain.last_step().reward);
+        assert_eq!(shaped.last.reward, plain.last.reward);
     }
     assert_eq!(shaped.episode(), plain.episode());
     let sums = shaped.take_sums();
@@ -124,7 +124,7 @@ fn after_a_second(settings: &[&str]) -> Vec<f64> {
     for step in 0..100 {
         let _ = env.step(&[0.3 * (step as f32 / 15.0).sin(); 20], &mut observation);
     }
-    env.simulation().qpos().to_vec()
+    env.sim.qpos().to_vec()
 }
 
 #[test]
@@ -204,7 +204,7 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
     pool.reset(vec![&mut observations]);
     let mut redirected = 0;
     for _ in 0..200 {
-        let before: Vec<_> = pool.envs_mut().map(|env| (env.goal(), env.episode().length)).collect();
+        let before: Vec<_> = pool.envs_mut().map(|env| (env.goal, env.episode().length)).collect();
         pool.blocks[0].step(&[0.0; 160], &mut [0.0; 8], &mut observations).unwrap();
         let members = &pool.blocks[0].members;
         let last: Vec<_> = members.iter().map(|member| (member.end, member.final_observation.clone())).collect();
@@ -212,13 +212,13 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
             let row = i * OBSERVATION_SIZE..(i + 1) * OBSERVATION_SIZE;
             let seen = &observations[row];
             let (end, under_the_old) = &last[i];
-            let shown = quat::canonical(env.goal()).map(|x| x as f32);
+            let shown = quat::canonical(env.goal).map(|x| x as f32);
             assert_eq!(seen[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
             if *end != Some(End::Redirected) {
                 continue;
             }
             redirected += 1;
-            assert!(env.goal() != goal && env.episode().length == length + 1, "the episode continues");
+            assert!(env.goal != goal && env.episode().length == length + 1, "the episode continues");
             let old = quat::canonical(goal).map(|x| x as f32);
             assert_eq!(under_the_old[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], old);
             for same in [0..GOAL_ORIENTATION, GOAL_ORIENTATION + 8..OBSERVATION_SIZE] {
@@ -233,30 +233,30 @@ fn goals_that_live_for_some_steps_are_replaced_under_way_and_the_policy_sees_wha
 fn a_goal_that_was_reached_is_worth_as_much_to_training_as_if_it_stayed() {
     let task = task(&["env.success_tolerance=3.14", "env.max_consecutive_successes=4"]);
     for (trained, lesson) in
-        [(true, lesson(0, &["training.tolerance=3.2", "training.hold=4"])), (false, Lesson::task(task.config()))]
+        [(true, lesson(0, &["training.tolerance=3.2", "training.hold=4"])), (false, Lesson::task(&task.config))]
     {
         let mut env = Repose::new(&task);
         env.set_lesson(lesson);
         let mut observation = start(&mut env, 0);
         for step in 1..=12 {
-            let goal = env.goal();
+            let goal = env.goal;
             let end = env.step(&[0.0; 20], &mut observation).end;
             let reached = step % 4 == 0;
             assert_eq!(end, (reached && trained).then_some(End::Redirected), "step {step}");
             if end.is_some() {
-                assert!(env.goal() == goal, "the value is bootstrapped under the goal that was reached");
+                assert!(env.goal == goal, "the value is bootstrapped under the goal that was reached");
                 env.redirect(&mut observation);
             }
-            assert_eq!(env.goal() != goal, reached, "step {step}");
+            assert_eq!(env.goal != goal, reached, "step {step}");
             assert_eq!(env.episode().goals, step / 4);
-            let shown = quat::canonical(env.goal()).map(|x| x as f32);
+            let shown = quat::canonical(env.goal).map(|x| x as f32);
             assert_eq!(observation[GOAL_ORIENTATION..GOAL_ORIENTATION + 4], shown);
         }
         // If the time limit falls on the step that reaches the goal, the last observation is also bootstrapped.
         env.skip_ahead(0.996);
-        let goal = env.goal();
+        let goal = env.goal;
         let ends = [0, 1, 2, 3].map(|_| env.step(&[0.0; 20], &mut observation).end);
-        assert_eq!((ends[3], env.goal() == goal), (Some(End::Truncated), trained), "{ends:?}");
+        assert_eq!((ends[3], env.goal == goal), (Some(End::Truncated), trained), "{ends:?}");
     }
 }
 
@@ -265,14 +265,14 @@ fn far_from_the_goal_actions_have_a_larger_noise_that_the_losses_know() {
     let away = ["ppo.std.from=0.5", "ppo.away_std=1.5", "ppo.away_range=[0.15,0.5]"];
     let sets = [&["env.num_envs=64", "ppo.minibatches=4", "ppo.hidden=[16]"][..], &away].concat();
     let task = task(&[]);
-    let object = task.scene().free_body("cube").unwrap().qpos;
+    let object = task.scene.free_body("cube").unwrap().qpos;
     let mut agent = started_agent(&task, &config(&sets));
     let rows = agent.rollout.first_observations_mut().into_iter();
     let rows = rows.flat_map(|rows| rows.chunks_exact_mut(OBSERVATION_SIZE));
     for (env, row) in agent.pool.envs_mut().zip(rows).step_by(2) {
-        let goal = env.goal();
-        env.simulation_mut().qpos_mut()[object + 3..object + 7].copy_from_slice(&goal);
-        env.simulation_mut().refresh();
+        let goal = env.goal;
+        env.sim.qpos_mut()[object + 3..object + 7].copy_from_slice(&goal);
+        env.sim.refresh();
         env.observe(row);
     }
     let never = AtomicBool::new(false);
@@ -368,16 +368,16 @@ fn half_of_the_episodes_are_helped_to_turn_the_cube_towards_its_goal_while_the_r
 
 fn expect_help(sets: &[&str]) {
     let task = task(sets);
-    let object = task.hand().object;
+    let object = task.hand.object;
     // The angular velocity that a falling cube gains in the first step, as a fraction of the largest assistance.
     let gained = |env_steps: u64, episode: u64| {
         let mut env = Repose::new(&task);
         env.set_lesson(lesson(env_steps, &["training.assist={from=100,to=0,steps=1000}"]));
         let mut observation = start(&mut env, episode);
         let orientation = env.object().orientation;
-        let left = quat::rotation_vector(quat::mul(env.goal(), quat::conj(orientation)));
+        let left = quat::rotation_vector(quat::mul(env.goal, quat::conj(orientation)));
         let _ = env.step(&[0.0; 20], &mut observation);
-        let spin = *env.simulation().qvel()[object.dof + 3..].first_chunk().unwrap();
+        let spin = *env.sim.qvel()[object.dof + 3..].first_chunk().unwrap();
         let spin = quat::rotate(env.object().orientation, spin);
         let most = left.map(|angle| 100.0 * angle * 0.01);
         let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
@@ -422,9 +422,9 @@ fn the_smoothing_follows_its_ramp_in_training_and_a_policy_plays_with_the_value_
         let mut env = Repose::new(&task);
         env.set_lesson(lesson(env_steps, &["env.act_moving_average={from=0.25,to=0.75,steps=100}"]));
         let mut observation = start(&mut env, 0);
-        let before = env.simulation().ctrl().to_vec();
+        let before = env.sim.ctrl().to_vec();
         let _ = env.step(&[1.0; 20], &mut observation);
-        env.simulation().ctrl().iter().zip(before).map(|(after, before)| after - before).sum::<f64>()
+        env.sim.ctrl().iter().zip(before).map(|(after, before)| after - before).sum::<f64>()
     };
     assert!((moved(100) / moved(0) - 3.0).abs() < 1e-6 && (moved(50) / moved(0) - 2.0).abs() < 1e-6);
 
@@ -433,11 +433,8 @@ fn the_smoothing_follows_its_ramp_in_training_and_a_policy_plays_with_the_value_
     succeeded(program(folder.path(), &train(&[&ramp[..], &["--run-dir", "run"]].concat())));
     let latest = folder.path().join("run/checkpoints/latest.safetensors");
     let played = |sets: &[Override]| Loaded::find(Some(&latest), sets).unwrap().task(sets).unwrap();
-    assert_eq!(played(&[]).config().act_moving_average, Ramp::constant(0.8));
-    assert_eq!(
-        played(&["env.act_moving_average=0.4".parse().unwrap()]).config().act_moving_average,
-        Ramp::constant(0.4)
-    );
+    assert_eq!(played(&[]).config.act_moving_average, Ramp::constant(0.8));
+    assert_eq!(played(&["env.act_moving_average=0.4".parse().unwrap()]).config.act_moving_average, Ramp::constant(0.4));
     let stored = Checkpoint::parse(&fs::read(&latest).unwrap()).unwrap().config;
     assert!(
         stored.contains("act_moving_average = { from = 0.2, to = 0.8, steps = 200 }"),
