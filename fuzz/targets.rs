@@ -50,8 +50,7 @@ pub(crate) fn set(data: &[u8]) -> [bool; 2] {
 /// Resumes from the bytes of a checkpoint of one environment: learner and environment, which then run an iteration.
 pub(crate) fn checkpoint(data: &[u8]) -> [bool; 2] {
     static TASK: OnceLock<Arc<Task>> = OnceLock::new();
-    let Config { env, hand, .. } = Config::default();
-    let task = TASK.get_or_init(|| Task::new(&env, &hand).unwrap());
+    let task = TASK.get_or_init(|| Task::new(&Config::default()).unwrap());
     let resume = |bytes: &[u8]| -> anyhow::Result<()> {
         let mut checkpoint = Checkpoint::parse(bytes)?;
         let mut config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Run, &[])?;

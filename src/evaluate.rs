@@ -410,7 +410,7 @@ mod tests {
     fn a_policy_that_treats_a_cubes_rotations_as_the_same_acts_alike_however_the_cube_is_turned_onto_itself() {
         for alike in [true, false] {
             let config = Config::default();
-            let task = Task::new(&config.env, &config.hand).unwrap();
+            let task = Task::new(&config).unwrap();
             let mut spaces = task.spaces();
             if !alike {
                 spaces.object_and_goal.iter_mut().for_each(|places| places.rotations = 1);

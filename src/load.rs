@@ -176,7 +176,7 @@ impl Loaded {
     /// Fails as [`settings`] does, or if the scene cannot be used, or has another hand.
     pub fn task(&self, overrides: &[Override]) -> Result<Arc<Task>> {
         let config = self.settings(overrides)?;
-        Task::new(&config.env, &config.hand)?.for_policy(&self.record)
+        Task::new(&config)?.for_policy(&self.record)
     }
 }
 

@@ -18,16 +18,17 @@ fn main() -> ExitCode {
     };
     let trains = matches!(command, Command::Train(_));
     let allowed = if trains { Ok(()) } else { ranks::expect_one() };
+    let done = |result: anyhow::Result<()>| result.map(|()| ExitCode::SUCCESS);
     let result = allowed.and_then(|()| Requests::listen(trains)).and_then(|requests| match command {
         Command::Train(args) => train(&args, &requests),
         Command::Play(args) => play::play(&args, &requests),
-        Command::View(args) => view::view(&args).map(|()| ExitCode::SUCCESS),
-        Command::Export(args) => export::export(&args).map(|()| ExitCode::SUCCESS),
-        Command::Plot(args) => plot::plot(&args).map(|()| ExitCode::SUCCESS),
-        Command::Runs(args) => runs::runs(&args).map(|()| ExitCode::SUCCESS),
-        Command::Bench(args) => bench::bench(&args).map(|()| ExitCode::SUCCESS),
-        Command::Completions { shell } => manual::completions(shell).map(|()| ExitCode::SUCCESS),
-        Command::Man => manual::man().map(|()| ExitCode::SUCCESS),
+        Command::View(args) => done(view::view(&args)),
+        Command::Export(args) => done(export::export(&args)),
+        Command::Plot(args) => done(plot::plot(&args)),
+        Command::Runs(args) => done(runs::runs(&args)),
+        Command::Bench(args) => done(bench::bench(&args)),
+        Command::Completions { shell } => done(manual::completions(shell)),
+        Command::Man => done(manual::man()),
     });
     result.unwrap_or_else(|error| match error.downcast::<clap::Error>() {
         Ok(answer) => tell(&answer),

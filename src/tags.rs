@@ -1,7 +1,7 @@
 //! The quantities that a training run logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, TaskReward, TrainingReward};
+use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, task_terms, training_terms};
 
 /// A logged quantity.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,14 +58,14 @@ pub fn tag(name: &str) -> Option<Tag> {
         return Some(Tag { title: (*title).to_owned(), description: (*description).to_owned() });
     }
     let (group, part) = name.split_once('/')?;
-    let term = |list: Vec<Description>| {
-        let found = list.into_iter().find(|term| term.0 == part);
+    let term = |list: &[Description]| {
+        let found = list.iter().find(|term| term.0 == part);
         found.map(|term| format!("{}, mean per step.", term.1.trim_end_matches('.')))
     };
     let of_lesson = || Lesson::descriptions().find(|value| value.0 == part).map(|value| value.1.to_owned());
     let description = match group {
-        "reward" => term(TaskReward::descriptions()),
-        "training" => term(TrainingReward::descriptions()).or_else(of_lesson),
+        "reward" => term(&task_terms()),
+        "training" => term(&training_terms()).or_else(of_lesson),
         _ => None,
     };
     if let Some(description) = description {

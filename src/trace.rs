@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use crate::env::{End, Env};
 use crate::evaluate::Moment;
-use crate::repose::{Group, Task, add_settings};
+use crate::repose::{Group, Task, add_settings, named, task_terms};
 
 /// The number of records at which writing stops. Episodes are written whole and in order.
 const ENOUGH: usize = 2000;
@@ -96,8 +96,9 @@ fn record(moment: &Moment) -> Value {
         });
     };
     let details = &env.last;
-    let mut reward = Map::from_iter(details.reward.named().map(|(name, value)| (name.to_owned(), json!(value))));
-    reward.insert("total".into(), json!(details.reward.total()));
+    let mut reward =
+        Map::from_iter(named(task_terms(), details.reward).map(|(name, value)| (name.to_owned(), json!(value))));
+    reward.insert("total".into(), json!(details.reward.iter().sum::<f64>()));
     json!({
         "episode": episode,
         "step": step,

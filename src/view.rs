@@ -49,7 +49,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
 
 /// Loads the task, and prints what the settings replace in the user's scene.
 fn task_for_display(config: &Config, shot: &see::Shot) -> Result<Arc<Task>> {
-    let task = Task::new(&config.env, &config.hand)?;
+    let task = Task::new(config)?;
     let task = see::task_for_display(&task, shot)?;
     if config.env.model_file().is_some() {
         os::say(task.table().trim_end());

@@ -38,7 +38,7 @@ static ALLOCATOR: Watching = Watching;
 fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     let sets = ["env.num_envs=256", "ppo.hidden=[256,128,64]"].map(|set| set.parse().unwrap());
     let config = Settings::new().sets(&sets).resolve().unwrap();
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let size = task.spaces().observation_size;
     let mut agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
     let mut iterate = || {

@@ -35,7 +35,7 @@ fn memory(name: &str) -> u64 {
 fn a_checkpoint() -> Checkpoint {
     let sets = ["env.num_envs=1", "ppo.hidden=[1]", "ppo.minibatches=1"].map(|set| set.parse().unwrap());
     let config = Settings::new().sets(&sets).resolve().unwrap();
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let agent = Agent::for_task(&task, &config, Exchange::alone(config.shards())).unwrap();
     let mut checkpoint = Checkpoint::default();
     agent.save(&mut checkpoint);

@@ -3,7 +3,7 @@
 use numpy::{Element, IntoPyArray, PyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shadow_repose::repose::EpisodeStats;
+use shadow_repose::repose::{EpisodeStats, task_terms};
 
 /// Puts the episodes that ended into columns `[N]`, and resets their sums of rewards.
 pub(crate) fn columns<'py>(
@@ -24,8 +24,8 @@ pub(crate) fn columns<'py>(
     columns.set_item("randomized", flags(|episode| episode.randomized))?;
     columns.set_item("rot_dist", floats(&|_, episode| episode.rot_dist_sum / f64::from(episode.length.max(1))))?;
     let terms = PyDict::new(py);
-    for (i, (name, _)) in episodes[0].1.reward.named().enumerate() {
-        terms.set_item(name, floats(&|_, episode| episode.reward.values()[i]))?;
+    for (i, name) in task_terms().into_iter().map(|term| term.0).enumerate() {
+        terms.set_item(name, floats(&|_, episode| episode.reward[i]))?;
     }
     columns.set_item("reward", terms)?;
     episodes.iter().for_each(|(hand, _)| returns[*hand] = 0.0);

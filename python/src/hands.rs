@@ -14,7 +14,9 @@ use rayon::prelude::*;
 use shadow_repose::config::Config;
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
-use shadow_repose::repose::{EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward};
+use shadow_repose::repose::{
+    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms, training_terms,
+};
 
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
@@ -168,11 +170,11 @@ impl Hands {
             let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
             terms.set_item(name, values.into_pyarray(py))
         };
-        for (i, (name, _)) in TaskReward::default().named().enumerate() {
-            put(name, steps.iter().map(|(reward, ..)| weight * reward.values()[i]).collect())?;
+        for (i, term) in task_terms().iter().enumerate() {
+            put(term.0, steps.iter().map(|(reward, ..)| weight * reward[i]).collect())?;
         }
-        for (i, (name, _)) in TrainingReward::default().named().enumerate().filter(|_| self.training) {
-            put(name, steps.iter().map(|(_, training, _)| training.values()[i]).collect())?;
+        for (i, term) in training_terms().iter().enumerate().filter(|_| self.training) {
+            put(term.0, steps.iter().map(|(_, training, _)| training[i]).collect())?;
         }
         let errors: Vec<f32> = steps.iter().map(|(.., rot_dist)| *rot_dist as f32).collect();
         Ok((terms, errors.into_pyarray(py)))

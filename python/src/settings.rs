@@ -32,7 +32,7 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
 /// Fails if the settings are invalid, or if the scene cannot be used.
 pub(crate) fn resolve(config: Option<&Path>, overrides: &[Override]) -> Result<(Config, Arc<Task>)> {
     let config = Settings::new().user_file(config)?.sets(overrides).resolve()?;
-    let task = Task::new(&config.env, &config.hand)?;
+    let task = Task::new(&config)?;
     Ok((Config { env: task.config.clone(), ..config }, task))
 }
 

@@ -53,7 +53,7 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let mut config = Settings::new().user_file(args.settings.config.as_deref())?.sets(&args.settings.set).resolve()?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
-    let task = Task::new(&config.env, &config.hand)?;
+    let task = Task::new(&config)?;
     let record = task.record().with(config.ppo.symmetry);
     let task = task.for_policy(&record)?;
     config.env = task.config.clone();

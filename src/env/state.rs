@@ -24,12 +24,12 @@ pub struct SavedEnv<'a> {
 impl EnvState {
     /// The states of these environments, one part after another.
     pub fn joined(parts: Vec<Self>) -> Self {
-        let join = |mut all: Self, part: Self| {
+        let mut all = Self::default();
+        for part in parts {
             all.numbers.extend(part.numbers);
             all.counters.extend(part.counters);
-            all
-        };
-        parts.into_iter().reduce(join).unwrap_or_default()
+        }
+        all
     }
 
     /// Adds a list that may be longer or shorter elsewhere, with its length.

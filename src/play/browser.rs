@@ -133,7 +133,7 @@ pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Over
     }
     let stored = settings(path, &header).with_context(cannot)?;
     let config = Settings::new().stored(stored, Reader::Run).sets(set).resolve().with_context(cannot)?;
-    let task = Task::new(&config.env, &config.hand)?;
+    let task = Task::new(&config)?;
     let joints = json!(task.hand.parts.joints);
     ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
     run::expect_output(&to.path, Some(path), task.config.model_file())?;

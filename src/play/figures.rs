@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use crate::goal_times::GoalTimes;
 use crate::os::number;
-use crate::repose::Score;
+use crate::repose::{Score, named, task_terms};
 
 /// The object that `--json` prints. Unknown values are null.
 pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
@@ -39,7 +39,7 @@ fn lines(score: &Score) -> Vec<(String, String)> {
             lines.push(("  95 % interval".to_owned(), format!("{low} … {high}")));
         }
     }
-    lines.extend(score.reward.named().map(|(term, value)| (format!("  {term}"), number(value, 2))));
+    lines.extend(named(task_terms(), score.reward).map(|(term, value)| (format!("  {term}"), number(value, 2))));
     lines.push(("diverged episodes".to_owned(), score.diverged.to_string()));
     lines
 }

@@ -101,7 +101,7 @@ impl Stage {
 pub(super) fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
     match loaded {
         Some(loaded) => loaded.task(set),
-        None => Settings::new().sets(set).resolve().and_then(|config| Task::new(&config.env, &config.hand)),
+        None => Settings::new().sets(set).resolve().and_then(|config| Task::new(&config)),
     }
 }
 

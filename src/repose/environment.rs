@@ -15,7 +15,7 @@ use super::randomization::{EpisodePhysics, Randomization};
 use super::reward::{Step, task_reward};
 use super::servos::Servos;
 use super::task::Task;
-use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward};
+use super::{EpisodeStats, Lesson, StepSums, TaskReward, TrainingReward, add};
 use crate::config::SuccessHold;
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
@@ -145,11 +145,11 @@ impl Repose {
         let reward = task_reward(&self.task.config, &self.last);
         let training = self.lesson.reward(&self.last);
         let rot_dist = self.last.rot_dist;
-        self.episode.reward += reward;
+        add(&mut self.episode.reward, reward);
         self.episode.rot_dist_sum += rot_dist;
         self.episode.in_tolerance += u32::from(rot_dist <= self.task.config.success_tolerance);
-        self.sums.task += reward;
-        self.sums.training += training;
+        add(&mut self.sums.task, reward);
+        add(&mut self.sums.training, training);
         self.sums.turned += self.last.rot_dist_before - rot_dist;
         self.last.reward = reward;
         self.last.training = training;
@@ -265,7 +265,7 @@ impl Env for Repose {
             self.replace_goal();
         }
         self.show(observation);
-        let reward = self.lesson.total(self.last.reward.total(), &self.last.training);
+        let reward = self.lesson.total(self.last.reward, self.last.training);
         Transition { reward: reward as f32, end }
     }
 

@@ -5,7 +5,7 @@ use std::ops::AddAssign;
 use anyhow::{Result, ensure};
 use serde::{Deserialize, Serialize};
 
-use super::{TaskReward, TrainingReward};
+use super::{TaskReward, TrainingReward, add, named, task_terms, training_terms};
 use crate::env::{EnvState, SavedEnv};
 
 /// The sums over one episode.
@@ -34,7 +34,7 @@ pub struct EpisodeStats {
 impl EpisodeStats {
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);
-        state.numbers.extend(self.reward.values());
+        state.numbers.extend(self.reward);
         state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
         state.counters.extend([self.dropped, self.diverged].map(u64::from));
     }
@@ -43,7 +43,7 @@ impl EpisodeStats {
     /// Fails if values are missing, or if no episode can have these counters.
     pub(super) fn saved(state: &mut SavedEnv) -> Result<Self> {
         let [rot_dist_sum] = state.numbers()?;
-        let reward = TaskReward::new(state.numbers()?);
+        let reward = state.numbers()?;
         let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
         let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
         ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
@@ -71,13 +71,13 @@ pub struct StepSums {
 impl StepSums {
     /// The mean of each term of the task's reward over the steps, by name.
     pub fn task_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
-        self.task.map(|sum| sum / self.steps as f64).named()
+        named(task_terms(), self.task.map(|sum| sum / self.steps as f64))
     }
 
     /// The mean of each term that training adds, by name, and the rotation towards the goal in 100 steps, rad.
     pub fn training_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let turned = 100.0 * self.turned / self.steps as f64;
-        self.training.map(|sum| sum / self.steps as f64).named().chain([("turned", turned)])
+        named(training_terms(), self.training.map(|sum| sum / self.steps as f64)).chain([("turned", turned)])
     }
 }
 
@@ -85,8 +85,8 @@ impl AddAssign for StepSums {
     fn add_assign(&mut self, other: Self) {
         let Self { steps, task, training, turned, diverged } = other;
         self.steps += steps;
-        self.task += task;
-        self.training += training;
+        add(&mut self.task, task);
+        add(&mut self.training, training);
         self.turned += turned;
         self.diverged += diverged;
     }

@@ -1,7 +1,7 @@
 //! The lesson, a stage of the curriculum: what training changes about the task and adds to its reward at a given step of a run.
 
 use super::reward::{Description, ramped, training_reward, training_weights};
-use super::{Step, TrainingReward};
+use super::{Step, TaskReward, TrainingReward};
 use crate::config::{Config, EnvConfig};
 
 /// The task as trained at a given step: when a goal is reached, how long goals stay, and what is rewarded.
@@ -33,14 +33,10 @@ impl Lesson {
     pub fn task(env: &EnvConfig) -> Self {
         Self {
             act_moving_average: env.act_moving_average.at(0),
-            assist: 0.0,
             tolerance: env.success_tolerance,
             hold: env.max_consecutive_successes,
-            redirect_chance: 0.0,
-            goals_end: false,
-            randomized: 0.0,
             task_reward: 1.0,
-            weights: TrainingReward::default(),
+            ..Self::default()
         }
     }
 
@@ -103,8 +99,8 @@ impl Lesson {
     }
 
     /// The reward that is learnt from, given the task's reward and what training adds to it.
-    pub(super) fn total(&self, task: f64, added: &TrainingReward) -> f64 {
-        self.task_reward * task + added.total()
+    pub(super) fn total(&self, task: TaskReward, added: TrainingReward) -> f64 {
+        self.task_reward * task.iter().sum::<f64>() + added.iter().sum::<f64>()
     }
 }
 
@@ -125,7 +121,7 @@ mod tests {
     #[test]
     fn the_task_itself_pays_its_own_reward_alone() {
         let task = Lesson::task(&Config::default().env);
-        assert_eq!(task.total(1.25, &task.reward(&step(3.0, 0.0, true, true))), 1.25);
+        assert_eq!(task.total([1.25, 0.0, 0.0, 0.0, 0.0], task.reward(&step(3.0, 0.0, true, true))), 1.25);
         assert_eq!((task.tolerance, task.hold, task.goals_end), (0.1, 50, false));
     }
 
@@ -150,21 +146,22 @@ mod tests {
         let sets = [&sets[..], &["training.task_reward=0.5"]].concat();
         let lesson = at(0, &[&sets[..], &["training.drop_reward=-3"]].concat());
         let reward = lesson.reward(&step(0.0, 0.25, true, false));
-        assert_eq!(reward.values(), [-2.5, 0.0, 2.0, 0.0]);
-        assert_eq!(lesson.total(4.0, &reward), 1.5);
-        assert_eq!(lesson.reward(&step(0.25, 0.0, false, true)).values(), [2.5, 0.0, 0.0, -3.0]);
+        assert_eq!(reward, [-2.5, 0.0, 2.0, 0.0]);
+        assert_eq!(lesson.total([4.0, 0.0, 0.0, 0.0, 0.0], reward), 1.5);
+        assert_eq!(lesson.reward(&step(0.25, 0.0, false, true)), [2.5, 0.0, 0.0, -3.0]);
         let sets = ["training.drop_reward={from=1,to=-3,steps=100}"];
-        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).reward(&step(0.0, 0.0, false, true))["drop"]);
+        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).reward(&step(0.0, 0.0, false, true))[3]);
         assert_eq!(drops, [1.0, -1.0, -3.0, -3.0]);
         let sets = ["training.task_reward={from=1,to=0,steps=100}"];
-        let weights = [0, 50, 100, 500].map(|steps| at(steps, &sets).total(1.0, &TrainingReward::default()));
+        let weights =
+            [0, 50, 100, 500].map(|steps| at(steps, &sets).total([1.0, 0.0, 0.0, 0.0, 0.0], TrainingReward::default()));
         assert_eq!(weights, [1.0, 0.5, 0.0, 0.0]);
     }
 
     #[test]
     fn the_same_turn_is_paid_more_near_the_goal_and_back_and_forth_earns_nothing() {
         let lesson = at(0, &["training.approach_reward=20"]);
-        let paid = |before, after| lesson.reward(&step(before, after, false, false))["approach"];
+        let paid = |before, after| lesson.reward(&step(before, after, false, false))[1];
         let factor_e = std::f64::consts::E * (0.3 + 0.1) - 0.1;
         assert!((paid(factor_e, 0.3) - 20.0).abs() < 1e-9, "{}", paid(factor_e, 0.3));
         assert!(paid(0.4, 0.2) > 5.0 * paid(2.4, 2.2));

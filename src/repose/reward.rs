@@ -2,11 +2,6 @@
 //!
 //! A term is one row. Its column in `metrics.csv`, its tag, its sums and its description follow from that row.
 
-use std::ops::{AddAssign, Index};
-
-use serde::de::Error;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
-
 use crate::config::{EnvConfig, Ramp, TrainingConfig};
 use crate::quat::Quat;
 use crate::sim::{Pose, Velocity};
@@ -100,111 +95,55 @@ const TRAINING: [TrainingTerm; 4] = [
         |step| f64::from(u8::from(step.dropped))),
 ];
 
-/// The list of the task's terms, and the list of the terms that training adds.
-const LISTS: [fn() -> Vec<Description>; 2] =
-    [|| TASK.iter().map(|term| term.0).collect(), || TRAINING.iter().map(|term| term.0).collect()];
+/// The task's reward by term, in the order of [`task_terms`].
+pub type TaskReward = [f64; TASK.len()];
 
-/// The values of the N terms in a list.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Terms<const LIST: usize, const N: usize>([f64; N]);
+/// The reward that training adds, by term, or the weights of these terms, in the order of [`training_terms`].
+pub type TrainingReward = [f64; TRAINING.len()];
 
-/// The task's reward by term.
-pub type TaskReward = Terms<0, { TASK.len() }>;
-
-/// The reward that training adds, by term, or the weights of these terms.
-pub type TrainingReward = Terms<1, { TRAINING.len() }>;
-
-impl<const LIST: usize, const N: usize> Terms<LIST, N> {
-    /// The terms with these values, in order.
-    pub fn new(values: [f64; N]) -> Self {
-        Self(values)
-    }
-
-    /// The descriptions of the terms, in order.
-    pub fn descriptions() -> Vec<Description> {
-        LISTS[LIST]()
-    }
-
-    /// The values, in order.
-    pub fn values(&self) -> [f64; N] {
-        self.0
-    }
-
-    /// The values by name.
-    pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> + use<LIST, N> {
-        Self::descriptions().into_iter().map(|Description(name, _)| name).zip(self.0)
-    }
-
-    /// The sum of the terms.
-    pub fn total(&self) -> f64 {
-        self.0.iter().sum()
-    }
-
-    /// Applies `f` to each term.
-    pub fn map(self, f: impl Fn(f64) -> f64) -> Self {
-        Self(self.0.map(f))
-    }
+/// The terms of the task's reward.
+pub fn task_terms() -> [Description; TASK.len()] {
+    TASK.each_ref().map(|term| term.0)
 }
 
-impl<const LIST: usize, const N: usize> Index<&str> for Terms<LIST, N> {
-    type Output = f64;
-
-    /// # Panics
-    /// Panics if there is no term of this name.
-    fn index(&self, name: &str) -> &f64 {
-        let place = Self::descriptions().iter().position(|term| term.0 == name);
-        &self.0[place.unwrap_or_else(|| panic!("no term is called {name}"))]
-    }
+/// The terms of the reward that training adds.
+pub fn training_terms() -> [Description; TRAINING.len()] {
+    TRAINING.each_ref().map(|term| term.0)
 }
 
-impl<const LIST: usize, const N: usize> AddAssign for Terms<LIST, N> {
-    fn add_assign(&mut self, other: Self) {
-        self.0.iter_mut().zip(other.0).for_each(|(sum, value)| *sum += value);
-    }
+/// The values of these terms by name.
+pub fn named<const N: usize>(terms: [Description; N], values: [f64; N]) -> impl Iterator<Item = (&'static str, f64)> {
+    terms.into_iter().map(|term| term.0).zip(values)
 }
 
-impl<const LIST: usize, const N: usize> Default for Terms<LIST, N> {
-    fn default() -> Self {
-        Self([0.0; N])
-    }
-}
-
-impl<const LIST: usize, const N: usize> Serialize for Terms<LIST, N> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.0[..].serialize(serializer)
-    }
-}
-
-impl<'de, const LIST: usize, const N: usize> Deserialize<'de> for Terms<LIST, N> {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let values = Vec::deserialize(deserializer)?;
-        values.try_into().map(Self).map_err(|_| D::Error::custom("another number of terms"))
-    }
+/// Adds rewards to a sum of rewards, term by term.
+pub fn add<const N: usize>(sum: &mut [f64; N], more: [f64; N]) {
+    sum.iter_mut().zip(more).for_each(|(sum, value)| *sum += value);
 }
 
 /// The task's reward of a step.
 pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
-    Terms::new(TASK.each_ref().map(|TaskTerm(_, value)| value(env, step)))
+    TASK.each_ref().map(|TaskTerm(_, value)| value(env, step))
 }
 
 /// The reward that training adds to a step, given the weights of its terms.
 pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
-    let mut values = weights.values();
+    let mut values = *weights;
     values.iter_mut().zip(&TRAINING).for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
-    Terms::new(values)
+    values
 }
 
 /// The weights of the terms that training adds, after `env_steps` control steps of the whole run.
 pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
-    Terms::new(TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
+    TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
         Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
-    }))
+    })
 }
 
 /// The weights that change in the course of a training run, with their descriptions.
 pub(super) fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
-    TRAINING.iter().zip(weights.values()).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
+    TRAINING.iter().zip(*weights).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
         Weight::Constant(_) => None,
         Weight::Ramp(setting, _) => Some((*setting, value)),
     })
@@ -226,28 +165,28 @@ mod tests {
         // 1 / (0.4 + 0.1), -10 * 0.05, -0.0002 * (1 + 0.25)
         let reward = terms(0.4, 0.05, &[1.0, -0.5]);
         let expected = [("rotation", 2.0), ("distance", -0.5), ("action", -0.00025), ("bonus", 0.0), ("fall", 0.0)];
-        for ((name, found), (expected_name, expected)) in reward.named().zip(expected) {
+        for ((name, found), (expected_name, expected)) in named(task_terms(), reward).zip(expected) {
             assert!(name == expected_name && (found - expected).abs() < 1e-12, "{reward:?}");
         }
-        assert!((reward.total() - 1.49975).abs() < 1e-12);
+        assert!((reward.iter().sum::<f64>() - 1.49975).abs() < 1e-12);
     }
 
     #[test]
     fn the_bonus_is_paid_up_to_the_tolerance_itself() {
-        assert_eq!(terms(0.1, 0.0, &[])["bonus"], 2.0);
-        assert_eq!(terms(0.1 + 1e-9, 0.0, &[])["bonus"], 0.0);
+        assert_eq!(terms(0.1, 0.0, &[])[3], 2.0);
+        assert_eq!(terms(0.1 + 1e-9, 0.0, &[])[3], 0.0);
     }
 
     #[test]
     fn the_fall_penalty_is_paid_from_the_limit_on() {
-        assert_eq!(terms(1.0, 0.24, &[])["fall"], -7.0);
-        assert_eq!(terms(1.0, 0.24 - 1e-9, &[])["fall"], 0.0);
+        assert_eq!(terms(1.0, 0.24, &[])[4], -7.0);
+        assert_eq!(terms(1.0, 0.24 - 1e-9, &[])[4], 0.0);
     }
 
     #[test]
     fn sums_of_terms_contain_every_term() {
-        let mut sum = TrainingReward::new([1.0; TRAINING.len()]);
-        sum += TrainingReward::new([2.0; TRAINING.len()]);
-        assert!(sum.values().iter().all(|&value| value == 3.0) && sum.named().count() == TRAINING.len());
+        let mut sum = [1.0; TRAINING.len()];
+        add(&mut sum, [2.0; TRAINING.len()]);
+        assert_eq!(sum, [3.0; TRAINING.len()]);
     }
 }

@@ -8,7 +8,7 @@ use std::ops::Index;
 use serde_json::{Map, Value, json};
 
 use super::divergence::divergence;
-use super::{EpisodeStats, TaskReward};
+use super::{EpisodeStats, TaskReward, add, named, task_terms};
 use crate::os::number;
 
 /// Which values of a measure are better.
@@ -76,7 +76,7 @@ pub const MEASURES: [Measure; 11] = [
         value: |played| played.mean(|e| e.length.into()) },
     Measure { key: "return", column: "return", title: "return", unit: "", decimals: 2, better: Higher,
         description: "Sum of the task's rewards of an episode.",
-        value: |played| played.reward().total() / played.count() },
+        value: |played| played.reward().iter().sum::<f64>() / played.count() },
 ];
 
 /// The measures of a training run's own episodes, in the order of their columns.
@@ -159,7 +159,7 @@ impl Played<'_> {
 
     fn reward(&self) -> TaskReward {
         let mut total = TaskReward::default();
-        self.episodes.iter().for_each(|episode| total += episode.reward);
+        self.episodes.iter().for_each(|episode| add(&mut total, episode.reward));
         total
     }
 
@@ -232,7 +232,7 @@ impl Score {
 
     /// All that is known, as an object of JSON in which unknown values are null.
     pub fn as_json(&self) -> Map<String, Value> {
-        let reward = self.reward.named().map(|(term, value)| (term.to_owned(), json!(value)));
+        let reward = named(task_terms(), self.reward).map(|(term, value)| (term.to_owned(), json!(value)));
         let mut object = Map::new();
         let mut put = |key: &str, value: Value| object.insert(key.to_owned(), value);
         put("episodes", json!(self.episodes));
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn a_score_is_the_mean_worked_out_by_hand() {
-        let reward = |rotation| TaskReward::new([rotation, 0.0, 0.0, 0.0, 0.0]);
+        let reward = |rotation| [rotation, 0.0, 0.0, 0.0, 0.0];
         let one = EpisodeStats {
             length: 1000,
             goals: 5,
@@ -290,7 +290,7 @@ mod tests {
         let found: Vec<_> = score.measured().map(|(measure, value)| (measure.column, measure.key, value)).collect();
         assert_eq!(found, by_hand);
         assert_eq!([score.episodes, score.env_steps as usize, score.diverged], [2, 1500, 0]);
-        assert_eq!(score.reward["rotation"], 20.0);
+        assert_eq!(score.reward[0], 20.0);
         // Standard deviation √8, standard error 2.
         assert!((score.goals_ci95[1] - (3.0 + 1.96 * 2.0)).abs() < 1e-12);
         assert_eq!(score.goals_ci95[0], 0.0);

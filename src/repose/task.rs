@@ -9,7 +9,7 @@ use super::mirror::Mirror;
 use super::physics::Physics;
 use super::sensing::NoiseStd;
 use super::{Hand, Record};
-use crate::config::{EnvConfig, FARTHEST};
+use crate::config::{Config, EnvConfig, FARTHEST};
 use crate::os;
 use crate::quat::CUBE_ROTATIONS;
 use crate::sim::{Compilation, Look, Parts, Scene, origin};
@@ -41,15 +41,15 @@ pub struct Task {
 }
 
 impl Task {
-    /// Loads the scene that `config` names, and binds the hand in it, of which some parts may be `named`.
+    /// Loads the scene that `all` settings name, and binds the hand in it.
     ///
     /// # Errors
     /// Fails with the scene's file if the scene cannot be loaded or lacks something, or if a setting does not fit the hand.
-    pub fn new(config: &EnvConfig, named: &Parts) -> Result<Arc<Self>> {
-        let file = config.model_file();
-        let mut config = config.clone();
+    pub fn new(all: &Config) -> Result<Arc<Self>> {
+        let file = all.env.model_file();
+        let mut config = all.env.clone();
         let as_it_is = Scene::load(file, &Compilation::plain(config.sim_dt, config.cone))?;
-        let mut parts = Hand::find(&as_it_is, named).with_context(|| origin(file))?;
+        let mut parts = Hand::find(&as_it_is, &all.hand).with_context(|| origin(file))?;
         let compilation = Compilation {
             object: parts.object.clone(),
             size: config.cube_size_scale,

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::draw::Page;
 use crate::env::Env;
-use crate::repose::{Repose, Task, TaskReward};
+use crate::repose::{Repose, Task, TaskReward, task_terms};
 use crate::sim::{Camera, Drawing, DrawnCamera};
 
 /// The scalars before the terms of the reward.
@@ -71,7 +71,7 @@ impl Columns {
 
     /// The names of the terms of the reward.
     fn terms() -> impl Iterator<Item = &'static str> {
-        TaskReward::default().named().map(|(name, _)| name)
+        task_terms().into_iter().map(|term| term.0)
     }
 
     /// The place of the rotation error.
@@ -85,7 +85,7 @@ impl Columns {
         let episode = env.episode();
         let (goal, error) = if episode.length == 0 { (env.goal, env.rot_dist()) } else { (last.goal, last.rot_dist) };
         let scalars = [episode.length.into(), error, env.held.into(), episode.goals.into()];
-        self.row(env.sim.qpos(), &goal, scalars, &reward.values())
+        self.row(env.sim.qpos(), &goal, scalars, &reward)
     }
 
     /// The row of a record of a trace.

@@ -15,7 +15,7 @@ use super::sliders::Sliders;
 use crate::env::End;
 use crate::evaluate::{Episodes, Player};
 use crate::os::{self, Machine, Server};
-use crate::repose::{Task, TaskReward};
+use crate::repose::{Task, TaskReward, add};
 use crate::sim::Camera;
 
 /// The time between two rows, s, rounded to control steps. A page interpolates between rows.
@@ -172,7 +172,7 @@ impl LiveHand {
     fn step(&mut self) {
         let end = (self.acting.step)(&mut self.player);
         self.has_ended = end.is_some();
-        self.reward += self.player.lane.env.last.reward;
+        add(&mut self.reward, self.player.lane.env.last.reward);
     }
 }
 
@@ -201,7 +201,7 @@ mod tests {
         let task = |sets: &[&str]| {
             let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
             let config = Settings::new().sets(&sets).resolve().unwrap();
-            Task::new(&config.env, &config.hand).unwrap()
+            Task::new(&config).unwrap()
         };
         let acting = |task: &Arc<Task>| LiveActor { step: Rc::new(|_| None), policy: None, task: task.clone() };
         let about = About { title: "A hand".into(), policy: None, seed: None };

@@ -103,7 +103,7 @@ mod tests {
     #[test]
     fn what_a_page_sends_moves_actuators_within_their_ranges_and_nothing_else_does() {
         let config = Config::default();
-        let task = Task::new(&config.env, &config.hand).unwrap();
+        let task = Task::new(&config).unwrap();
         let sliders = Sliders::new(&task);
         let post = sliders.on_post();
         let [low, high] = task.hand.actuators[3].range;

@@ -10,7 +10,7 @@ use super::clock::Clock;
 use crate::env::Env;
 use crate::evaluate::{Actor, Episodes, Player};
 use crate::os;
-use crate::repose::{Repose, Step, Task, TaskReward, task_reward};
+use crate::repose::{Repose, Step, Task, TaskReward, named, task_reward, task_terms};
 use crate::sim::{Gauge, Readout, Trend, Viewer};
 
 /// The minimum time between two frames.
@@ -138,7 +138,7 @@ fn curves(task: &Task) -> [Trend; 2] {
 /// Adds the last of so many steps to the curves.
 fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
     let step = &env.last;
-    for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.total()]) {
+    for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.iter().sum()]) {
         curve.points.push_back([steps as f64 * env.task.config.ctrl_dt, value]);
         if curve.points.len() > HISTORY {
             curve.points.pop_front();
@@ -153,8 +153,8 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
     let extreme = Step { goal_dist: config.fall_dist, action: vec![1.0; env.spaces().action_size], ..Step::default() };
-    let largest = task_reward(config, &extreme).values();
-    let terms = reward.named().zip(largest).map(|((name, value), largest)| {
+    let largest = task_reward(config, &extreme);
+    let terms = named(task_terms(), reward).zip(largest).map(|((name, value), largest)| {
         let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };
         Gauge { name, fraction, signed: true, text: format!("{value:+.3}") }
     });

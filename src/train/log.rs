@@ -83,7 +83,7 @@ mod tests {
     use crate::agent::{Agent, Iteration};
     use crate::config::{Config, Settings};
     use crate::ppo::{Losses, UpdateStats};
-    use crate::repose::{Lesson, StepSums, Task, TaskReward, TrainingReward};
+    use crate::repose::{Lesson, StepSums, Task, TaskReward};
 
     #[test]
     fn everything_that_is_logged_is_described() {
@@ -96,8 +96,7 @@ mod tests {
     fn histograms_are_those_of_the_quantities_whose_names_they_have() {
         let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
         let config = Settings::new().sets(&sets.map(|set| set.parse().unwrap())).resolve().unwrap();
-        let mut agent =
-            Agent::for_task(&Task::new(&config.env, &config.hand).unwrap(), &config, Exchange::alone(1)).unwrap();
+        let mut agent = Agent::for_task(&Task::new(&config).unwrap(), &config, Exchange::alone(1)).unwrap();
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let found = histograms(&agent.rollout);
         let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
@@ -132,8 +131,8 @@ mod tests {
             learning_rate: 12.0,
         };
         let iteration = Iteration { lesson, update, steps: 60, collect_s: 13.0, update_s: 17.0 };
-        let reward = TaskReward::new([20.0, 21.0, 22.0, 23.0, 24.0]);
-        let training = TrainingReward::new([25.0, 31.0, 26.0, 27.0]);
+        let reward = [20.0, 21.0, 22.0, 23.0, 24.0];
+        let training = [25.0, 31.0, 26.0, 27.0];
         let steps = StepSums { steps: 1, task: reward, training, turned: 0.32, diverged: 28 };
         let episode = |reward, length, goals| EpisodeStats {
             length,

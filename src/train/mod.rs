@@ -122,15 +122,14 @@ impl Session {
     /// Fails if a loss is not finite, after a panic, or if others do not have the same weights.
     fn iterate(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Outcome>> {
         let number = self.agent.iteration + 1;
-        let never = Requests::none();
-        let now = self.requests_now(requests, &never);
+        let now = self.requests_now(requests);
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
             let Some(iteration) = self.agent.iterate(now.stop())? else { return Ok(None) };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, now, duties)? else { return Ok(None) };
+            let Some(evaluation) = self.evaluate(due, &now, duties)? else { return Ok(None) };
             let histograms = self.histograms();
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
@@ -142,8 +141,8 @@ impl Session {
     }
 
     /// What may end an iteration early: with other ranks nothing, because they wait for what is computed here.
-    fn requests_now<'a>(&self, requests: &'a Requests, never: &'a Requests) -> &'a Requests {
-        if self.agent.exchange.is_alone() { requests } else { never }
+    fn requests_now(&self, requests: &Requests) -> Requests {
+        if self.agent.exchange.is_alone() { requests.clone() } else { Requests::none() }
     }
 
     /// The episodes that ended on any rank since the last call, and the sums over all steps.
@@ -184,9 +183,8 @@ impl Session {
     /// Fails as an evaluation does.
     fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
         if self.config.run.patience > 0 && self.rise.is_none() {
-            let never = Requests::none();
-            let now = self.requests_now(requests, &never);
-            let Some(before) = caught(|| self.evaluate(true, now, duties))? else { return Ok(false) };
+            let now = self.requests_now(requests);
+            let Some(before) = caught(|| self.evaluate(true, &now, duties))? else { return Ok(false) };
             let known = figures(&before);
             ensure!(
                 known.iter().all(|x| x.is_finite()),

@@ -170,7 +170,7 @@ impl Plan {
     pub(super) fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
         let load = || {
             let config = &self.config;
-            let task = Task::new(&config.env, &config.hand)?;
+            let task = Task::new(config)?;
             let record = match &self.from {
                 Some((_, checkpoint)) => Record::parse(&checkpoint.hand)?,
                 None => task.record().with(config.ppo.symmetry),
@@ -281,9 +281,10 @@ fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
 
 /// Checks that the scene is the scene of the checkpoint. Its physics may change: timestep, cones, masses, sizes, servos, joints.
 fn expect_scene(parent: &Config, config: &Config, checkpoint: &Checkpoint) -> Result<()> {
-    let mut before = parent.env.clone();
-    before.model.clone_from(&config.env.model);
-    let here = Task::new(&before, &config.hand)?.scene.fingerprint();
+    let mut before = parent.clone();
+    before.env.model.clone_from(&config.env.model);
+    before.hand.clone_from(&config.hand);
+    let here = Task::new(&before)?.scene.fingerprint();
     ensure!(
         checkpoint.scene == here,
         "{MODEL} = {}: not the scene of the checkpoint, which a fork must keep",

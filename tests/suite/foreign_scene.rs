@@ -3,9 +3,9 @@
 use std::fs;
 
 use shadow_repose::repose::Task;
-use shadow_repose::sim::{Compilation, Cone, Parts, Scene};
+use shadow_repose::sim::{Compilation, Cone, Scene};
 
-use crate::support::{SCENE, env_config};
+use crate::support::{SCENE, config};
 
 /// Returns the built-in scene with these texts replaced.
 #[track_caller]
@@ -23,7 +23,7 @@ fn refused(edits: &[(&str, &str)], part: &str) {
     let path = folder.path().join("own.xml");
     fs::write(&path, edited(edits)).unwrap();
     let model = format!("env.model={}", path.display());
-    let message = Task::new(&env_config(&[&model]), &Parts::default()).err().map(|error| format!("{error:#}"));
+    let message = Task::new(&config(&[&model])).err().map(|error| format!("{error:#}"));
     assert!(message.as_ref().is_some_and(|message| message.contains(part)), "{part}: {message:?}");
 }
 

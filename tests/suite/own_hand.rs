@@ -8,7 +8,7 @@ use shadow_repose::env::Env;
 use shadow_repose::repose::{Repose, Task};
 use shadow_repose::rng;
 
-use crate::support::{SCENE, env_config, program, stderr, succeeded, task, train};
+use crate::support::{SCENE, config, program, stderr, succeeded, task, train};
 
 /// A hand of three fingers: nine joints, six actuators, tendons, sites, and a box.
 const THREE_FINGERS: &str = include_str!("three_fingers.xml");
@@ -45,7 +45,7 @@ fn placed(scene: &str) -> (tempfile::TempDir, String) {
 fn refusal(scene: &str, sets: &[&str]) -> String {
     let (_folder, model) = placed(scene);
     let config = crate::support::config(&[&[&model[..]], sets].concat());
-    format!("{:#}", Task::new(&config.env, &config.hand).err().expect("it is refused"))
+    format!("{:#}", Task::new(&config).err().expect("it is refused"))
 }
 
 fn header(trace: &Path) -> Value {
@@ -217,14 +217,14 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
     }
     let (_folder, model) = placed(&both);
     let config = crate::support::config(&[&model, "hand.object=other", "hand.goal=g2"]);
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     assert_eq!((&*task.hand.parts.object, &*task.hand.parts.goal), ("other", "g2"));
 }
 
 #[test]
 fn a_scene_that_shows_no_goal_gets_one_that_touches_nothing() {
     let (_folder, model) = placed(THREE_FINGERS);
-    let task = Task::new(&env_config(&[&model]), &Default::default()).unwrap();
+    let task = Task::new(&config(&[&model])).unwrap();
     let mut env = Repose::new(&task);
     let mut observation = vec![0.0; task.spaces().observation_size];
     env.reset(rng::stream(0, "test", 0), &mut observation);

@@ -268,7 +268,7 @@ fn the_rewards_of_a_step_outlive_the_start_of_the_next_episode() {
     let mut pool = AtOnce::new(1, &["env.max_episode_seconds=0.02", "env.fall_dist=10"], false);
     for _ in 0..4 {
         pool.step(Autoreset::SameStep);
-        let last = pool.pool.envs_mut().next().unwrap().last.reward.total();
+        let last = pool.pool.envs_mut().next().unwrap().last.reward.iter().sum::<f64>();
         assert!(last != 0.0 && (last - f64::from(pool.rewards[0])).abs() < 1e-6, "{last} {:?}", pool.rewards);
     }
 }
@@ -276,7 +276,7 @@ fn the_rewards_of_a_step_outlive_the_start_of_the_next_episode() {
 #[test]
 fn a_pool_that_is_stepped_at_once_with_the_actions_of_a_rollout_sees_what_the_rollout_saw() {
     let config = config(&["env.num_envs=32", "env.max_episode_seconds=0.1", "training.goal_lifetime=5"]);
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let mut agent = started_agent(&task, &config);
     agent.collect(&AtomicBool::new(false)).unwrap();
     let envs = (0..32).map(|_| Repose::new(&task)).collect();

@@ -11,7 +11,6 @@ use shadow_repose::evaluate::{Actor, Episodes, Trial};
 use shadow_repose::ppo::{Checkpoint, Ppo};
 use shadow_repose::ranks::{Exchange, Ranks};
 use shadow_repose::repose::{EpisodeStats, Lesson, Repose, Task};
-use shadow_repose::sim::Parts;
 
 use crate::point_mass::{of_ranks, settings};
 use crate::support::{config, started_agent};
@@ -134,7 +133,7 @@ fn the_shards_of_a_training_come_to_the_same_bits_on_any_number_of_ranks() {
 fn hands_that_are_dealt_to_ranks_learn_the_same_bits() {
     let sets = ["env.num_envs=16", "ppo.hidden=[16]", "ppo.horizon=8", "env.max_episode_seconds=0.1"];
     let config = config(&sets);
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let work = |ranks: usize| {
         on_ranks(ranks, 8, |_, exchange| {
             let (envs, of_run) = ((0..16 / ranks).map(|_| Repose::new(&task)).collect(), config.clone());
@@ -170,7 +169,7 @@ fn a_checkpoint_does_not_know_how_many_ranks_have_saved_it() {
     // The parameters of the nets are not a whole number of chunks for any number of ranks.
     let sets = ["env.num_envs=16", "ppo.hidden=[40]", "ppo.horizon=8", "env.max_episode_seconds=0.1", "run.shards=8"];
     let config = config(&sets);
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let expected = continued(None, 4, 1, &config, &task);
     for path in [[4, 1], [1, 4], [2, 8], [8, 2]] {
         let middle = continued(None, 2, path[0], &config, &task);
@@ -182,7 +181,7 @@ fn a_checkpoint_does_not_know_how_many_ranks_have_saved_it() {
 #[test]
 fn evaluation_episodes_that_are_shared_out_have_the_same_results() {
     let config = config(&["env.max_episode_seconds=0.2", "ppo.hidden=[16]"]);
-    let task = Task::new(&config.env, &config.hand).unwrap();
+    let task = Task::new(&config).unwrap();
     let ppo = Ppo::new(&config.ppo, task.spaces(), 0, Exchange::alone(1)).unwrap();
     let never = AtomicBool::new(false);
     for count in [5, 100] {
@@ -225,7 +224,7 @@ fn all_ranks_together_send_no_more_than_a_ring_would() {
 
 #[test]
 fn trainings_of_any_number_of_hands_work() {
-    let task = Task::new(&config(&[]).env, &Parts::default()).unwrap();
+    let task = Task::new(&config(&[])).unwrap();
     for hands in [1, 7, 16, 100] {
         let config = config(&[&format!("env.num_envs={hands}"), "ppo.hidden=[16]"]);
         let mut agent = started_agent(&task, &config);

@@ -6,14 +6,14 @@ use shadow_repose::env::Env;
 use shadow_repose::repose::{Hand, Repose, Task};
 use shadow_repose::sim::{Compilation, Cone, Parts, Scene, Simulation, Validity};
 
-use crate::support::{OBSERVATION_SIZE, SCENE, config, env_config, started, task};
+use crate::support::{OBSERVATION_SIZE, SCENE, config, started, task};
 
 /// Writes `text` as a scene, tries to create a task from it, and returns the error message.
 fn refusal(text: &str) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = write(&folder, text);
     let setting = format!("env.model={}", path.display());
-    match Task::new(&env_config(&[&setting]), &Parts::default()) {
+    match Task::new(&config(&[&setting])) {
         Ok(_) => panic!("must be refused"),
         Err(error) => format!("{error:#}"),
     }
@@ -171,7 +171,7 @@ fn all_names_that_are_missing_come_in_one_message() {
     let model = format!("env.model={}", write(&folder, SCENE).display());
     let names = ["hand.joints=[\"a\",\"rh_WRJ1\",\"b\"]", "hand.fingertips=[\"c\"]", "hand.object=d", "hand.goal=e"];
     let config = config(&[&[&model[..]], &names[..]].concat());
-    let message = format!("{:#}", Task::new(&config.env, &config.hand).err().unwrap());
+    let message = format!("{:#}", Task::new(&config).err().unwrap());
     for name in ["own_scene.xml: has no body `d`", "body `e`", "body or site `c`", "joint `a`", "joint `b`"] {
         assert!(message.contains(name), "{name}: {message}");
     }
@@ -209,7 +209,7 @@ fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
         ("integrator=\"implicitfast\"", "integrator=\"RK4\"", "RK4"),
         ("</mujoco>", "", "MuJoCo refuses this scene"),
     ]);
-    let missing = format!("{:#}", Task::new(&env_config(&["env.model=nowhere.xml"]), &Parts::default()).err().unwrap());
+    let missing = format!("{:#}", Task::new(&config(&["env.model=nowhere.xml"])).err().unwrap());
     assert!(missing.contains("nowhere.xml") && missing.contains("no such file"), "{missing}");
 }
 

@@ -40,7 +40,7 @@ pub(crate) fn config(settings: &[&str]) -> Config {
 /// Returns the task with these settings.
 pub(crate) fn task(settings: &[&str]) -> Arc<Task> {
     let config = config(settings);
-    Task::new(&config.env, &config.hand).unwrap()
+    Task::new(&config).unwrap()
 }
 
 /// Returns the `[env]` settings of the default configuration with these settings applied over it.
