@@ -11,7 +11,7 @@ use anyhow::{Context, Error, Result, ensure};
 
 use crate::config::{BUILTIN_MODEL, Config, MODEL, NetConfig, Override, Reader, Settings, Source};
 use crate::evaluate::Actor;
-use crate::os;
+use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
 use crate::repose::{Record, Task};
 use crate::run;
@@ -145,7 +145,7 @@ impl Loaded {
             (Some(place), _) => PolicySource::find(place)?,
             (None, Some(newest)) => PolicySource::find(&newest)?,
             (None, None) => {
-                os::say("there is no run here: using the built-in policy");
+                say!("there is no run here: using the built-in policy");
                 PolicySource::BuiltIn(&BUILTIN[0])
             }
         };
@@ -204,7 +204,7 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
-            Err(error) if is_damage(&error) => os::say(&format!("warning: {error:#}\n  Trying the previous one.")),
+            Err(error) if is_damage(&error) => say!("warning: {error:#}\n  Trying the previous one."),
             result => return Ok((path.clone(), result?)),
         }
     }

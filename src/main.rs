@@ -34,7 +34,7 @@ fn main() -> ExitCode {
         Ok(answer) => tell(&answer),
         Err(error) => {
             if trains || ranks::is_spokesman() {
-                os::say(&format!("error: {error:#}"));
+                os::say_line(&format!("error: {error:#}"));
             }
             ExitCode::FAILURE
         }
@@ -47,7 +47,7 @@ fn tell(answer: &clap::Error) -> ExitCode {
         && let Err(error) = answer.print()
         && error.kind() != ErrorKind::BrokenPipe
     {
-        os::say(&format!("error: cannot write to stdout: {error}"));
+        os::say_line(&format!("error: cannot write to stdout: {error}"));
         return ExitCode::FAILURE;
     }
     ExitCode::from(answer.exit_code() as u8)

@@ -8,7 +8,7 @@ use anyhow::{Result, bail, ensure};
 
 use crate::cli::{Along, PlotArgs};
 use crate::draw::{Chart, Curve, Picture, PictureFile, Subplot};
-use crate::os::{self, similar};
+use crate::os::{say, similar};
 use crate::run::{self, MetricsTable, value_at};
 use crate::tags::tag;
 
@@ -73,7 +73,7 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     let panels = metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, args)).collect();
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
     let plural = if runs.len() == 1 { "" } else { "s" };
-    os::say(&format!("{}: {} run{plural}", args.out.path.display(), runs.len()));
+    say!("{}: {} run{plural}", args.out.path.display(), runs.len());
     Ok(())
 }
 
@@ -144,7 +144,7 @@ fn tables<'a>(args: &'a PlotArgs, wanted: &[&str]) -> Result<Vec<(&'a Path, Metr
         match rows {
             Ok(table) => tables.push((place, table)),
             Err(error) if tables.is_empty() && i + 1 == args.runs.len() => return Err(error),
-            Err(error) => os::say(&format!("warning: {error:#}; skipped")),
+            Err(error) => say!("warning: {error:#}; skipped"),
         }
     }
     Ok(tables)
@@ -171,7 +171,7 @@ fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
             }
         }
         if !lacking.is_empty() {
-            os::say(&format!("warning: no column {name} in {}", lacking.join(", ")));
+            say!("warning: no column {name} in {}", lacking.join(", "));
         }
     }
     Ok(())

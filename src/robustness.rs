@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::config::{EnvConfig, Override};
 use crate::draw::{self, BarChart, HeatMap, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Destination, Requests, number};
+use crate::os::{self, Destination, Requests, number, say};
 use crate::repose::{Score, Task, measure};
 
 /// Single changes: the start of the name of a row, the setting, and its values.
@@ -85,7 +85,7 @@ pub fn robustness(
     let output = report.picture.as_ref().map(PictureFile::create).transpose()?;
     let Episodes { seed, count, .. } = episodes;
     let rows = played(playable(task)?, actor, episodes, requests)?;
-    let interrupted = requests.stop().load(std::sync::atomic::Ordering::Relaxed);
+    let interrupted = requests.stop.load(std::sync::atomic::Ordering::Relaxed);
     let text = match report.json {
         true => format!("{}\n", as_json(&rows, count, seed, place)),
         false => table(&rows, count, seed, place),
@@ -93,7 +93,7 @@ pub fn robustness(
     os::print(&text)?;
     match output {
         Some(file) if interrupted => {
-            os::say(&format!("{}: interrupted, not written", file.output.path().display()));
+            say!("{}: interrupted, not written", file.output.path.display());
         }
         Some(file) => picture(&rows, count, place).write(file)?,
         None => {}
@@ -109,7 +109,7 @@ fn playable(task: &Loading) -> Result<Vec<(Condition, Arc<Task>)>> {
         match task(&condition.sets).with_context(|| format!("row `{}`", condition.name)) {
             Ok(task) => playable.push((condition, task)),
             Err(reason) if playable.is_empty() => return Err(reason),
-            Err(reason) => os::say(&format!("left out: {reason:#}")),
+            Err(reason) => say!("left out: {reason:#}"),
         }
     }
     Ok(playable)
@@ -131,11 +131,11 @@ fn played(
         bar.set_message(condition.name.clone());
         let played = match known {
             Some(known) => Some(known),
-            None => Trial { task: &task, actor, episodes, stop: requests.stop() }.score(&bar, &mut |_| {})?,
+            None => Trial { task: &task, actor, episodes, stop: &requests.stop }.score(&bar, &mut |_| {})?,
         };
         let Some(score) = played else { break };
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
-            os::say(&format!("warning: {}: {warning}", condition.name));
+            say!("warning: {}: {warning}", condition.name);
         }
         let nominal = rows.first().map_or(score["goals"], |nominal| nominal.score["goals"]);
         // Without any goals there is no fraction.

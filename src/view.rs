@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail};
 use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
 use crate::evaluate::{Actor, Episodes, Player};
-use crate::os::{self, OutputFile};
+use crate::os::{self, OutputFile, say};
 use crate::repose::Task;
 use crate::run;
 use crate::see;
@@ -52,9 +52,9 @@ fn task_for_display(config: &Config, shot: &see::Shot) -> Result<Arc<Task>> {
     let task = Task::new(config)?;
     let task = see::task_for_display(&task, shot)?;
     if config.env.model_file().is_some() {
-        os::say(task.table().trim_end());
+        os::say_line(task.table().trim_end());
     }
-    task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+    task.notes().iter().for_each(|note| say!("note: {note}"));
     Ok(task)
 }
 
@@ -74,10 +74,10 @@ fn show_on_page(port: u16, task: &Arc<Task>, choice: usize, seed: u64, camera: O
 
 #[cfg(feature = "video")]
 fn draw(output: OutputFile, task: &Arc<Task>, choice: usize, episodes: Episodes, seconds: f64) -> Result<()> {
-    let path = output.path().to_owned();
+    let path = output.path.clone();
     let (_, actor) = &Actor::WITHOUT_POLICY[choice];
     let [width, height] = see::screenshot(output, task, actor, episodes, seconds)?;
-    os::say(&format!("{}: {width}x{height}", path.display()));
+    say!("{}: {width}x{height}", path.display());
     Ok(())
 }
 
@@ -89,7 +89,7 @@ fn draw(_: OutputFile, _: &Arc<Task>, _: usize, _: Episodes, _: f64) -> Result<(
 #[cfg(feature = "viewer")]
 fn show(task: &Arc<Task>, choice: usize, episodes: Episodes) -> Result<()> {
     match see::Window::open(task, Actor::WITHOUT_POLICY.into(), choice) {
-        Ok(window) => os::say(&window.play(task, episodes)?),
+        Ok(window) => os::say_line(&window.play(task, episodes)?),
         Err(error) => bail!("{error:#}\n  {INSTEAD}"),
     }
     Ok(())

@@ -150,7 +150,7 @@ impl Settings {
         let own = SHIPPED.into_iter().find(|(place, _)| path == Path::new(place) && !path.exists());
         let text = match own {
             Some((place, text)) => {
-                os::say(&format!("note: there is no {place} here: using the one in the program"));
+                os::say!("note: there is no {place} here: using the one in the program");
                 text.to_owned()
             }
             None => os::read_text(path)?,

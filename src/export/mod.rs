@@ -11,7 +11,7 @@ use crate::cli::ExportArgs;
 use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
-use crate::os;
+use crate::os::{self, say};
 use crate::ppo::Checkpoint;
 use crate::repose::{Hand, Task};
 use crate::run;
@@ -25,8 +25,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
     let task = loaded.task(&args.set).context("the file needs the actuator ranges of the scene")?;
-    task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
-    task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+    task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
+    task.notes().iter().for_each(|note| say!("note: {note}"));
     expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), task.config.model_file())?;
     let parts = &task.hand.parts;
@@ -37,7 +37,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let output = os::OutputFile::create(&args.out)?;
     let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, &task));
     output.finish(&bytes)?;
-    os::say(&format!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len()));
+    say!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len());
     Ok(())
 }
 

@@ -30,7 +30,8 @@ pub struct Requests {
     since: Instant,
     /// Whether the program ends by itself after the first request to stop. Until this is set, a request ends it at once.
     patient: Arc<AtomicBool>,
-    stop: Arc<AtomicBool>,
+    /// The flag that is set when the program is requested to stop.
+    pub stop: Arc<AtomicBool>,
     /// The signal that requested the stop, or 0.
     signal: Arc<AtomicI32>,
     save: Arc<AtomicBool>,
@@ -93,11 +94,6 @@ impl Requests {
                 self.stop.store(true, Ordering::Relaxed);
             }
         }
-    }
-
-    /// The flag that is set when the program is requested to stop.
-    pub fn stop(&self) -> &AtomicBool {
-        &self.stop
     }
 
     /// The signal that requested the stop, or 0 if none did.

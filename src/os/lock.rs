@@ -133,7 +133,7 @@ impl Renewal {
         fs::write(&path, &own).cannot("write", &path)?;
         thread::sleep(SETTLED);
         ensure!(holder(&path) == own, in_use(folder, &path));
-        say(&format!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display()));
+        say!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display());
         let file = path.clone();
         let lives = Arc::new(());
         let alive = Arc::downgrade(&lives);

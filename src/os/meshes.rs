@@ -27,7 +27,7 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     if let Some(meshes) = undamaged(&folder, names, CHECKSUM) {
         return Ok(meshes);
     }
-    say("fetching the meshes of the Shadow Hand (8 MB, once)");
+    say!("fetching the meshes of the Shadow Hand (8 MB, once)");
     let damaged = || format!("the meshes in {} are damaged; deleting this folder may help", folder.display());
     let fetched = fetch(&folder, names);
     if folder.exists() {

@@ -29,7 +29,8 @@ pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};
 pub use server::{OnPost, Server};
 pub use similar::similar;
+pub(crate) use terminal::say;
 pub use terminal::{
-    called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say, shortened, speak_as,
+    called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say_line, shortened, speak_as,
 };
 pub use threads::{start_threads, thread_pool};

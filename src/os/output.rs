@@ -100,7 +100,7 @@ pub fn is_abandoned(entry: &DirEntry) -> bool {
 #[derive(Debug)]
 pub struct OutputFile {
     /// The path as the user gave it.
-    path: PathBuf,
+    pub path: PathBuf,
     file: File,
     /// The temporary name and the final one.
     names: Option<(Unfinished, PathBuf)>,
@@ -182,11 +182,6 @@ impl OutputFile {
     pub fn complete(self) -> Result<()> {
         let Some((unfinished, target)) = &self.names else { return Ok(()) };
         self.file.sync_all().and_then(|()| unfinished.become_named(target)).cannot("write", &self.path)
-    }
-
-    /// The path as the user gave it.
-    pub fn path(&self) -> &Path {
-        &self.path
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use console::Term;
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use super::{number, say};
+use super::{number, say, say_line};
 
 /// The time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -75,7 +75,7 @@ impl StatusLine {
         {
             self.last_line = Some(Instant::now());
             let parts = self.shown.parts(left).join("  ");
-            say(&format!("{} of {} steps  {parts}", status.env_steps, self.total_steps));
+            say!("{} of {} steps  {parts}", status.env_steps, self.total_steps);
         }
     }
 
@@ -90,8 +90,8 @@ impl StatusLine {
     /// Prints a line above the progress line.
     pub fn say(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| say(line)),
-            None => say(line),
+            Some(bar) => bar.suspend(|| say_line(line)),
+            None => say_line(line),
         }
     }
 
@@ -105,7 +105,7 @@ impl StatusLine {
         if let Some(bar) = &self.bar {
             bar.abandon();
             // The cursor is left at the end of the line.
-            say("");
+            say_line("");
         }
     }
 }

@@ -33,7 +33,8 @@ pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
 /// A page that is served as long as the program runs.
 pub struct Server {
     shared: Arc<Shared>,
-    port: u16,
+    /// Its port.
+    pub port: u16,
 }
 
 struct Shared {
@@ -81,11 +82,6 @@ impl Server {
         let accepting = thread::Builder::new().name("server".into());
         accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
         Ok(Self { shared, port })
-    }
-
-    /// The port.
-    pub fn port(&self) -> u16 {
-        self.port
     }
 
     /// Sets the event that readers get first.

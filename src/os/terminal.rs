@@ -44,7 +44,7 @@ pub fn number(value: f64, decimals: usize) -> String {
     if is_zero { text.trim_start_matches('-').to_owned() } else { text }
 }
 
-/// What each line of [`say`] begins with.
+/// What each line of [`say_line`] begins with.
 static SPEAKER: OnceLock<String> = OnceLock::new();
 
 /// From now on, lines to stderr begin with this name, because several processes print to the same place.
@@ -70,8 +70,16 @@ fn escaped(text: &str, kept: &str, escape: impl Fn(char) -> String) -> String {
     text.chars().map(shown).collect()
 }
 
+/// Prints a line to stderr, which is written as for `println!`.
+macro_rules! say {
+    ($($text:tt)*) => {
+        $crate::os::say_line(&format!($($text)*))
+    };
+}
+pub(crate) use say;
+
 /// Prints a line to stderr. Characters that control the terminal are escaped, since the line may quote an untrusted file.
-pub fn say(line: &str) {
+pub fn say_line(line: &str) {
     let speaker = SPEAKER.get().map_or("", String::as_str);
     let harmless = escaped(line, "\n\t", |c| c.escape_unicode().to_string());
     let _ = std::io::stderr().write_all(format!("{speaker}{harmless}\n").as_bytes());

@@ -12,7 +12,7 @@ use super::files::PageFile;
 use super::stage::Stage;
 use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
-use crate::os::{self, Destination, Stamp};
+use crate::os::{self, Destination, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
 use crate::see::{self, About, Live, Shot};
@@ -59,7 +59,7 @@ impl Followed {
         let needs = "--follow needs a run";
         PolicySource::find(&place).context(needs)?;
         let run = RunFolder::containing(&place).context(needs)?;
-        let path = run.checkpoints().latest();
+        let path = run.checkpoints.latest();
         Ok(Self { stamp: Stamp::of(&path), run, path })
     }
 
@@ -86,7 +86,7 @@ pub(super) fn live(
     let stage = Rc::new(stage);
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
-        about = About { title: followed.run.path().display().to_string(), policy: None, ..about };
+        about = About { title: followed.run.path.display().to_string(), policy: None, ..about };
     }
     let mut acting = stage.clone().acting(task.clone());
     let live = Live::open(port, (&about, shot.camera), hands as usize, &acting, None)?;
@@ -108,7 +108,7 @@ pub(super) fn live(
         {
             match load(&followed.path) {
                 Ok(newer) => acting = newer,
-                Err(error) => os::say(&format!("warning: {error:#}\n  The previous policy continues.")),
+                Err(error) => say!("warning: {error:#}\n  The previous policy continues."),
             }
         }
         acting.clone()
@@ -140,7 +140,7 @@ pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Over
     let mut page = PageFile::begin(to, &task, shot, 0)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {
-        os::say(&format!("note: {left_out} more episodes of {} are not in the HTML file", path.display()));
+        say!("note: {left_out} more episodes of {} are not in the HTML file", path.display());
     }
     page.finish(&recorded(&header))?;
     Ok(ExitCode::SUCCESS)

@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::plan::Outputs;
 use super::stage::Stage;
 use crate::evaluate::{Episodes, Moment};
-use crate::os::{self, Destination, OutputFile};
+use crate::os::{Destination, OutputFile, say};
 use crate::repose::Task;
 use crate::see::{self, About, Replay, Shot};
 use crate::trace::Trace;
@@ -54,7 +54,7 @@ impl Files {
     pub(super) fn give_up(self) {
         let trace = self.trace.map(|(output, _)| output);
         for output in trace.into_iter().chain(self.page.map(|page| page.output)) {
-            os::say(&format!("{}: interrupted, not written", output.path().display()));
+            say!("{}: interrupted, not written", output.path.display());
         }
     }
 }
@@ -90,9 +90,9 @@ impl PageFile {
     /// Fails if it cannot be written.
     pub(super) fn finish(self, about: &About) -> Result<()> {
         let html = self.replay.page(about)?.html();
-        let path = self.output.path().display().to_string();
+        let path = self.output.path.display().to_string();
         self.output.finish(html.as_bytes())?;
-        os::say(&format!("{path}: {} kB", html.len().div_ceil(1000)));
+        say!("{path}: {} kB", html.len().div_ceil(1000));
         Ok(())
     }
 }

@@ -24,7 +24,7 @@ use self::stage::{Stage, task};
 use crate::cli::PlayArgs;
 use crate::config::{Override, expect_used};
 use crate::evaluate::Episodes;
-use crate::os::{self, Requests};
+use crate::os::{self, Requests, say};
 use crate::robustness::robustness;
 use crate::see;
 
@@ -60,7 +60,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
         Plan::Score(outputs) => {
             let stage = Stage::set(place, args)?;
             if !args.wants_result() && os::is_terminal() {
-                os::say(&format!("note: there is no display. {INSTEAD}"));
+                say!("note: there is no display. {INSTEAD}");
             }
             let is_seen = outputs.film.is_some() || outputs.page.is_some();
             score(&stage, episodes(args, if is_seen { 1 } else { 256 }), &outputs, requests)
@@ -73,10 +73,10 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
 fn show(stage: &Stage, shot: &see::Shot, args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     let task = see::task_for_display(&stage.task, shot)?;
     match see::Window::open(&task, stage.actors(), stage.choice) {
-        Ok(window) => os::say(&window.play(&task, episodes(args, u64::MAX))?),
+        Ok(window) => os::say_line(&window.play(&task, episodes(args, u64::MAX))?),
         Err(error) if args.window => bail!("{error:#}\n  {INSTEAD}"),
         Err(error) => {
-            os::say(&format!("note: {error:#}\n  {INSTEAD} The score follows."));
+            say!("note: {error:#}\n  {INSTEAD} The score follows.");
             return score(stage, episodes(args, 256), &Outputs::of(args)?, requests);
         }
     }

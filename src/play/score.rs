@@ -15,7 +15,7 @@ use crate::evaluate::{Actor, Episodes, Moment, Trial};
 use crate::goal_times::GoalTimes;
 #[cfg(feature = "video")]
 use crate::os::Destination;
-use crate::os::{self, Requests};
+use crate::os::{self, Requests, say};
 use crate::repose::Score;
 use crate::see;
 
@@ -33,7 +33,7 @@ pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, reques
         goal_times.observe(moment);
         files.observe(moment);
     };
-    let trial = Trial { task, actor, episodes, stop: requests.stop() };
+    let trial = Trial { task, actor, episodes, stop: &requests.stop };
     let played = match &outputs.film {
         #[cfg(not(feature = "video"))]
         Some(_) => bail!(see::NO_FILMS),
@@ -46,7 +46,7 @@ pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, reques
         return Ok(os::exit_code(requests.signal()));
     };
     files.finish(&about(stage, episodes.seed))?;
-    played.divergence().into_iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    played.divergence().into_iter().for_each(|warning| say!("warning: {warning}"));
     if outputs.json {
         os::print(&format!("{}\n", json_score(&played, &goal_times, place.as_deref(), episodes.seed)))?;
         return Ok(ExitCode::SUCCESS);
@@ -96,6 +96,6 @@ fn film(
             Err(error) => return Err(film.abandon().unwrap_or(error)),
         }
     }
-    os::say(&format!("{}: {}", to.path.display(), film.finish()?));
+    say!("{}: {}", to.path.display(), film.finish()?);
     Ok((played.len() == count).then(|| Score::of(&played, task.config.ctrl_dt)))
 }

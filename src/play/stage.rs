@@ -10,7 +10,7 @@ use crate::cli::PlayArgs;
 use crate::config::{Override, Settings};
 use crate::evaluate::Actor;
 use crate::load::Loaded;
-use crate::os::{self, Destination};
+use crate::os::{self, Destination, say};
 use crate::ppo::FixedPolicy;
 use crate::repose::Task;
 use crate::run;
@@ -40,11 +40,11 @@ impl Stage {
         expect_outputs(&args.out, file, stage.task.config.model_file())?;
         os::start_threads(args.threads)?;
         if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
-            os::say(&format!("playing {}", loaded.name));
+            say!("playing {}", loaded.name);
         }
-        stage.task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+        stage.task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
         if !args.json {
-            stage.task.notes().iter().for_each(|note| os::say(&format!("note: {note}")));
+            stage.task.notes().iter().for_each(|note| say!("note: {note}"));
         }
         Ok(stage)
     }

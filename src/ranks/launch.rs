@@ -79,7 +79,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
             // An error that occurs on all ranks at once, such as a loss that is not finite, is reported by the first.
             std::thread::sleep(PATIENCE);
         }
-        os::say(&format!("error: {error:#}"));
+        os::say!("error: {error:#}");
         exchange.abort()
     })
 }

@@ -15,17 +15,12 @@ pub(super) const CHECKPOINTS: &str = "checkpoints";
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
 pub struct Checkpoints {
-    folder: PathBuf,
+    pub(super) folder: PathBuf,
 }
 
 impl Checkpoints {
     pub(super) fn new(run: &Path) -> Self {
         Self { folder: run.join(CHECKPOINTS) }
-    }
-
-    /// The path of the folder.
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// The path of the newest checkpoint.
@@ -138,7 +133,7 @@ mod tests {
     use super::*;
 
     fn names(checkpoints: &Checkpoints) -> Vec<String> {
-        let entries = fs::read_dir(checkpoints.folder()).unwrap();
+        let entries = fs::read_dir(&checkpoints.folder).unwrap();
         let mut names: Vec<String> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
         names

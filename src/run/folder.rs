@@ -45,15 +45,17 @@ pub(super) const METRICS: &str = "metrics.csv";
 /// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
 #[derive(Clone, Debug)]
 pub struct RunFolder {
-    path: PathBuf,
+    /// Its path.
+    pub path: PathBuf,
+    /// Its checkpoints.
+    pub checkpoints: Checkpoints,
     /// The time of a file `stop` that was there before this session.
     stop_before: Option<SystemTime>,
 }
 
 impl RunFolder {
     pub(super) fn at(path: PathBuf) -> Self {
-        let stop_before = modified(&path.join(STOP));
-        Self { path, stop_before }
+        Self { checkpoints: Checkpoints::new(&path), stop_before: modified(&path.join(STOP)), path }
     }
 
     /// Creates the folder of a new run: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
@@ -68,7 +70,7 @@ impl RunFolder {
         let lock = run.lock()?;
         // Another training run may have started and ended in the meantime.
         run.expect_free(Some(LOCK))?;
-        run.checkpoints().create_folder()?;
+        run.checkpoints.create_folder()?;
         let lock = run.claim(lock)?;
         Ok((run, lock))
     }
@@ -91,7 +93,7 @@ impl RunFolder {
         let there = whole.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self::at(path.to_owned())) {
-            let holds_a_run = folder.checkpoints().begun() || folder.path.join(LOCK).exists();
+            let holds_a_run = folder.checkpoints.begun() || folder.path.join(LOCK).exists();
             ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
         }
         Ok(())
@@ -104,7 +106,7 @@ impl RunFolder {
             begins.clone().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()))
         };
         let all_early = self.entries()?.iter().all(|entry| early(&entry.file_name()));
-        Ok(all_early && self.path.join(LOCK).exists() && !self.checkpoints().begun())
+        Ok(all_early && self.path.join(LOCK).exists() && !self.checkpoints.begun())
     }
 
     /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
@@ -121,7 +123,7 @@ impl RunFolder {
         for entry in self.entries().into_iter().flatten() {
             let _ = fs::remove_file(entry.path());
         }
-        for folder in [self.checkpoints().folder(), &self.path.join(HPARAMS), &self.path] {
+        for folder in [&self.checkpoints.folder, &self.path.join(HPARAMS), &self.path] {
             let _ = fs::remove_dir(folder);
         }
     }
@@ -139,9 +141,9 @@ impl RunFolder {
     pub fn containing(place: &Path) -> Result<Self> {
         let run = Self::around(place)?;
         // A folder that may not be listed or entered would look empty.
-        let checkpoints = run.checkpoints();
-        match fs::read_dir(checkpoints.folder()).and_then(|_| fs::metadata(checkpoints.folder().join("."))) {
-            Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", checkpoints.folder())?,
+        let folder = &run.checkpoints.folder;
+        match fs::read_dir(folder).and_then(|_| fs::metadata(folder.join("."))) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", folder)?,
             _ => {}
         }
         Ok(run)
@@ -151,7 +153,7 @@ impl RunFolder {
         ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
         let whole = place.canonicalize().cannot("read", place)?;
         let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
-        let run = folder.and_then(Path::parent).filter(|run| Some(Checkpoints::new(run).folder()) == folder);
+        let run = folder.and_then(Path::parent).filter(|run| Some(&*Checkpoints::new(run).folder) == folder);
         match run {
             Some(run) => Ok(Self::at(run.to_owned())),
             None if place.is_dir() => Ok(Self::at(place.to_owned())),
@@ -201,7 +203,7 @@ impl RunFolder {
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
         let inner = [DIVERGED, HPARAMS].map(|name| self.path.join(name));
-        let folders = [&[self.path.clone(), self.checkpoints().folder().to_owned()][..], &inner].concat();
+        let folders = [&[self.path.clone(), self.checkpoints.folder.clone()][..], &inner].concat();
         for folder in folders.iter().filter(|folder| folder.exists()) {
             for entry in fs::read_dir(folder).cannot("read", folder)? {
                 found.push(entry.cannot("read", folder)?);
@@ -230,16 +232,6 @@ impl RunFolder {
             return;
         }
         let _ = if finished { write_whole(&path, b"") } else { fs::remove_file(path).map_err(Into::into) };
-    }
-
-    /// The path of the folder.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Its checkpoints.
-    pub fn checkpoints(&self) -> Checkpoints {
-        Checkpoints::new(&self.path)
     }
 
     /// The path of the policy without its training state: the best one, or the latest if none was scored yet.
@@ -295,7 +287,7 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
         ensure!(place.exists(), "{}: no such checkpoint or run folder", place.display());
         return Ok(place.to_owned());
     }
-    let checkpoints = RunFolder::containing(place)?.checkpoints();
+    let checkpoints = RunFolder::containing(place)?.checkpoints;
     let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
@@ -304,7 +296,7 @@ pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
 pub fn newest_run() -> Option<PathBuf> {
     let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder::at(entry.path()));
     // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.
-    runs.filter_map(|run| Some((modified(&run.checkpoints().latest())?, run.path))).max().map(|(_, path)| path)
+    runs.filter_map(|run| Some((modified(&run.checkpoints.latest())?, run.path))).max().map(|(_, path)| path)
 }
 
 /// Creates a run folder in the default folder of runs, under a name from the current time that no other run has.
@@ -348,7 +340,7 @@ mod tests {
         fs::write(&victim, "precious").unwrap();
         for name in ["run.lock", "metrics.csv", "events.out.tfevents.1.2.shadow-repose", "checkpoints/x.partial"] {
             let run = RunFolder::at(place.path().join("run"));
-            run.checkpoints().create_folder().unwrap();
+            run.checkpoints.create_folder().unwrap();
             std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
             assert!(refusal.contains(name) && refusal.contains("not followed"), "{refusal}");
@@ -373,10 +365,10 @@ mod tests {
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
         let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        let left = run.checkpoints().folder().join(".shadow-repose-999999999-0.partial");
+        let left = run.checkpoints.folder.join(".shadow-repose-999999999-0.partial");
         fs::write(&left, "half").unwrap();
         let living = crate::os::OutputFile::create(&place.path().join("trace")).unwrap();
-        assert!(run.checkpoints().newest_first().is_empty());
+        assert!(run.checkpoints.newest_first().is_empty());
         drop(lock);
         let lock = run.lock().unwrap();
         assert!(left.exists(), "locking alone removes nothing");
@@ -417,10 +409,10 @@ mod tests {
     fn the_folder_of_its_checkpoints_means_the_run() {
         let place = tempfile::tempdir().unwrap();
         let (run, _lock) = RunFolder::create(Some(&place.path().join("run")), None).unwrap();
-        write_whole(&run.checkpoints().latest(), b"latest").unwrap();
-        let found = RunFolder::containing(run.checkpoints().folder()).unwrap();
+        write_whole(&run.checkpoints.latest(), b"latest").unwrap();
+        let found = RunFolder::containing(&run.checkpoints.folder).unwrap();
         assert!(same_file(&found.path, &run.path), "{found:?}");
-        assert!(same_file(&resolve_checkpoint(run.checkpoints().folder()).unwrap(), &run.checkpoints().latest()));
+        assert!(same_file(&resolve_checkpoint(&run.checkpoints.folder).unwrap(), &run.checkpoints.latest()));
     }
 
     #[test]
@@ -428,12 +420,12 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let (run, _) = RunFolder::create(Some(place.path()), None).unwrap();
         assert!(resolve_checkpoint(place.path()).is_err());
-        let checkpoints = run.checkpoints();
+        let checkpoints = &run.checkpoints;
         write_whole(&checkpoints.latest(), b"latest").unwrap();
         assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.latest());
         write_whole(&checkpoints.best(), b"best").unwrap();
         assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.best());
-        assert_eq!(RunFolder::containing(&checkpoints.latest()).unwrap().path(), place.path().canonicalize().unwrap());
+        assert_eq!(RunFolder::containing(&checkpoints.latest()).unwrap().path, place.path().canonicalize().unwrap());
     }
 
     #[test]

@@ -39,13 +39,13 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
     let (run, names) = if inside { (folder.parent(), &INSIDE[..]) } else { (Some(folder), &IN_RUN[..]) };
     let run = RunFolder::at(run.unwrap_or(folder).to_owned());
-    let is_run = run.checkpoints().begun() || run.path().join(LOCK).exists();
+    let is_run = run.checkpoints.begun() || run.path.join(LOCK).exists();
     let name = name.to_string_lossy();
     let is_kept = names.iter().any(|kept| match kept.split_once('*') {
         Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
         None => name == *kept,
     });
-    let place = run.path().display();
+    let place = run.path.display();
     ensure!(!is_run || !is_kept, "{}: the run {place} reserves this file name; choose another name", path.display());
     Ok(())
 }

@@ -47,7 +47,7 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
             return os::print(&(os::harmless(&text.to_string()) + "\n"));
         }
         if runs.is_empty() && !args.watch {
-            os::say("there are no runs in this folder");
+            os::say!("there are no runs in this folder");
         }
         let letters = if compared.is_some() { &["A", "B"][..] } else { &[] };
         let mut lines = table(&runs, letters);

@@ -27,7 +27,7 @@ pub struct Shot {
 /// # Errors
 /// Fails like [`Task::for_display`].
 pub fn task_for_display(task: &Task, shot: &Shot) -> Result<Arc<Task>> {
-    let note = |error: &Error| os::say(&format!("note: {error:#}; primitives are shown instead"));
+    let note = |error: &Error| os::say!("note: {error:#}; primitives are shown instead");
     // Only the built-in hand has meshes.
     let prefix = task.hand.side().filter(|_| !shot.plain && task.config.model_file().is_none());
     let meshes =

@@ -87,12 +87,12 @@ impl Live {
         let hands: Vec<_> = (0..hands).map(|episode| LiveHand::new(acting.clone(), episode, episodes)).collect();
         let hello = hello(&key, seed, &hands, sliders.as_ref());
         let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
-        let port = server.port();
+        let port = server.port;
         let machine = Machine::this().name;
-        os::say(&format!(
+        os::say!(
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
-        ));
+        );
         Ok(Self { columns, server, sliders, key, every, episodes, hands })
     }
 

@@ -36,7 +36,7 @@ impl<'a> Window<'a> {
     pub fn open(task: &Task, actors: Vec<(&'static str, Actor<'a>)>, first: usize) -> Result<Self> {
         let (names, actors) = actors.into_iter().unzip();
         let viewer = Viewer::open(&task.scene, "shadow-repose", names, first)?;
-        os::say(KEYS);
+        os::say_line(KEYS);
         Ok(Self { viewer, actors })
     }
 

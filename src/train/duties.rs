@@ -12,7 +12,7 @@ use super::saver::Saver;
 use super::session::Session;
 use crate::config::{EnvConfig, scene_option};
 
-use crate::os::{self, Requests, Status, StatusLine};
+use crate::os::{self, Requests, Status, StatusLine, say};
 use crate::ppo::{Checkpoint, Rise};
 use crate::repose::{HEADLINE, Score, divergence, measure};
 use crate::run::{Hparams, Report};
@@ -74,7 +74,7 @@ impl Lead {
         let tags = tags(config.randomization.happens());
         let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
         let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
-        let report = Report::new(saver.held.folder.path(), &tags, progress);
+        let report = Report::new(&saver.held.folder.path, &tags, progress);
         let report = report.described(described(&tags), config.to_text(), hparams);
         Self { report, saver, quiet, diverged: 0, warned: false, far: 0 }
     }
@@ -122,13 +122,13 @@ impl Lead {
         }
         let saved = self.saver.save_at_last(&mut self.report);
         if self.warned {
-            os::say(&format!("warning: {} steps of this session diverged", self.diverged));
+            say!("warning: {} steps of this session diverged", self.diverged);
         }
         let held = &self.saver.held;
         let stop = ended.inspect_err(|_| match &saved {
-            Ok(()) if held.wrote => os::say(&format!("saved the state after {}", held.steps_made())),
-            Ok(()) => os::say("the run folder was not changed"),
-            Err(error) => os::say(&format!("error: {error:#}")),
+            Ok(()) if held.wrote => say!("saved the state after {}", held.steps_made()),
+            Ok(()) => say!("the run folder was not changed"),
+            Err(error) => say!("error: {error:#}"),
         })?;
         saved?;
         match stop {
@@ -142,12 +142,12 @@ impl Lead {
         let held = &self.saver.held;
         held.folder.mark_finished(true);
         let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
-        os::say(&format!("{why}: {}; {}", held.steps_made(), held.folder.path().display()));
+        say!("{why}: {}; {}", held.steps_made(), held.folder.path.display());
         if let Some(rise) = &session.rise {
-            os::say(&before_and_after(rise, session.config.run.eval_episodes));
+            os::say_line(&before_and_after(rise, session.config.run.eval_episodes));
         }
         if !self.quiet {
-            say_what_next(held.folder.path(), &session.config.env);
+            say_what_next(&held.folder.path, &session.config.env);
         }
         self.saver.release();
     }
@@ -155,14 +155,14 @@ impl Lead {
     fn stop(&mut self, stop: Stop) {
         let held = &self.saver.held;
         if !held.wrote {
-            return os::say(
+            return os::say_line(
                 "stopped before the first iteration: the run is unchanged; repeat the same command to continue",
             );
         }
         held.folder.mark_finished(stop.by_file);
         let reason = if stop.by_file { "stopped by the file `stop`" } else { "stopped" };
-        os::say(&format!("{reason} after {}; resume with", held.steps_made()));
-        os::say(&format!("  {}", held.how_to_resume(&held.folder)));
+        say!("{reason} after {}; resume with", held.steps_made());
+        say!("  {}", held.how_to_resume(&held.folder));
         self.saver.release();
     }
 }
@@ -230,5 +230,5 @@ fn say_what_next(run: &Path, env: &EnvConfig) {
     let word = os::quoted_path(run);
     let all = run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let play = format!("{program} play --ckpt {word}{}", scene_option(env));
-    os::say(&format!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {}", os::quoted_path(all)));
+    say!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {}", os::quoted_path(all));
 }

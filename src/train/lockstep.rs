@@ -55,7 +55,7 @@ impl Session {
     pub(super) fn decide(&self, requests: &Requests, by_file: bool, improved: bool) -> Result<Decision> {
         let exchange = &self.agent.exchange;
         // With a single rank, the next iteration stops at once.
-        let asked = !exchange.is_alone() && requests.stop().load(Ordering::Relaxed);
+        let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
         let weights = if exchange.is_alone() { 0 } else { self.agent.ppo.checksum() };
         let signal = if asked { requests.signal() } else { 0 };
         let vote = Vote { stop: by_file || asked, save: requests.take_save(), improved, signal, weights };

@@ -18,7 +18,7 @@ use anyhow::{Context, Result, anyhow, ensure};
 use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
-use crate::os::{self, Requests};
+use crate::os::{self, Requests, say};
 use crate::ppo::{Evaluation, Rise};
 use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums, Task};
@@ -48,7 +48,7 @@ pub fn train(args: &TrainArgs, requests: &Requests) -> Result<ExitCode> {
 /// Trains, reports and saves.
 fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
     let (mut session, saver) = Session::lead(args, exchange)?;
-    let place = saver.held.folder.path().display().to_string();
+    let place = saver.held.folder.path.display().to_string();
     if session.finished() {
         let advice = match session.is_flat() {
             true => "its evaluations no longer rise; use --fork to continue",
@@ -58,21 +58,21 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
         if args.total_steps.is_none() {
             saver.held.folder.mark_finished(true);
         }
-        os::say(&format!("{place} is finished: {}; {advice}", saver.held.steps_made()));
+        say!("{place} is finished: {}; {advice}", saver.held.steps_made());
         return Ok(ExitCode::SUCCESS);
     }
     if let Some(limit) = args.stop_after {
         requests.stop_after(limit)?;
     }
     requests.wait_for_end();
-    os::say(&format!("run folder: {place}"));
-    session.task.warnings.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+    say!("run folder: {place}");
+    session.task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
     if !args.quiet {
         let default = Config::default();
         let hints = hints(&session.config, args, &default, session.task.scene.size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
         let mobility = own_scene.then(|| mobility(&session.task, &default.env));
-        session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| os::say(&format!("note: {hint}")));
+        session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| say!("note: {hint}"));
     }
     let mut lead = Lead::new(&session, saver, args.quiet);
     if args.resume.is_none() {
@@ -126,7 +126,7 @@ impl Session {
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
-            let Some(iteration) = self.agent.iterate(now.stop())? else { return Ok(None) };
+            let Some(iteration) = self.agent.iterate(&now.stop)? else { return Ok(None) };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
             let Some(evaluation) = self.evaluate(due, &now, duties)? else { return Ok(None) };
@@ -217,7 +217,7 @@ impl Session {
         }
         let task = self.task_now();
         let actor = Actor::Mean(self.agent.ppo.policy.freeze());
-        let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: requests.stop() };
+        let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: &requests.stop };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
             duties.attend(requests);
             Ok(())
@@ -285,7 +285,7 @@ mod tests {
         let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
         let mut session = from_scratch(&sets);
         let saver = saver_of(&session, RunFolder::create(Some(place.path()), None).unwrap());
-        let latest = saver.held.folder.checkpoints().latest();
+        let latest = saver.held.folder.checkpoints.latest();
         let mut lead = Lead::new(&session, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();

@@ -8,7 +8,7 @@ use anyhow::{Error, Result, anyhow};
 use crate::cli::TrainArgs;
 use crate::config::{Config, scene_option};
 use crate::load;
-use crate::os::{self, Locked};
+use crate::os::{self, Locked, say};
 use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
@@ -60,7 +60,7 @@ impl Saver {
         let options =
             format!("{}{}", scene_option(&config.env), if args.dump_diverged { " --dump-diverged" } else { "" });
         // The newest, and one more in case that is damaged.
-        let keep = args.keep.unwrap_or_else(|| folder.checkpoints().count().max(2));
+        let keep = args.keep.unwrap_or_else(|| folder.checkpoints.count().max(2));
         let initial = Arc::new(initial);
         let last = initial.clone();
         let settings = config.to_text();
@@ -97,12 +97,12 @@ impl Saver {
             None => self.held.folder.lock()?,
         };
         self.lock = Some(self.held.folder.claim(lock)?);
-        let best = self.held.folder.checkpoints().best();
+        let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
-            let aside = self.held.folder.checkpoints().put_best_aside()?;
+            let aside = self.held.folder.checkpoints.put_best_aside()?;
             report.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
         }
-        if !self.from_newest || self.held.folder.checkpoints().newest_first().is_empty() {
+        if !self.from_newest || self.held.folder.checkpoints.newest_first().is_empty() {
             write(&self.held.folder, None, &self.initial, self.held.keep)?;
         }
         let Progress { iteration, env_steps, fork, .. } = &self.initial.progress;
@@ -177,19 +177,19 @@ impl Saver {
         let held = self.held.clone();
         let holds = self.lock.as_ref().map(Locked::watch);
         sim::before_fatal_error(move |said| {
-            os::say(&format!("error: {said}"));
+            say!("error: {said}");
             if !held.wrote {
-                return os::say("the run folder was not changed");
+                return say!("the run folder was not changed");
             }
-            let replaced = || anyhow!("{} has been replaced", held.folder.path().display());
+            let replaced = || anyhow!("{} has been replaced", held.folder.path.display());
             let ours = holds.is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
             match ours.and_then(|()| held.write(&held.folder, held.keep)) {
                 Ok(()) => {
                     let iteration = held.last.progress.iteration;
                     let command = held.how_to_resume(&held.folder);
-                    os::say(&format!("saved the state after {iteration} iterations; resume with\n  {command}"));
+                    say!("saved the state after {iteration} iterations; resume with\n  {command}");
                 }
-                Err(error) => os::say(&format!("error: {:#}", held.elsewhere(error))),
+                Err(error) => say!("error: {:#}", held.elsewhere(error)),
             }
         });
     }
@@ -203,7 +203,7 @@ impl Held {
 
     /// Writes the best policy, unless that is done, and the checkpoint into a run folder, in which the newest `keep` are kept.
     fn write(&self, folder: &RunFolder, keep: usize) -> Result<()> {
-        let unsaved = !self.best_is_saved || !folder.checkpoints().best().exists();
+        let unsaved = !self.best_is_saved || !folder.checkpoints.best().exists();
         write(folder, self.best.as_deref().filter(|_| unsaved), &self.last, keep)
     }
 
@@ -220,7 +220,7 @@ impl Held {
             Ok(run) => anyhow!(
                 "{reason:#}\nThe state after {} iterations is in {} instead; resume with\n  {}",
                 self.last.progress.iteration,
-                run.path().display(),
+                run.path.display(),
                 self.how_to_resume(&run)
             ),
             Err(error) => anyhow!(
@@ -232,7 +232,7 @@ impl Held {
 
     /// The command that resumes the run in this folder with the same options.
     pub(super) fn how_to_resume(&self, run: &RunFolder) -> String {
-        format!("{} train --resume {}{}", os::called_as(), os::quoted_path(run.path()), self.options)
+        format!("{} train --resume {}{}", os::called_as(), os::quoted_path(&run.path), self.options)
     }
 }
 
@@ -241,12 +241,12 @@ impl Held {
 /// in the resumed checkpoint.
 pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<Evaluation>) -> Option<Evaluation> {
     let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
-    score(&folder.checkpoints().best()).or_else(|| score(&folder.policy())).or(resumed)
+    score(&folder.checkpoints.best()).or_else(|| score(&folder.policy())).or(resumed)
 }
 
 /// Writes the best checkpoint, if there is one to write, and the checkpoint `last` into a run folder.
 fn write(folder: &RunFolder, best: Option<&Checkpoint>, last: &Checkpoint, keep: usize) -> Result<()> {
-    let checkpoints = folder.checkpoints();
+    let checkpoints = &folder.checkpoints;
     match best {
         Some(best) => {
             os::write_whole(&folder.policy(), &best.policy_alone().to_bytes()?)?;
@@ -261,7 +261,7 @@ fn write(folder: &RunFolder, best: Option<&Checkpoint>, last: &Checkpoint, keep:
 fn keep_policy(folder: &RunFolder, last: &Checkpoint) -> Result<()> {
     let score = |checkpoint: &Checkpoint| checkpoint.progress.best;
     let shared = load::read(&folder.policy()).ok().as_ref().and_then(score);
-    let policy = match load::read(&folder.checkpoints().best()) {
+    let policy = match load::read(&folder.checkpoints.best()) {
         Ok(best) if score(&best) == shared => return Ok(()),
         Ok(best) => best.policy_alone(),
         // The policy file is all that is left of the best checkpoint.

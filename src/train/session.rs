@@ -10,7 +10,7 @@ use crate::agent::Agent;
 use crate::cli::TrainArgs;
 use crate::config::{Config, Settings, Source};
 use crate::evaluate::{expect_finite_actions, expect_finite_values};
-use crate::os;
+use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Evaluation, Rise};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
@@ -62,7 +62,7 @@ impl Session {
     /// # Errors
     /// Fails as [`Plan::receive`] and [`Session::new`] do.
     pub(super) fn follow(exchange: &Exchange) -> Result<Self> {
-        sim::before_fatal_error(|said| os::say(&format!("error: {said}")));
+        sim::before_fatal_error(|said| say!("error: {said}"));
         let session = Self::set_up(Plan::receive(exchange)?, exchange)?;
         // Together with the state that the saver begins with.
         session.checkpoint();
@@ -81,7 +81,7 @@ impl Session {
         let session = Self::new(plan, loaded, exchange)?;
         let exchange = &session.agent.exchange;
         let warning = exchange.expect_alike(&session.scene)?.filter(|_| exchange.is_first() && threads == 0);
-        warning.iter().for_each(|warning| os::say(&format!("warning: {warning}")));
+        warning.iter().for_each(|warning| say!("warning: {warning}"));
         Ok(session)
     }
 
@@ -120,7 +120,7 @@ impl Session {
         }
         self.rise = checkpoint.progress.rise;
         if checkpoint.scene != self.scene && agent.exchange.is_first() {
-            os::say("warning: the scene differs from the checkpoint's scene: the resumed run is a different training");
+            say!("warning: the scene differs from the checkpoint's scene: the resumed run is a different training");
         }
         checkpoint.finish()
     }

@@ -100,7 +100,7 @@ impl Plan {
         let place = place.map(Path::to_owned).or_else(run::newest_run);
         let place = place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")?;
         let folder = RunFolder::containing(&place)?;
-        let checkpoints = folder.checkpoints();
+        let checkpoints = &folder.checkpoints;
         ensure!(
             !checkpoints.newest_first().is_empty(),
             "{} holds no checkpoint: the run ended before it saved one; repeat the command that started it",
@@ -216,7 +216,7 @@ fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
     if !place.is_dir() {
         return Ok(vec![place.to_owned()]);
     }
-    Ok(RunFolder::containing(place)?.checkpoints().newest_first())
+    Ok(RunFolder::containing(place)?.checkpoints.newest_first())
 }
 
 /// What the user sets.
