@@ -25,40 +25,26 @@ pub(super) struct Request {
     pub(super) body: Vec<u8>,
 }
 
-/// A status line without the protocol, a sentence, and the headers that belong to them.
-pub(super) type Refusal = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+/// A status, without the protocol and with the header lines that belong to it, and a sentence.
+pub(super) type Refusal = (&'static str, &'static str);
 
-const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.", &[]);
-const TOO_LONG: Refusal = ("431 Request Header Fields Too Large", "The request is too long.", &[]);
-const LATE: Refusal = ("408 Request Timeout", "The request took too long.", &[]);
-const NO_LENGTH: Refusal = ("411 Length Required", "The length of the body is not given.", &[]);
-const TOO_LARGE: Refusal = ("413 Content Too Large", "The body is too long.", &[]);
-const ELSEWHERE: Refusal = (
-    "403 Forbidden",
-    "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.",
-    &[],
-);
-const NOT_GET: Refusal = ("405 Method Not Allowed", "This method is not allowed here.", &[("Allow", "GET")]);
-const NOT_POST: Refusal = ("405 Method Not Allowed", "This method is not allowed here.", &[("Allow", "POST")]);
-const FOREIGN: Refusal = ("403 Forbidden", "Only the page itself may send this.", &[]);
+const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.");
 
 impl Request {
-    /// Reads a request. Returns `None` if the other side has gone.
+    /// Reads a request.
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub(super) fn read(stream: &mut TcpStream) -> Result<Option<Self>, Refusal> {
+    pub(super) fn read(stream: &mut TcpStream) -> Result<Self, Refusal> {
         let deadline = Instant::now() + PATIENCE;
         let mut bytes = Vec::new();
         let end = loop {
-            if !read_some(stream, &mut bytes, LONGEST_HEAD, deadline)? {
-                return Ok(None);
-            }
+            read_some(stream, &mut bytes, LONGEST_HEAD, deadline)?;
             if let Some(end) = bytes.windows(4).position(|four| four == b"\r\n\r\n") {
                 break end + 4;
             }
             if bytes.len() >= LONGEST_HEAD {
-                return Err(TOO_LONG);
+                return Err(("431 Request Header Fields Too Large", "The request is too long."));
             }
         };
         let body = bytes.split_off(end);
@@ -67,25 +53,23 @@ impl Request {
             request.body = body;
             let length = request.length()?;
             while request.body.len() < length {
-                if !read_some(stream, &mut request.body, length, deadline)? {
-                    return Ok(None);
-                }
+                read_some(stream, &mut request.body, length, deadline)?;
             }
             request.body.truncate(length);
         }
-        Ok(Some(request))
+        Ok(request)
     }
 
     fn parse(head: &[u8]) -> Option<Self> {
         let mut lines = std::str::from_utf8(head).ok()?.trim_end_matches("\r\n").split("\r\n");
         let [method, target, version] = Vec::from_iter(lines.next()?.split(' ')).try_into().ok()?;
         let path = target.split('?').next()?;
-        let mut headers = Vec::new();
-        for line in lines {
+        let header = |line: &str| {
             let (name, value) = line.split_once(':')?;
             let is_name = !name.is_empty() && name.bytes().all(|c| c.is_ascii_graphic());
-            headers.push(is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))?);
-        }
+            is_name.then(|| (name.to_ascii_lowercase(), value.trim().to_owned()))
+        };
+        let headers = lines.map(header).collect::<Option<_>>()?;
         let fits = path.starts_with('/') && version.starts_with("HTTP/1.");
         fits.then(|| Self { method: method.into(), path: path.into(), headers, body: Vec::new() })
     }
@@ -99,19 +83,12 @@ impl Request {
 
     /// The length of the body in bytes.
     fn length(&self) -> Result<usize, Refusal> {
-        let is_number = |text: &&str| !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit());
-        let digits = self.header("content-length").filter(is_number);
-        let digits = digits.filter(|_| self.header("transfer-encoding").is_none()).ok_or(NO_LENGTH)?;
-        digits.parse().ok().filter(|length| *length <= LONGEST_BODY).ok_or(TOO_LARGE)
-    }
-
-    /// Checks that the method is the one that is allowed for the path.
-    ///
-    /// # Errors
-    /// Fails with the answer to send.
-    pub(super) fn expect_method(&self, allowed: &str) -> Result<(), Refusal> {
-        let refusal = if allowed == "GET" { NOT_GET } else { NOT_POST };
-        if self.method == allowed { Ok(()) } else { Err(refusal) }
+        let length = self.header("content-length").filter(|_| self.header("transfer-encoding").is_none());
+        match length.map(str::parse) {
+            Some(Ok(length @ ..=LONGEST_BODY)) => Ok(length),
+            Some(Ok(_)) => Err(("413 Content Too Large", "The body is too long.")),
+            _ => Err(("411 Length Required", "The length of the body is not given.")),
+        }
     }
 
     /// Checks that the address in the browser belongs to this machine: another host name may have been made to lead here.
@@ -125,7 +102,8 @@ impl Request {
             _ => host,
         };
         let is_local = ["localhost", "127.0.0.1", "[::1]"].iter().any(|local| name.eq_ignore_ascii_case(local));
-        is_local.then_some(()).ok_or(ELSEWHERE)
+        let sentence = "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.";
+        is_local.then_some(()).ok_or(("403 Forbidden", sentence))
     }
 
     /// Checks that the request comes from the page, and not from a page of another origin in the same browser.
@@ -141,64 +119,60 @@ impl Request {
             (None, Some(origin), Some(host)) => origin.strip_prefix("http://") == Some(host),
             _ => false,
         };
-        (is_json && is_own).then_some(()).ok_or(FOREIGN)
+        (is_json && is_own).then_some(()).ok_or(("403 Forbidden", "Only the page itself may send this."))
     }
 }
 
-/// Reads what has arrived, so that there are at most `most` bytes. Returns false at the end of the stream.
-fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline: Instant) -> Result<bool, Refusal> {
+/// Reads what has arrived, so that there are at most `most` bytes.
+///
+/// # Errors
+/// Fails with the answer to send if nothing arrives any more.
+fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline: Instant) -> Result<(), Refusal> {
+    let late = ("408 Request Timeout", "The request took too long.");
     let left = deadline.saturating_duration_since(Instant::now());
     if left.is_zero() || stream.set_read_timeout(Some(left)).is_err() {
-        return Err(LATE);
+        return Err(late);
     }
     let mut part = [0; 1024];
     let room = part.len().min(most - bytes.len());
     match stream.read(&mut part[..room]) {
-        Ok(count) => {
-            bytes.extend(&part[..count]);
-            Ok(count > 0)
-        }
-        Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(true),
-        Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => Err(LATE),
-        Err(_) => Ok(false),
+        Ok(0) => return Err(MALFORMED),
+        Ok(count) => bytes.extend(&part[..count]),
+        Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+        Err(_) => return Err(late),
     }
+    Ok(())
 }
 
 /// The head of an answer that is not cached, and is not shown inside another page.
-pub(super) fn head(status: &str, more: &[(&str, &str)]) -> String {
+pub(super) fn head(status: &str, more: &[&str]) -> String {
     let always = [
-        ("Cache-Control", "no-store"),
-        ("X-Content-Type-Options", "nosniff"),
-        ("X-Frame-Options", "DENY"),
-        ("Cross-Origin-Resource-Policy", "same-origin"),
-        ("Referrer-Policy", "no-referrer"),
-        ("Connection", "close"),
+        "Cache-Control: no-store",
+        "X-Content-Type-Options: nosniff",
+        "X-Frame-Options: DENY",
+        "Cross-Origin-Resource-Policy: same-origin",
+        "Referrer-Policy: no-referrer",
+        "Connection: close",
     ];
-    let lines = always.iter().chain(more).map(|(name, value)| format!("{name}: {value}\r\n"));
-    format!("HTTP/1.1 {status}\r\n{}\r\n", lines.collect::<String>())
+    format!("HTTP/1.1 {status}\r\n{}\r\n\r\n", [&always, more].concat().join("\r\n"))
 }
 
-/// Answers with a text, if it is not empty.
+/// Answers with a text of this type.
 ///
 /// # Errors
 /// Fails if the other side does not read it.
-pub(super) fn answer(stream: &mut TcpStream, status: &str, more: &[(&str, &str)], text: &str) -> io::Result<()> {
-    let length = text.len().to_string();
-    let mut headers = more.to_vec();
-    if !text.is_empty() {
-        headers.push(("Content-Length", &length));
-    }
-    stream.write_all((head(status, &headers) + text).as_bytes())
+pub(super) fn answer(stream: &mut TcpStream, status: &str, kind: &str, text: &str) -> io::Result<()> {
+    let about = [format!("Content-Length: {}", text.len()), format!("Content-Type: {kind}; charset=utf-8")];
+    stream.write_all((head(status, &about.each_ref().map(String::as_str)) + text).as_bytes())
 }
 
 /// Answers with a refusal. What the other side still sends is read, up to a limit, since a closed connection would lose the answer.
-pub(super) fn refuse(stream: &mut TcpStream, (status, sentence, headers): Refusal) {
-    let headers = [headers, &[("Content-Type", "text/plain; charset=utf-8")]].concat();
-    let sent = answer(stream, status, &headers, &format!("{sentence}\n"));
+pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal) {
+    let sent = answer(stream, status, "text/plain", &format!("{sentence}\n"));
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
         let deadline = Instant::now() + LINGER;
         let mut rest = Vec::new();
-        while rest.len() < MOST_LINGERED && read_some(stream, &mut rest, MOST_LINGERED, deadline) == Ok(true) {}
+        while rest.len() < MOST_LINGERED && read_some(stream, &mut rest, MOST_LINGERED, deadline).is_ok() {}
     }
 }
 

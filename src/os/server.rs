@@ -21,23 +21,15 @@ const KEPT: usize = 64;
 /// The time without an event after which a reader gets an event without news.
 const QUIET: Duration = Duration::from_secs(1);
 
-const NO_PAGE: Refusal = ("404 Not Found", "There is no such page.", &[]);
-const CROWDED: Refusal = ("503 Service Unavailable", "There are too many viewers.", &[]);
-
-/// What a user can do about a port that cannot be opened.
-const OTHER_PORT: &str = "choose another one, or 0 for any free port";
+const CROWDED: &str = "503 Service Unavailable";
 
 /// What happens with the body of a POST to `controls`. An error is a sentence about it.
 pub type OnPost = Box<dyn Fn(&[u8]) -> Result<(), &'static str> + Send + Sync>;
 
 /// A page that is served as long as the program runs.
 pub struct Server {
-    shared: Arc<Shared>,
     /// Its port.
     pub port: u16,
-}
-
-struct Shared {
     page: String,
     on_post: Option<OnPost>,
     news: Mutex<News>,
@@ -51,10 +43,10 @@ struct Shared {
 #[derive(Default)]
 struct News {
     /// The event that each reader gets first, and again where it has missed some.
-    hello: Arc<str>,
+    hello: String,
     /// The number of the first event that is kept.
     first: u64,
-    events: VecDeque<Arc<str>>,
+    events: VecDeque<String>,
 }
 
 impl News {
@@ -70,47 +62,44 @@ impl Server {
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
-    pub fn open(port: u16, page: String, hello: &str, on_post: Option<OnPost>) -> Result<Self> {
-        let cannot = |error| anyhow!("cannot use port {port} of 127.0.0.1: {error}; {OTHER_PORT}");
+    pub fn open(port: u16, page: String, hello: &str, on_post: Option<OnPost>) -> Result<Arc<Self>> {
+        let cannot =
+            |error| anyhow!("cannot use port {port} of 127.0.0.1: {error}; choose another one, or 0 for any free port");
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
         let port = listener.local_addr().map_err(cannot)?.port();
         let news = Mutex::new(News { hello: hello.into(), ..News::default() });
-        let readers = Arc::default();
-        let connections = Arc::default();
-        let shared = Arc::new(Shared { page, on_post, news, readers, connections, changed: Condvar::new() });
-        let own = shared.clone();
-        let accepting = thread::Builder::new().name("server".into());
-        accepting.spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
-        Ok(Self { shared, port })
+        let [readers, connections] = Default::default();
+        let server = Arc::new(Self { port, page, on_post, news, readers, connections, changed: Condvar::new() });
+        let own = server.clone();
+        thread::Builder::new().spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
+        Ok(server)
     }
 
     /// Sets the event that readers get first.
     pub fn greet(&self, hello: &str) {
-        self.shared.news().hello = hello.into();
+        self.news().hello = hello.into();
     }
 
     /// Sends events, each as the protocol writes it, to all readers. Readers that are too late miss them.
     pub fn send(&self, events: &str) {
-        let mut news = self.shared.news();
+        let mut news = self.news();
         news.events.push_back(events.into());
         if news.events.len() > KEPT {
             news.events.pop_front();
             news.first += 1;
         }
-        self.shared.changed.notify_all();
+        self.changed.notify_all();
     }
 
     /// Waits until somebody reads the events, and returns whether it had to.
     pub fn wait_for_reader(&self) -> bool {
-        let is_alone = || Arc::strong_count(&self.shared.readers) == 1;
-        let news = self.shared.news();
+        let is_alone = || Arc::strong_count(&self.readers) == 1;
+        let news = self.news();
         let waits = is_alone();
-        drop(self.shared.changed.wait_while(news, |_| is_alone()));
+        drop(self.changed.wait_while(news, |_| is_alone()));
         waits
     }
-}
 
-impl Shared {
     /// The news. They are consistent even after a panic of a thread that held them.
     fn news(&self) -> MutexGuard<'_, News> {
         self.news.lock().unwrap_or_else(PoisonError::into_inner)
@@ -125,15 +114,14 @@ impl Shared {
             };
             let _ = stream.set_write_timeout(Some(PATIENCE));
             let Some(permit) = self.take_permit(&self.connections, MOST_CONNECTIONS) else {
-                let _ = answer(&mut stream, "503 Service Unavailable", &[], "There are too many connections.\n");
+                let _ = answer(&mut stream, CROWDED, "text/plain", "There are too many connections.\n");
                 continue;
             };
-            let connection = thread::Builder::new().name("connection".into());
-            let shared = self.clone();
+            let server = self.clone();
             // Without a thread, the connection is closed.
-            let _ = connection.spawn(move || {
+            let _ = thread::Builder::new().spawn(move || {
                 let _permit = permit;
-                shared.serve(stream);
+                server.serve(stream);
             });
         }
     }
@@ -149,10 +137,7 @@ impl Shared {
 
     fn serve(&self, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
-        let answered = Request::read(&mut stream).and_then(|request| match request {
-            Some(request) => self.answer(&mut stream, &request),
-            None => Ok(()),
-        });
+        let answered = Request::read(&mut stream).and_then(|request| self.answer(&mut stream, &request));
         if let Err(refusal) = answered {
             refuse(&mut stream, refusal);
         }
@@ -160,30 +145,29 @@ impl Shared {
 
     fn answer(&self, stream: &mut TcpStream, request: &Request) -> Result<(), Refusal> {
         request.expect_local()?;
+        let not_here = "This method is not allowed here.";
         // An error of a write is a reader that has gone, or has read nothing for too long.
-        let _ = match (&*request.path, &self.on_post) {
-            ("/", _) => {
-                request.expect_method("GET")?;
-                answer(stream, "200 OK", &[("Content-Type", "text/html; charset=utf-8")], &self.page)
-            }
-            ("/events", _) => {
-                request.expect_method("GET")?;
-                let _permit = self.take_permit(&self.readers, MOST_READERS).ok_or(CROWDED)?;
+        let _ = match (&*request.method, &*request.path, &self.on_post) {
+            ("GET", "/", _) => answer(stream, "200 OK", "text/html", &self.page),
+            ("GET", "/events", _) => {
+                let permit = self.take_permit(&self.readers, MOST_READERS);
+                let _permit = permit.ok_or((CROWDED, "There are too many viewers."))?;
                 self.send_events(stream)
             }
-            ("/controls", Some(on_post)) => {
-                request.expect_method("POST")?;
+            ("POST", "/controls", Some(on_post)) => {
                 request.expect_own()?;
-                on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence, &[][..]))?;
-                answer(stream, "204 No Content", &[], "")
+                on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
+                stream.write_all(head("204 No Content", &[]).as_bytes())
             }
-            _ => return Err(NO_PAGE),
+            (_, "/" | "/events", _) => return Err(("405 Method Not Allowed\r\nAllow: GET", not_here)),
+            (_, "/controls", Some(_)) => return Err(("405 Method Not Allowed\r\nAllow: POST", not_here)),
+            _ => return Err(("404 Not Found", "There is no such page.")),
         };
         Ok(())
     }
 
     fn send_events(&self, stream: &mut TcpStream) -> std::io::Result<()> {
-        let more = [("Content-Type", "text/event-stream"), ("X-Accel-Buffering", "no")];
+        let more = ["Content-Type: text/event-stream", "X-Accel-Buffering: no"];
         let (mut text, mut next) = {
             let news = self.news();
             (head("200 OK", &more) + &news.hello, news.next())
@@ -193,11 +177,9 @@ impl Shared {
             let waited = self.changed.wait_timeout_while(self.news(), QUIET, |news| news.next() == next);
             let (news, _) = waited.unwrap_or_else(PoisonError::into_inner);
             text = match next.checked_sub(news.first) {
-                Some(old) if old < news.events.len() as u64 => {
-                    news.events.range(old as usize..).map(|e| &**e).collect()
-                }
+                Some(old) if old < news.events.len() as u64 => news.events.range(old as usize..).cloned().collect(),
                 Some(_) => "event: beat\ndata: 1\n\n".to_owned(),
-                None => news.hello.to_string(),
+                None => news.hello.clone(),
             };
             next = news.next();
         }

@@ -41,7 +41,7 @@ pub struct LiveActor {
 /// Hands on a page of this machine.
 pub struct Live {
     columns: Columns,
-    server: Server,
+    server: Arc<Server>,
     sliders: Option<Sliders>,
     key: String,
     /// Control steps from row to row.
