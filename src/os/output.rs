@@ -19,7 +19,7 @@ use super::file::{Cannot, expect_named, read_bytes};
 use super::quoted_path;
 
 /// The prefix of the name of a file that is not complete yet, followed by the process id.
-pub const OUR_PARTIAL: &str = ".shadow-repose-";
+const OUR_PARTIAL: &str = ".shadow-repose-";
 
 /// The age from which an unfinished file is taken for abandoned where there are no locks.
 const LONG_AGO: Duration = Duration::from_secs(24 * 3600);

@@ -31,37 +31,32 @@ pub(super) struct EventFile {
 pub const SETTINGS: &str = "settings";
 
 impl EventFile {
-    /// Creates an event file in `folder` that begins with the `settings` of the run (TOML), as [`EventFile::open`] does.
+    /// Creates an event file in `folder` that begins with the `settings` of the run (TOML), if there are any. TensorBoard reads all
+    /// event files of a folder as one run, in the order of their names. It discards values from earlier files at `first_step` and
+    /// later.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
     pub(super) fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
-        let mut events = Self::open(folder, first_step, tags)?;
-        let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
-        let written = events.summary([(SETTINGS, settings)].into_iter(), first_step);
-        written.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
-    }
-
-    /// Creates an event file in `folder`. TensorBoard reads all event files of a folder as one run, in the order of their names.
-    /// It discards values from earlier files at `first_step` and later.
-    ///
-    /// # Errors
-    /// Fails if the file cannot be written.
-    pub(super) fn open(folder: &Path, first_step: u64, tags: &Descriptions) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
         let seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
         let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
         let file = File::create_new(&path).cannot("create", &path)?;
-        let events = Self { path, file, undescribed: tags.clone() };
-        let begun = events.begin(first_step).and_then(|()| Ok(sync_folder(&events.path)?));
+        let mut events = Self { path, file, undescribed: tags.clone() };
+        let begun = events.begin(first_step, settings);
         begun.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
     }
 
-    fn begin(&self, first_step: u64) -> Result<()> {
+    fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
         self.write(What::file_version("brain.Event:2".into()), 0)?;
         let session = SessionLog { status: SessionLog_SessionStatus::START, ..SessionLog::default() };
-        self.write(What::session_log(session), first_step)
+        self.write(What::session_log(session), first_step)?;
+        if !settings.is_empty() {
+            let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
+            self.summary([(SETTINGS, settings)].into_iter(), first_step)?;
+        }
+        Ok(sync_folder(&self.path)?)
     }
 
     /// Adds the values of one step and flushes. `NaN` values are left out.
@@ -104,7 +99,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written, or was deleted.
-    pub(super) fn sync(&self) -> Result<()> {
+    pub(super) fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         self.file.sync_data().cannot("write", &self.path)
     }

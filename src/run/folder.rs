@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
 use super::hparams::HPARAMS;
-use crate::os::{Cannot, LOCK, Locked, OUR_PARTIAL, is_abandoned, read_text, sync_folder, write_whole};
+use crate::os::{Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, write_whole};
 
 /// The default folder of runs.
 pub(super) const RUNS: &str = "runs/shadow-hand-repose";
@@ -23,8 +23,10 @@ pub(super) const DIVERGED: &str = "diverged";
 const STOP: &str = "stop";
 /// A file with this name says that the training run is not to be continued.
 pub(super) const FINISHED: &str = "finished";
-/// The prefixes of the names of a run's files.
-const OURS: [&str; 11] = [
+/// A file or folder that is not complete yet.
+const PARTIAL: &str = ".shadow-repose-*";
+/// The names of a run's files and folders. A star stands for anything.
+pub(super) const OURS: [&str; 11] = [
     CONFIG,
     VERSION,
     POLICY,
@@ -32,15 +34,24 @@ const OURS: [&str; 11] = [
     METRICS,
     DIVERGED,
     HPARAMS,
-    "metrics.before-",
-    "events.out.",
+    "metrics.before-*.csv",
+    "events.out.*",
     CHECKPOINTS,
-    OUR_PARTIAL,
+    PARTIAL,
 ];
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
 pub(super) const METRICS: &str = "metrics.csv";
+
+/// Whether a name is one of these, in which a star stands for anything.
+pub(super) fn is_one_of(name: &OsStr, patterns: &[&str]) -> bool {
+    let name = name.to_string_lossy();
+    patterns.iter().any(|pattern| match pattern.split_once('*') {
+        Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
+        None => name == *pattern,
+    })
+}
 
 /// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
 #[derive(Clone, Debug)]
@@ -64,25 +75,28 @@ impl RunFolder {
     /// Fails if the folder already holds a run, lies inside one, or cannot be written to.
     pub fn create(path: Option<&Path>, name: Option<&str>) -> Result<(Self, Locked)> {
         let run = Self::at(path.map_or_else(|| create_unused(name), |path| Ok(path.to_owned()))?);
-        run.expect_free(None)?;
+        run.expect_free()?;
         let created = fs::create_dir_all(&run.path).and_then(|()| sync_folder(&run.path));
         created.cannot("create the run folder", &run.path)?;
         let lock = run.lock()?;
         // Another training run may have started and ended in the meantime.
-        run.expect_free(Some(LOCK))?;
+        run.expect_free()?;
         run.checkpoints.create_folder()?;
         let lock = run.claim(lock)?;
         Ok((run, lock))
     }
 
-    /// Checks that the folder contains nothing of a run except the file `but`, and that it does not lie inside a run.
-    fn expect_free(&self, but: Option<&str>) -> Result<()> {
-        let mut names = self.entries()?.into_iter().map(|entry| entry.file_name());
+    /// Checks that the folder contains nothing of a run, and that it does not lie inside a run.
+    fn expect_free(&self) -> Result<()> {
+        let names: Vec<OsString> = self.entries()?.iter().map(DirEntry::file_name).collect();
+        // A training run was killed here before its first checkpoint was complete: the same command may begin again.
+        let is_half_begun = names.iter().all(|name| is_one_of(name, &[LOCK, POLICY, CHECKPOINTS, PARTIAL]))
+            && self.path.join(LOCK).exists()
+            && !self.checkpoints.begun();
         // An unfinished trace does not belong to a run.
-        let of_a_run = |name: &OsString| !name.as_encoded_bytes().starts_with(OUR_PARTIAL.as_bytes());
-        let half_begun = self.is_half_begun()?;
-        let name = names.find(|name| of_a_run(name) && but.is_none_or(|but| name != but));
-        if let Some(name) = name.filter(|_| !half_begun) {
+        if let Some(name) = names.iter().find(|name| !is_one_of(name, &[PARTIAL]))
+            && !is_half_begun
+        {
             bail!(
                 "{} already holds a run, or part of one ({}); resume it, or choose another folder",
                 self.path.display(),
@@ -97,16 +111,6 @@ impl RunFolder {
             ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
         }
         Ok(())
-    }
-
-    /// Whether a training run was killed here before its first checkpoint was complete: the same command may begin again.
-    fn is_half_begun(&self) -> Result<bool> {
-        let early = |name: &OsString| {
-            let begins = [LOCK, POLICY, CHECKPOINTS, OUR_PARTIAL].iter();
-            begins.clone().any(|begin| name.as_encoded_bytes().starts_with(begin.as_bytes()))
-        };
-        let all_early = self.entries()?.iter().all(|entry| early(&entry.file_name()));
-        Ok(all_early && self.path.join(LOCK).exists() && !self.checkpoints.begun())
     }
 
     /// Creates a run folder among the temporary files, for a run whose own folder cannot be written to.
@@ -139,25 +143,19 @@ impl RunFolder {
     /// # Errors
     /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
-        let run = Self::around(place)?;
-        // A folder that may not be listed or entered would look empty.
-        let folder = &run.checkpoints.folder;
-        match fs::read_dir(folder).and_then(|_| fs::metadata(folder.join("."))) {
-            Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", folder)?,
-            _ => {}
-        }
-        Ok(run)
-    }
-
-    fn around(place: &Path) -> Result<Self> {
         ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
         let whole = place.canonicalize().cannot("read", place)?;
         let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
-        let run = folder.and_then(Path::parent).filter(|run| Some(&*Checkpoints::new(run).folder) == folder);
-        match run {
-            Some(run) => Ok(Self::at(run.to_owned())),
-            None if place.is_dir() => Ok(Self::at(place.to_owned())),
+        let run = match folder.filter(|folder| folder.ends_with(CHECKPOINTS)).and_then(Path::parent) {
+            Some(run) => Self::at(run.to_owned()),
+            None if place.is_dir() => Self::at(place.to_owned()),
             None => bail!("{} does not lie in the checkpoints folder of a run", whole.display()),
+        };
+        // A folder that may not be listed or entered would look empty.
+        let folder = &run.checkpoints.folder;
+        match fs::read_dir(folder).and_then(|_| fs::metadata(folder.join("."))) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(error).cannot("read", folder),
+            _ => Ok(run),
         }
     }
 
@@ -167,7 +165,16 @@ impl RunFolder {
     /// # Errors
     /// Fails if another training process uses the folder, if it contains a link, or if it cannot be written to.
     pub fn lock(&self) -> Result<Locked> {
-        self.expect_plain()?;
+        // The folder is untrusted, and will be written to.
+        for entry in self.entries()? {
+            let path = entry.path();
+            let kind = entry.file_type().cannot("read", &path)?;
+            ensure!(
+                kind.is_file() || kind.is_dir(),
+                "{}: neither a file nor a folder; links in a run folder are not followed",
+                path.display()
+            );
+        }
         Locked::acquire(&self.path)
     }
 
@@ -184,34 +191,22 @@ impl RunFolder {
         lock.sign()
     }
 
-    /// Checks that nothing in the folder links out of it: the folder is untrusted, and will be written to.
-    fn expect_plain(&self) -> Result<()> {
-        for entry in self.entries()? {
-            let path = entry.path();
-            let kind = entry.file_type().cannot("read", &path)?;
-            ensure!(
-                kind.is_file() || kind.is_dir(),
-                "{}: neither a file nor a folder; links in a run folder are not followed",
-                path.display()
-            );
-        }
-        Ok(())
-    }
-
     /// The files of the run: files with the names of a run's files, and all in `checkpoints`, `diverged` and `hparams`.
     /// Other files in the folder are left out.
     fn entries(&self) -> Result<Vec<DirEntry>> {
         let mut found = Vec::new();
-        let inner = [DIVERGED, HPARAMS].map(|name| self.path.join(name));
-        let folders = [&[self.path.clone(), self.checkpoints.folder.clone()][..], &inner].concat();
-        for folder in folders.iter().filter(|folder| folder.exists()) {
-            for entry in fs::read_dir(folder).cannot("read", folder)? {
-                found.push(entry.cannot("read", folder)?);
+        for name in ["", CHECKPOINTS, DIVERGED, HPARAMS] {
+            let folder = self.path.join(name);
+            if !folder.exists() {
+                continue;
+            }
+            for entry in fs::read_dir(&folder).cannot("read", &folder)? {
+                let entry = entry.cannot("read", &folder)?;
+                if !name.is_empty() || is_one_of(&entry.file_name(), &OURS) {
+                    found.push(entry);
+                }
             }
         }
-        let begins = |name: &OsStr, begin: &str| name.as_encoded_bytes().starts_with(begin.as_bytes());
-        let ours = |name: &OsStr| OURS.iter().any(|begin| begins(name, begin));
-        found.retain(|entry| entry.path().parent() != Some(&self.path) || ours(&entry.file_name()));
         Ok(found)
     }
 

@@ -47,7 +47,7 @@ pub(super) fn begin(folder: &Path, step: u64, hparams: &Hparams) -> Result<Event
     for (_, old) in event_files(&folder)? {
         fs::remove_file(&old).cannot("remove", &old)?;
     }
-    let events = EventFile::open(&folder, step, &Descriptions::new())?;
+    let events = EventFile::create(&folder, step, &Descriptions::new(), "")?;
     events.values(vec![session_value("session_start_info", 3, &start_info(&hparams.settings)?)?], step)?;
     Ok(events)
 }
@@ -60,11 +60,6 @@ pub(super) fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
         out.write_double(2, now())
     })?;
     Ok(vec![session_value("session_end_info", 4, &info)?])
-}
-
-/// The metrics after an evaluation.
-pub(super) fn metrics(best: f64, drop_rate: f64, steps_per_s: f64) -> [(&'static str, f64); 3] {
-    [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", steps_per_s)]
 }
 
 /// The message `SessionStartInfo`.

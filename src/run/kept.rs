@@ -5,15 +5,11 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use super::checkpoints::CHECKPOINTS;
-use super::folder::{CONFIG, DIVERGED, FINISHED, METRICS, POLICY, RunFolder, VERSION};
+use super::folder::{DIVERGED, FINISHED, OURS, RunFolder, is_one_of};
 use crate::os::{LOCK, final_path, same_file};
 use crate::sim::scene_files;
 
-/// The names of the files that a run keeps in its folder. A star stands for anything.
-const IN_RUN: [&str; 9] =
-    [CONFIG, VERSION, POLICY, LOCK, METRICS, FINISHED, "metrics.before-*.csv", "events.out.*", ".shadow-repose-*"];
-
-/// The same for the folders of its checkpoints and of its dumps.
+/// The names of the files in the folders of the checkpoints and of the dumps of a run. A star stands for anything.
 const INSIDE: [&str; 7] = [
     "iteration-*.safetensors",
     "iteration-*.later",
@@ -37,14 +33,9 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
     let Some(whole) = final_path(path) else { return Ok(()) };
     let Some((folder, name)) = whole.parent().zip(whole.file_name()) else { return Ok(()) };
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let (run, names) = if inside { (folder.parent(), &INSIDE[..]) } else { (Some(folder), &IN_RUN[..]) };
-    let run = RunFolder::at(run.unwrap_or(folder).to_owned());
+    let run = RunFolder::at(folder.parent().filter(|_| inside).unwrap_or(folder).to_owned());
     let is_run = run.checkpoints.begun() || run.path.join(LOCK).exists();
-    let name = name.to_string_lossy();
-    let is_kept = names.iter().any(|kept| match kept.split_once('*') {
-        Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
-        None => name == *kept,
-    });
+    let is_kept = if inside { is_one_of(name, &INSIDE) } else { name == FINISHED || is_one_of(name, &OURS) };
     let place = run.path.display();
     ensure!(!is_run || !is_kept, "{}: the run {place} reserves this file name; choose another name", path.display());
     Ok(())

@@ -24,19 +24,22 @@ const FIXED: [&str; 2] = ["iteration", "env_steps"];
 pub struct Report {
     folder: PathBuf,
     header: String,
-    descriptions: Descriptions,
-    /// The settings of the run, TOML.
-    settings: String,
+    /// The descriptions of all that is logged, for TensorBoard.
+    pub descriptions: Descriptions,
+    /// The settings of the run (TOML), for TensorBoard.
+    pub settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
-    hparams: Hparams,
+    /// The settings and the best evaluation, for TensorBoard.
+    pub hparams: Hparams,
     /// The row of TensorBoard's HPARAMS.
     session: Log<EventFile>,
     /// From the iteration before the first one of the run to the last one that was logged.
     iterations: Range<u64>,
     /// Control steps up to its end.
     env_steps: u64,
-    progress: StatusLine,
+    /// The line on the terminal.
+    pub progress: StatusLine,
 }
 
 /// A log, which has no writer while it cannot be written.
@@ -54,6 +57,16 @@ struct Log<W> {
 impl<W> Log<W> {
     fn new(name: &'static str) -> Self {
         Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
+    }
+
+    /// Opens the log if it is not open. Reports if that fails.
+    fn open(&mut self, progress: &StatusLine, open: impl FnOnce() -> Result<W>) {
+        if self.writer.is_none() {
+            match open() {
+                Ok(writer) => self.writer = Some(writer),
+                Err(error) => self.give_up(progress, 0, &error),
+            }
+        }
     }
 
     /// Writes an iteration if possible. Reports if the log fails or recovers.
@@ -107,45 +120,29 @@ impl Report {
         }
     }
 
-    /// Adds descriptions of all that is logged, the settings of the run (TOML) and its hyperparameters, for TensorBoard.
-    #[must_use]
-    pub fn described(self, descriptions: Descriptions, settings: String, hparams: Hparams) -> Self {
-        Self { descriptions, settings, hparams, ..self }
-    }
-
     /// Opens the logs to continue after these iterations, which ended after `env_steps` steps.
     pub fn open_logs(&mut self, iterations: Range<u64>, env_steps: u64) {
         self.iterations = iterations;
         self.env_steps = env_steps;
-        // A session that ended before its next checkpoint may have logged later steps. These are made again.
-        match cut_off_after(&self.folder, env_steps).and_then(|()| self.open_events()) {
-            Ok(events) => self.events.writer = Some(events),
-            Err(error) => self.events.give_up(&self.progress, 0, &error),
-        }
-        match self.open_metrics() {
-            Ok((metrics, notes)) => {
-                self.metrics.writer = Some(metrics);
-                notes.iter().for_each(|note| self.say(note));
-            }
-            Err(error) => self.metrics.give_up(&self.progress, 0, &error),
-        }
-        match self.begin_session() {
-            Ok(session) => self.session.writer = Some(session),
-            Err(error) => self.session.give_up(&self.progress, 0, &error),
-        }
+        self.open();
     }
 
-    fn begin_session(&self) -> Result<EventFile> {
-        hparams::begin(&self.folder, self.env_steps, &self.hparams)
-    }
-
-    fn open_events(&self) -> Result<EventFile> {
-        let first_step = self.env_steps + u64::from(self.iterations.end > 0);
-        EventFile::create(&self.folder, first_step, &self.descriptions, &self.settings)
-    }
-
-    fn open_metrics(&self) -> Result<(Metrics, Vec<String>)> {
-        Metrics::open(&self.folder.join(METRICS), &self.header, self.iterations.clone())
+    /// Opens the logs that are not open.
+    fn open(&mut self) {
+        let Self { progress, folder, env_steps, iterations, .. } = self;
+        self.events.open(progress, || {
+            // A session that ended before its next checkpoint may have logged later steps. These are made again.
+            cut_off_after(folder, *env_steps)?;
+            let first_step = *env_steps + u64::from(iterations.end > 0);
+            EventFile::create(folder, first_step, &self.descriptions, &self.settings)
+        });
+        let is_first = !self.metrics.failing;
+        self.metrics.open(progress, || {
+            let (metrics, notes) = Metrics::open(&folder.join(METRICS), &self.header, iterations.clone())?;
+            notes.iter().filter(|_| is_first).for_each(|note| progress.say(note));
+            Ok(metrics)
+        });
+        self.session.open(progress, || hparams::begin(folder, *env_steps, &self.hparams));
     }
 
     /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
@@ -170,7 +167,7 @@ impl Report {
             self.hparams.goals = Some(best);
             let drop_rate = values.iter().find(|(name, _)| name.as_ref() == "eval/drop_rate");
             let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
-            let metrics = hparams::metrics(best, drop_rate, status.steps_per_s);
+            let metrics = [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", status.steps_per_s)];
             self.session.write(&self.progress, |events| events.iteration(status.env_steps, &metrics, &[]));
         }
         self.progress.show(status);
@@ -179,13 +176,11 @@ impl Report {
     /// Brings everything that was logged onto the disk, before a checkpoint relies on it. Reopens logs that could not be written.
     pub fn sync(&mut self) {
         self.metrics.sync(&self.progress, Metrics::sync);
-        self.events.sync(&self.progress, |events| events.sync());
-        self.session.sync(&self.progress, |events| events.sync());
+        self.events.sync(&self.progress, EventFile::sync);
+        self.session.sync(&self.progress, EventFile::sync);
         // The whole folder may have been deleted.
         let _ = fs::create_dir_all(&self.folder);
-        self.metrics.writer = self.metrics.writer.take().or_else(|| Some(self.open_metrics().ok()?.0));
-        self.events.writer = self.events.writer.take().or_else(|| self.open_events().ok());
-        self.session.writer = self.session.writer.take().or_else(|| self.begin_session().ok());
+        self.open();
     }
 
     /// Says in the row of TensorBoard's HPARAMS that the run has made all its steps, or has failed.
@@ -199,19 +194,10 @@ impl Report {
         self.progress.end();
         for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
             if lost > 0 {
-                self.warn(&format!("{name} lacks {lost} iterations of this session, which could not be written"));
+                self.progress
+                    .warn(&format!("{name} lacks {lost} iterations of this session, which could not be written"));
             }
         }
-    }
-
-    /// Prints a line above the progress line.
-    pub fn say(&self, line: &str) {
-        self.progress.say(line);
-    }
-
-    /// Prints a warning above the progress line.
-    pub fn warn(&self, text: &str) {
-        self.progress.warn(text);
     }
 }
 

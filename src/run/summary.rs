@@ -24,11 +24,11 @@ pub(super) fn value(tag: &str, content: Content, description: Option<String>) ->
         Content::histo(_) => ("histograms", 2),
         _ => ("text", 2),
     };
-    let Some(description) = description else {
-        return Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
-    };
     let mut value = with_metadata(tag, content, plugin, data_class);
-    value.mut_metadata().set_summary_description(description);
+    match description {
+        Some(description) => value.mut_metadata().set_summary_description(description),
+        None => value.clear_metadata(),
+    }
     value
 }
 

@@ -74,8 +74,10 @@ impl Lead {
         let tags = tags(config.randomization.happens());
         let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
         let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
-        let report = Report::new(&saver.held.folder.path, &tags, progress);
-        let report = report.described(described(&tags), config.to_text(), hparams);
+        let mut report = Report::new(&saver.held.folder.path, &tags, progress);
+        report.descriptions = described(&tags);
+        report.settings = config.to_text();
+        report.hparams = hparams;
         Self { report, saver, quiet, diverged: 0, warned: false, far: 0 }
     }
 
@@ -99,13 +101,13 @@ impl Lead {
         let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
             self.warned = true;
-            self.report.warn(&warning);
+            self.report.progress.warn(&warning);
         }
         let desired_kl = session.config.ppo.desired_kl.at(session.agent.env_steps);
         let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
         self.far = if is_far { self.far.saturating_add(1) } else { 0 };
         if self.far == FAR_FOR {
-            self.report.warn(&format!(
+            self.report.progress.warn(&format!(
                 "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: updates are too \
                  large; lower ppo.learning_rate_range or ppo.learning_rate"
             ));
@@ -182,7 +184,9 @@ impl Duties for Lead {
         let found =
             HEADLINE.map(|column| format!("{} {}", measure(column).label(), measure(column).text(score[column])));
         let episodes = score.episodes;
-        self.report.say(&format!("{env_steps} steps: evaluation of {episodes} episodes: {}", found.join("; ")));
+        self.report
+            .progress
+            .say(&format!("{env_steps} steps: evaluation of {episodes} episodes: {}", found.join("; ")));
     }
 
     fn keep(&mut self, state: Checkpoint) {
@@ -193,7 +197,7 @@ impl Duties for Lead {
         self.saver.open_folder(&mut self.report)?;
         for (name, text) in &outcome.dumps {
             let dumped = self.saver.held.folder.dump(name, text);
-            dumped.unwrap_or_else(|error| self.report.warn(&format!("{error:#}")));
+            dumped.unwrap_or_else(|error| self.report.progress.warn(&format!("{error:#}")));
         }
         self.warn(session, outcome);
         let ended = Ended::new(&outcome.ended, session.config.env.ctrl_dt, session.config.randomization.happens());

@@ -100,7 +100,7 @@ impl Saver {
         let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
             let aside = self.held.folder.checkpoints.put_best_aside()?;
-            report.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
+            report.progress.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
         }
         if !self.from_newest || self.held.folder.checkpoints.newest_first().is_empty() {
             write(&self.held.folder, None, &self.initial, self.held.keep)?;
@@ -155,7 +155,7 @@ impl Saver {
     /// Saves, and prints a warning if that is not possible now.
     pub(super) fn save_or_warn(&mut self, report: &mut Report) {
         if let Err(error) = self.save(report) {
-            report.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
+            report.progress.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
         }
     }
 
