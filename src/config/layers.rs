@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, anyhow, bail};
-use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::overlay::{DEFAULTS, lookup, names_scene, overlay, settings, table_of};
@@ -15,12 +14,6 @@ use crate::os;
 
 /// The key of the only setting that is a path.
 pub const MODEL: &str = "env.model";
-
-/// The keys of `[ppo]` that describe a policy.
-const OF_NETS: [&str; 3] = ["hidden", "activation", "symmetry"];
-
-/// The keys of `[env]` that a player does not take: the sizes of its hand are part of the policy.
-const OF_ITS_SCENE: [&str; 3] = ["num_envs", "num_hand_dofs", "num_actuators"];
 
 /// One `--set key=value`.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,11 +28,11 @@ impl std::str::FromStr for Override {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let parts = text.split_once('=').map(|(key, value)| (key.trim(), value.trim()));
-        let (key, value) = parts
-            .filter(|(key, _)| !key.is_empty())
-            .ok_or_else(|| format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"))?;
-        Ok(Self { key: key.into(), value: value.into() })
+        let parts = text.split_once('=');
+        let parts = parts.map(|(key, value)| Self { key: key.trim().into(), value: value.trim().into() });
+        parts
+            .filter(|parts| !parts.key.is_empty())
+            .ok_or_else(|| format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"))
     }
 }
 
@@ -83,10 +76,12 @@ impl Reader {
         for (section, keys) in &mut table {
             let Value::Table(keys) = keys else { continue };
             keys.retain(|key, value| match &**section {
-                "ppo" => OF_NETS.contains(&key),
+                // What describes a policy.
+                "ppo" => ["hidden", "activation", "symmetry"].contains(&key),
                 _ if self == Self::NewRun => false,
                 "env" if key == "goal_position" => is_kept(value),
-                _ => !OF_ITS_SCENE.contains(&key),
+                // The sizes of its hand are part of the policy.
+                _ => !["num_envs", "num_hand_dofs", "num_actuators"].contains(&key),
             });
             let Self::Player { env_steps } = self else { continue };
             for (_, value) in keys {
@@ -175,7 +170,7 @@ impl Settings {
         let mut scene = BUILTIN_MODEL.to_owned();
         if let Some((source, reader)) = &self.stored {
             let mut table = reader.take(source.table()?, &self.sets);
-            model(&table).clone_into(&mut scene);
+            scene = model(&table).to_owned();
             if let Some(Value::Integer(shards)) = table.get_mut("run").and_then(|run| run.get_mut("shards")) {
                 kept = std::mem::take(shards) as usize;
             }
@@ -225,7 +220,7 @@ impl Layers {
             let (section, key) = name.split_once('.').expect("a key is in a section");
             let mut alone = DEFAULTS.clone();
             alone[section][key] = self.merged[section][key].clone();
-            if let Err(error) = Config::deserialize(Value::Table(alone)) {
+            if let Err(error) = alone.try_into::<Config>() {
                 let value = os::shortened(&self.merged[section][key].to_string());
                 let message = os::shortened(error.message().trim());
                 self.problems.push(format!("{name} = {value}: {message}"));
@@ -236,10 +231,10 @@ impl Layers {
 
     /// The configuration. An error names the file from which it came.
     fn resolve(mut self, origin: Option<Source>) -> Result<Config> {
-        if Config::deserialize(Value::Table(self.merged.clone())).is_err() {
+        if self.merged.clone().try_into::<Config>().is_err() {
             self.replace_nonsense();
         }
-        let mut config = Config::deserialize(Value::Table(self.merged))?;
+        let mut config: Config = self.merged.try_into()?;
         let env = &mut config.env;
         if env.model_file().is_some() && !self.named.contains("randomization.cube_size") {
             config.randomization.cube_size = [1.0; 2];

@@ -120,8 +120,7 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
             Err(rule) => {
                 let number = value.as_float().filter(|x| x.is_finite());
                 let value = number.map_or_else(|| value.to_string(), brief);
-                let [name, value] = [&name, &value].map(|text| shortened(text));
-                problems.push(format!("{name} = {value}: must be {rule}"));
+                problems.push(format!("{} = {}: must be {rule}", shortened(&name), shortened(&value)));
             }
         }
     }
@@ -129,10 +128,11 @@ pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &
 
 /// What a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
 fn inner(expected: &Table, value: &Value) -> Option<Table> {
-    let constant = [("from", value.clone()), ("to", value.clone()), ("steps", 0.into())];
-    let constant = constant.into_iter().map(|(part, value)| (part.to_owned(), value)).collect();
-    let constant = number(value).filter(|_| is_ramp(expected)).map(|_| constant);
-    let mut given = value.as_table().cloned().or(constant)?;
+    if is_ramp(expected) && number(value).is_some() {
+        let parts = [("from", value.clone()), ("to", value.clone()), ("steps", 0.into()), ("after", 0.into())];
+        return Some(parts.into_iter().map(|(part, value)| (part.to_owned(), value)).collect());
+    }
+    let mut given = value.as_table()?.clone();
     // A complete ramp without `after` starts at step 0, even if the default has an `after`. `to_text` relies on this.
     if is_ramp(expected) && ["from", "to", "steps"].iter().all(|part| given.contains_key(*part)) {
         given.entry("after").or_insert(0.into());
@@ -157,7 +157,6 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
             typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
-        (Value::Boolean(_), Value::Boolean(_)) => Ok(value.clone()),
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
             let reason = format!("value = {}", with_zeros(text)).parse::<Table>().err();
@@ -171,7 +170,6 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
 /// What a value in the place of this one must be.
 fn type_of(expected: &Value) -> String {
     let text = match expected {
-        Value::Boolean(_) => "true or false",
         Value::Float(_) => "a number",
         Value::Integer(_) => "a whole number, not negative",
         Value::String(_) => "a string",
@@ -180,8 +178,7 @@ fn type_of(expected: &Value) -> String {
         Value::Table(table) if table.is_empty() => {
             "a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }"
         }
-        Value::Table(_) => "a section with keys",
-        Value::Datetime(_) => "of another type",
+        _ => "a section with keys",
     };
     text.into()
 }
@@ -189,17 +186,19 @@ fn type_of(expected: &Value) -> String {
 fn unknown(name: &str) -> String {
     // Within a section that is known, or a ramp, only what belongs there is suggested.
     let (whole, last) = name.rsplit_once('.').unwrap_or(("", name));
-    let inside = lookup(&DEFAULTS, whole).and_then(Value::as_table);
-    let parts = inside.map(|table| table.keys().map(|key| format!("{whole}.{key}")).collect::<Vec<_>>());
-    let sections = DEFAULTS.keys().filter(|_| whole.is_empty()).cloned();
-    let known = parts.unwrap_or_else(|| sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect());
+    let known: Vec<String> = match lookup(&DEFAULTS, whole) {
+        Some(Value::Table(inside)) => inside.keys().map(|key| format!("{whole}.{key}")).collect(),
+        _ => {
+            let sections = DEFAULTS.keys().filter(|_| whole.is_empty()).cloned();
+            sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect()
+        }
+    };
     let alike = similar(name, known.iter().map(String::as_str), '.');
     let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
     let holds = known.iter().map(String::as_str).find(|key| last.len() > 2 && end(key).contains(last));
     let near = alike.into_iter().find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
-    let nearest = near.or(holds);
-    let hint = nearest.map(|nearest| format!("did you mean {nearest}?"));
-    let hint = hint.unwrap_or_else(|| "configs/repose.toml lists all of them".into());
+    let all = "configs/repose.toml lists all of them";
+    let hint = near.or(holds).map_or(all.into(), |nearest| format!("did you mean {nearest}?"));
     format!("{}: unknown key; {hint}", shortened(name))
 }
 

@@ -26,7 +26,7 @@ impl Ramp {
     /// The ramp that this value of a setting is, unless it is a constant or something else.
     pub(super) fn read(value: &Value) -> Option<Self> {
         // As an array of numbers would also be read.
-        value.is_table().then(|| Self::deserialize(value.clone()).ok()).flatten()
+        value.as_table()?.clone().try_into().ok()
     }
 
     /// A ramp whose value does not change.
@@ -47,11 +47,9 @@ impl Ramp {
 
     /// The fraction of the ramp that is over, from 0 to 1.
     fn fraction(&self, env_steps: u64) -> f64 {
-        match env_steps.checked_sub(self.after) {
-            None => 0.0,
-            Some(_) if self.steps == 0 => 1.0,
-            Some(passed) => (passed as f64 / self.steps as f64).min(1.0),
-        }
+        // Without steps, the quotient is infinite or NaN, of which the minimum is 1.
+        let passed = env_steps.checked_sub(self.after);
+        passed.map_or(0.0, |passed| (passed as f64 / self.steps as f64).min(1.0))
     }
 }
 

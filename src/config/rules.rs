@@ -1,6 +1,7 @@
 //! The rules for valid values.
 
 use std::f64::consts::PI;
+use std::fmt::Display;
 
 use toml::{Table, Value};
 
@@ -76,7 +77,7 @@ pub(super) fn violations(config: &Config) -> Vec<String> {
         }
     }
     for (key, most) in AT_MOST {
-        rules.number(&table, key, |x| x <= *most, &format!("be at most {most}"));
+        rules.number(&table, key, |x| x <= *most, format!("be at most {most}"));
     }
     magnitudes(&table, &mut rules);
     env(config, &mut rules);
@@ -94,10 +95,10 @@ fn magnitudes(table: &Table, rules: &mut Rules) {
         let most = if limited.iter().any(|section| key.starts_with(section)) { LARGEST } else { most };
         let values = floats(value);
         if let Some(&x) = values.iter().find(|x| x.abs() > most) {
-            rules.check(false, &key, brief(x), &format!("be at most {} in magnitude", brief(most)));
+            rules.check(false, &key, brief(x), format!("be at most {} in magnitude", brief(most)));
         }
         if let Some(&x) = values.iter().find(|x| **x != 0.0 && x.abs() < least) {
-            rules.check(false, &key, brief(x), &format!("be 0, or at least {least:e} in magnitude"));
+            rules.check(false, &key, brief(x), format!("be 0, or at least {least:e} in magnitude"));
         }
     }
 }
@@ -128,7 +129,7 @@ fn env(config: &Config, rules: &mut Rules) {
     let place = env.goal_position.value;
     let near = place.iter().all(|x| x.abs() <= FARTHEST);
     let rule = format!("have coordinates of at most {FARTHEST} m");
-    rules.check(near, "env.goal_position", format!("{place:?}"), &rule);
+    rules.check(near, "env.goal_position", format!("{place:?}"), rule);
     let names = |path: &str| path.split('/').all(|name| name.len() <= LONGEST_NAME);
     let is_path =
         |path: &str| (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control);
@@ -136,7 +137,7 @@ fn env(config: &Config, rules: &mut Rules) {
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
     let rule = format!("be a whole multiple of env.sim_dt = {}, at most 10000 times it", env.sim_dt);
-    rules.check(whole || ratio.is_nan() || ratio <= 0.0, "env.ctrl_dt", env.ctrl_dt, &rule);
+    rules.check(whole || ratio.is_nan() || ratio <= 0.0, "env.ctrl_dt", env.ctrl_dt, rule);
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
     let rule = "last between one and 1e9 steps of env.ctrl_dt";
     rules.check((1.0..=1e9).contains(&steps), "env.max_episode_seconds", env.max_episode_seconds, rule);
@@ -160,12 +161,12 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     rules.check(low <= high, "randomization.delay", &range, "be [low, high] with low <= high");
     let steps = if env.max_episode_seconds >= env.ctrl_dt { env.max_episode_steps() } else { u32::MAX };
     let rule = format!("be shorter than an episode, which lasts {steps} steps");
-    rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, &rule);
+    rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, rule);
     let rule = format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
     let longest = env.action_delay.saturating_add(high);
-    rules.check(high == 0 || longest < steps, "randomization.delay", &range, &rule);
+    rules.check(high == 0 || longest < steps, "randomization.delay", &range, rule);
     let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
-    rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, &rule);
+    rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, rule);
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
@@ -189,7 +190,7 @@ fn learning(config: &Config, rules: &mut Rules) {
     let parts = ppo.minibatches;
     // A number of 0 is reported elsewhere.
     let divides = parts == 0 || samples.is_multiple_of(parts);
-    rules.check(divides, "ppo.minibatches", parts, &format!("divide num_envs * horizon = {samples}"));
+    rules.check(divides, "ppo.minibatches", parts, format!("divide num_envs * horizon = {samples}"));
     let shards = config.run.shards;
     let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
@@ -204,7 +205,7 @@ fn learning(config: &Config, rules: &mut Rules) {
     rules.check(!fixed || kl.from == kl.to, "ppo.desired_kl", kl, "be above 0 at both ends, or 0 throughout");
     let within = fixed || (low..=high).contains(&ppo.learning_rate);
     let rule = format!("lie in ppo.learning_rate_range = {range} unless ppo.desired_kl = 0");
-    rules.check(within, "ppo.learning_rate", ppo.learning_rate, &rule);
+    rules.check(within, "ppo.learning_rate", ppo.learning_rate, rule);
     rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "be [low, high] with 0 < low <= high");
     let [near, far] = ppo.away_range;
     let range = format!("[{near}, {far}]");
@@ -216,14 +217,14 @@ fn learning(config: &Config, rules: &mut Rules) {
 struct Rules(Vec<String>);
 
 impl Rules {
-    fn check(&mut self, holds: bool, key: &str, value: impl std::fmt::Display, rule: &str) {
+    fn check(&mut self, holds: bool, key: &str, value: impl Display, rule: impl Display) {
         if !holds {
             self.0.push(format!("{} = {}: must {rule}", shortened(key), shortened(&value.to_string())));
         }
     }
 
     /// Checks a number, both ends of a ramp, or the numbers of all groups.
-    fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: &str) {
+    fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: impl Display) {
         let value = lookup(table, key).expect("a setting");
         let numbers = match value.as_table() {
             // The other parts of a ramp are counts of steps.
@@ -235,7 +236,7 @@ impl Rules {
         };
         for (name, value) in numbers {
             let x = number(value).expect("a number");
-            self.check(holds(x), &name, brief(x), rule);
+            self.check(holds(x), &name, brief(x), &rule);
         }
     }
 }
