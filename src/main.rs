@@ -12,7 +12,7 @@ use shadow_repose::train::train;
 use shadow_repose::{bench, export, manual, os, play, plot, ranks, runs, view};
 
 fn main() -> ExitCode {
-    let command = match cli::parse() {
+    let command = match cli::parse_from(std::env::args_os()) {
         Ok(cli) => cli.command,
         Err(answer) => return tell(&answer),
     };

@@ -8,7 +8,7 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::builder::{PossibleValuesParser, RangedU64ValueParser};
+use clap::builder::PossibleValuesParser;
 use clap::error::ErrorKind;
 use clap::{ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 
@@ -20,12 +20,7 @@ use crate::sim::{self, Camera, Quality};
 pub use results::{Along, PlotArgs, RunsArgs};
 use together::given;
 pub use together::{Made, expect_together};
-use values::{LARGEST, camera, destination, quality, seconds, size, steps, time};
-
-/// Parses a number of threads, within the limits of `run.threads`.
-fn threads() -> RangedU64ValueParser<usize> {
-    RangedU64ValueParser::new().range(0..=4096)
-}
+use values::{camera, count, destination, quality, seconds, seed, size, steps, threads, time};
 
 // The groups of options in the help.
 const SETTINGS: &str = "Settings";
@@ -106,36 +101,18 @@ pub fn command() -> clap::Command {
         let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
         arg.help(defaults.iter().fold(help, |help, (key, value)| help.replace(key, value)))
     };
-    without_defaults().mut_subcommands(|command| command.mut_args(with_defaults))
-}
-
-/// Builds the command line without the defaults that come from settings, which are slow to load.
-fn without_defaults() -> clap::Command {
     let program = env!("CARGO_PKG_VERSION");
     let commit = env!("SHADOW_REPOSE_COMMIT");
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
-    Cli::command().version(version)
-}
-
-/// Parses the command line of this process.
-///
-/// # Errors
-/// Fails if the command line is wrong, or asks for help or the version.
-pub fn parse() -> Result<Cli, clap::Error> {
-    parse_from(std::env::args_os())
+    Cli::command().version(version).mut_subcommands(|command| command.mut_args(with_defaults))
 }
 
 /// Parses a command line, which begins with the name of the program.
 ///
 /// # Errors
-/// Fails as [`parse`] does.
+/// Fails if the command line is wrong, or asks for help or the version.
 pub fn parse_from<T: Into<OsString> + Clone>(words: impl IntoIterator<Item = T>) -> Result<Cli, clap::Error> {
-    let words: Vec<OsString> = words.into_iter().map(Into::into).collect();
-    let parsed = without_defaults().try_get_matches_from(&words);
-    let matches = parsed.map_err(|answer| match answer.kind() {
-        ErrorKind::DisplayHelp => command().try_get_matches_from(&words).err().unwrap_or(answer),
-        _ => answer,
-    })?;
+    let matches = command().try_get_matches_from(words)?;
     let mut cli = Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command()))?;
     let given = given(&matches);
     match &mut cli.command {
@@ -164,7 +141,7 @@ pub struct TrainArgs {
     #[command(flatten)]
     pub settings: SettingArgs,
     /// Random seed of the run [default: {seed}]
-    #[arg(long, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
+    #[arg(long, value_parser = seed(), help_heading = SETTINGS)]
     pub seed: Option<u64>,
     /// Number of worker threads; 0: one per core [default: {threads}]
     #[arg(long, value_name = "N", value_parser = threads(), help_heading = SETTINGS)]
@@ -190,7 +167,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN|CHECKPOINT", conflicts_with_all = ["resume", "init"], help_heading = START)]
     pub fork: Option<PathBuf>,
     /// Number of newest checkpoints to keep [default: 2, or the number in a resumed run if larger]
-    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000), help_heading = RUN_FOLDER)]
+    #[arg(long, value_name = "N", value_parser = count(), help_heading = RUN_FOLDER)]
     pub keep: Option<usize>,
     /// Save and exit with code 0 after this time, e.g. 3h50m
     #[arg(long, value_name = "TIME", value_parser = time)]
@@ -214,7 +191,7 @@ pub struct PlayArgs {
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000), help_heading = TASK)]
     pub episodes: Option<u64>,
     /// Random seed; episode k is drawn from (seed, k)
-    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = TASK)]
+    #[arg(long, default_value_t = 0, value_parser = seed(), help_heading = TASK)]
     pub seed: u64,
     /// Number of worker threads; 0: one per core
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = threads())]
@@ -296,7 +273,7 @@ pub struct ViewArgs {
         help_heading = SETTINGS)]
     pub actions: String,
     /// Random seed; episode k is drawn from (seed, k)
-    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=LARGEST), help_heading = SETTINGS)]
+    #[arg(long, default_value_t = 0, value_parser = seed(), help_heading = SETTINGS)]
     pub seed: u64,
     /// Write one picture (.png) and exit, without opening a window; needs no display
     #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = PICTURE)]

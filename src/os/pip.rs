@@ -51,10 +51,8 @@ fn sources(folder: &Path) -> Vec<(String, String)> {
         // One line is `section.name='value'`. A value for this command alone takes precedence.
         let of = |section: &str| {
             let key = format!("{section}.{name}=");
-            listed
-                .lines()
-                .find_map(|line| line.strip_prefix(&key))
-                .map(|value| value.trim_matches(['\'', '"']).to_owned())
+            let value = listed.lines().find_map(|line| line.strip_prefix(&key));
+            value.map(|value| value.trim_matches(['\'', '"']))
         };
         // Several values are separated by line feeds, which are shown escaped.
         of("download").or_else(|| of("global")).map(|value| value.replace("\\n", " ").trim().to_owned())

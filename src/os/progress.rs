@@ -1,12 +1,11 @@
 //! Progress on the terminal: a line that is redrawn in place, or plain lines if that is impossible.
 
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use console::Term;
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-use super::{number, say, say_line};
+use super::{is_terminal, number, say, say_line};
 
 /// The time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -51,7 +50,7 @@ impl StatusLine {
     pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
         // A line can be redrawn in place on a terminal that is wide enough.
         let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
-        let bar = (!quiet && std::io::stderr().is_terminal() && !is_dumb() && wide).then(|| {
+        let bar = (!quiet && is_terminal() && !is_dumb() && wide).then(|| {
             // Cuts off what does not fit, even after the terminal is resized.
             let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
             let bar = ProgressBar::no_length().with_style(style);

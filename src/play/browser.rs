@@ -60,13 +60,13 @@ impl Followed {
         PolicySource::find(&place).context(needs)?;
         let run = RunFolder::containing(&place).context(needs)?;
         let path = run.checkpoints.latest();
-        Ok(Self { stamp: Stamp::of(&path), run, path })
+        Ok(Self { stamp: os::stamp(&path), run, path })
     }
 
     /// Whether the file has changed since the last call.
     fn has_changed(&mut self) -> bool {
         let before = self.stamp;
-        self.stamp = Stamp::of(&self.path);
+        self.stamp = os::stamp(&self.path);
         self.stamp != before
     }
 }

@@ -1,6 +1,6 @@
 //! Reading `metrics.csv`, for charts. Any file may be given: sizes are bounded, and messages quote little of it.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -57,14 +57,14 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
         bail!("{} has no column {column}; it has {}", path.display(), shortened(&header));
     }
     let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
-    let places: Vec<usize> = BTreeSet::from_iter(asked.flatten()).into_iter().collect();
+    let places: Vec<usize> = asked.flatten().collect();
     let columns = read_columns(reader, &path, &places, names.len())?;
     let columns = places.iter().map(|&place| names[place].to_owned()).zip(columns).collect();
     let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
     Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
 }
 
-/// Reads the cells at these places, in rising order, of all rows of `path` that have this number of cells.
+/// Reads the cells at these places of all rows of `path` that have this number of cells.
 fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: usize) -> Result<Vec<Vec<f64>>> {
     let mut columns = vec![Vec::new(); places.len()];
     let mut line = Vec::new();
@@ -72,9 +72,13 @@ fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: 
     while next_row(&mut reader, &mut line).cannot("read", path)? > 0 {
         row += 1;
         ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
+        let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
         // Skips incomplete rows: the last row of a run in progress may be one.
-        let Some(cells) = cells(line.trim_ascii_end(), places, count) else { continue };
-        for (column, cell) in columns.iter_mut().zip(cells) {
+        if cells.len() != count {
+            continue;
+        }
+        for (column, &place) in columns.iter_mut().zip(places) {
+            let cell = cells[place];
             column.push(number(cell).with_context(|| {
                 let cell = String::from_utf8_lossy(cell);
                 format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell))
@@ -82,37 +86,6 @@ fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: 
         }
     }
     Ok(columns)
-}
-
-/// The cells at these places of a row, in rising order, or `None` if it does not have this number of cells.
-fn cells<'a>(row: &'a [u8], places: &[usize], count: usize) -> Option<Vec<&'a [u8]>> {
-    let mut rest = row;
-    let mut first = 0;
-    let mut found = Vec::with_capacity(places.len());
-    for &place in places {
-        rest = after_commas(rest, place - first)?;
-        first = place;
-        found.push(rest.split(|&byte| byte == b',').next().unwrap_or_default());
-    }
-    let left = count.checked_sub(first + 1)?;
-    let is_last = after_commas(rest, left).is_some() && after_commas(rest, left + 1).is_none();
-    is_last.then_some(found)
-}
-
-/// What follows this number of commas, if there are as many. Most of a long row is counted in chunks, a few
-/// instructions each.
-fn after_commas(row: &[u8], mut count: usize) -> Option<&[u8]> {
-    let mut begin = 0;
-    for chunk in row.as_chunks::<32>().0 {
-        let commas: u8 = chunk.iter().map(|&byte| u8::from(byte == b',')).sum();
-        if usize::from(commas) >= count {
-            break;
-        }
-        begin += chunk.len();
-        count -= usize::from(commas);
-    }
-    let commas = row[begin..].iter().enumerate().filter(|(_, byte)| **byte == b',').map(|(at, _)| begin + at + 1);
-    [0].into_iter().chain(commas).nth(count).map(|after| &row[after..])
 }
 
 /// The number in a cell, NaN where there is none or it cannot be drawn.
@@ -150,24 +123,6 @@ mod tests {
         assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(), 2);
         let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
         assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
-    }
-
-    #[test]
-    fn cells_are_found_by_their_place_in_rows_of_any_length() {
-        for width in [0, 1, 2, 31, 32, 33] {
-            let of = |place: usize| format!("{place}{}", "x".repeat(width * (place % 3)));
-            let row = (0..70).map(of).collect::<Vec<_>>().join(",");
-            for places in [&[0, 1, 69][..], &[3, 40], &[68], &[]] {
-                let expected: Vec<String> = places.iter().map(|place| of(*place)).collect();
-                assert_eq!(
-                    cells(row.as_bytes(), places, 70).unwrap(),
-                    expected.iter().map(String::as_bytes).collect::<Vec<_>>()
-                );
-                assert!([1, 69, 71].iter().all(|count| cells(row.as_bytes(), places, *count).is_none()), "{places:?}");
-            }
-        }
-        assert_eq!(cells(b"", &[0], 1), Some(vec![&b""[..]]));
-        assert_eq!(cells(b",,", &[0, 2], 3), Some(vec![&b""[..]; 2]));
     }
 
     #[test]

@@ -75,7 +75,7 @@ impl Run {
             Ok(config) => (config, None),
             Err(error) => (None, Some(format!("config.toml does not fit this version: {error:#}"))),
         };
-        let stamp = glance.metrics.as_deref().and_then(Stamp::of);
+        let stamp = glance.metrics.as_deref().and_then(os::stamp);
         let figures = match known.filter(|known| known.stamp == stamp) {
             Some(known) => (*known).clone(),
             None => Figures { stamp, ..Figures::of(path, glance.metrics.is_some()) },
