@@ -39,7 +39,7 @@ macro_rules! examples {
 }
 
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
-#[derive(Debug, Parser)]
+#[derive(Parser)]
 #[command(arg_required_else_help = true, disable_help_flag = true, max_term_width = 100)]
 #[command(after_help = examples!("play --ckpt builtin", "train"))]
 pub struct Cli {
@@ -52,7 +52,7 @@ pub struct Cli {
 }
 
 /// The commands of the program.
-#[derive(Debug, Subcommand)]
+#[derive(Subcommand)]
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
     #[command(after_help = examples!("train --seed 1 --name first", "train --resume"))]
@@ -124,7 +124,7 @@ pub fn parse_from<T: Into<OsString> + Clone>(words: impl IntoIterator<Item = T>)
 }
 
 /// The options that change settings.
-#[derive(Args, Debug, Default)]
+#[derive(Args, Default)]
 pub struct SettingArgs {
     /// TOML file with the settings that differ from the defaults
     #[arg(long, value_name = "FILE", help_heading = SETTINGS)]
@@ -135,7 +135,7 @@ pub struct SettingArgs {
 }
 
 /// The options of `train`.
-#[derive(Args, Debug, Default)]
+#[derive(Args, Default)]
 pub struct TrainArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
@@ -181,7 +181,7 @@ pub struct TrainArgs {
 }
 
 /// The options of `play`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct PlayArgs {
     /// Who acts: a checkpoint, a run folder (its best checkpoint, else its latest), a built-in policy (builtin, or robust for other
     /// physics and delays), or actions without a policy (zero, random, wave) [default: the newest run, or builtin if there is none]
@@ -248,7 +248,7 @@ pub struct PlayArgs {
 }
 
 /// The options of `export`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct ExportArgs {
     /// Policy to export: a checkpoint, a run folder (its best checkpoint, else its latest), or a built-in policy:
     /// builtin, or robust for other physics and delays [default: the newest run, or builtin if there is none]
@@ -263,7 +263,7 @@ pub struct ExportArgs {
 }
 
 /// The options of `view`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct ViewArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
@@ -301,7 +301,7 @@ pub struct ViewArgs {
 }
 
 /// The options for what is seen.
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone)]
 pub struct ShotArgs {
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]
@@ -333,7 +333,7 @@ pub fn usage_error(name: &str, text: &str) -> clap::Error {
 }
 
 /// The options of `bench`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct BenchArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
@@ -350,7 +350,7 @@ pub struct BenchArgs {
 }
 
 /// A part of the benchmark.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
 pub enum Part {
     /// Bare physics, and the environments around it
     Physics,

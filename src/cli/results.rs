@@ -8,7 +8,7 @@ use super::values::{count, destination, size};
 use crate::os::Destination;
 
 /// The options of `plot`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct PlotArgs {
     /// Run folders, or tables such as their metrics.csv
     #[arg(required = true, value_name = "RUN")]
@@ -36,7 +36,7 @@ pub struct PlotArgs {
 }
 
 /// The quantity on the x axis of a learning curve.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
 pub enum Along {
     /// Control steps over all environments
     Steps,
@@ -45,7 +45,7 @@ pub enum Along {
 }
 
 /// The options of `runs`.
-#[derive(Args, Debug)]
+#[derive(Args)]
 pub struct RunsArgs {
     /// Folder of runs to list, or single runs: two are compared, any other number is listed [default: runs/shadow-hand-repose]
     #[arg(value_name = "DIR|RUN")]

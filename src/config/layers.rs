@@ -46,7 +46,7 @@ pub struct Source {
 }
 
 /// Who reads the settings that a run has written, which decides what is taken from them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq)]
 pub enum Reader {
     /// The run itself, or a fork of it: everything. The number of shards is kept if it still fits.
     Run,
@@ -124,13 +124,11 @@ impl Settings {
     }
 
     /// Adds what a run has written, as this reader takes it. Settings that did not exist then have their defaults.
-    #[must_use]
     pub fn stored(self, stored: Source, reader: Reader) -> Self {
         Self { stored: Some((stored, reader)), ..self }
     }
 
     /// Adds a file that the user trusts.
-    #[must_use]
     pub fn file(self, file: Source) -> Self {
         Self { file: Some(file), ..self }
     }
@@ -154,7 +152,6 @@ impl Settings {
     }
 
     /// Adds single settings.
-    #[must_use]
     pub fn sets(self, sets: &[Override]) -> Self {
         Self { sets: sets.to_vec(), ..self }
     }

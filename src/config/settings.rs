@@ -102,7 +102,7 @@ impl<T: PartialEq> PartialEq for OfScene<T> {
 pub type ByGroup = BTreeMap<String, f64>;
 
 /// The effect of a step outside the tolerance on the counter of steps within it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SuccessHold {
     /// The counter stays unchanged.
@@ -175,7 +175,7 @@ pub struct PpoConfig {
 }
 
 /// The activation function after each hidden layer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
     Elu,
@@ -184,7 +184,7 @@ pub enum Activation {
 }
 
 /// The states that a policy treats as the same.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Symmetry {
     /// None.
@@ -196,7 +196,7 @@ pub enum Symmetry {
 }
 
 /// The implementation that computes the gradients.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
     /// Our own kernels.
@@ -206,7 +206,7 @@ pub enum Backend {
 }
 
 /// The number format of the matrix products in the nets while learning and collecting. Everything else is `f32`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// `f32`.
@@ -231,7 +231,7 @@ pub struct RunConfig {
 }
 
 /// The settings of a learner that are part of its policy.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, PartialEq, Serialize)]
 pub struct NetConfig {
     /// The sizes of the hidden layers, the same for actor and critic.
     pub hidden: Vec<usize>,
@@ -302,7 +302,6 @@ impl RandomizationConfig {
 
 impl EnvConfig {
     /// The task after `env_steps` control steps of a run: actions are smoothed as much as training has come to smooth them.
-    #[must_use]
     pub fn at(&self, env_steps: u64) -> Self {
         let act_moving_average = Ramp::constant(self.act_moving_average.at(env_steps));
         Self { act_moving_average, ..self.clone() }

@@ -16,7 +16,6 @@ const LINGER: Duration = Duration::from_millis(500);
 const MOST_LINGERED: usize = 1 << 16;
 
 /// A request whose head and body have arrived whole.
-#[derive(Debug)]
 pub(super) struct Request {
     pub(super) method: String,
     /// Without the part from a question mark on.

@@ -25,7 +25,7 @@ const ONE_REQUEST: Duration = Duration::from_secs(1);
 const ONE_KEY: Duration = Duration::from_millis(200);
 
 /// The requests since the program began to listen.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Requests {
     since: Instant,
     /// Whether the program ends by itself after the first request to stop. Until this is set, a request ends it at once.

@@ -42,14 +42,7 @@ pub struct Locked {
     path: PathBuf,
     file: File,
     /// Without locks: as long as this lives, the lock file is renewed.
-    _renewal: Option<Renewal>,
-}
-
-/// The renewal of a lock file.
-#[derive(Debug)]
-struct Renewal {
-    path: PathBuf,
-    _lives: Arc<()>,
+    renewal: Option<Arc<()>>,
 }
 
 impl Locked {
@@ -69,10 +62,10 @@ impl Locked {
                 Err(TryLockError::WouldBlock) if pauses.next().is_some() => thread::sleep(PAUSE),
                 Err(TryLockError::WouldBlock) => bail!(in_use(folder, &path)),
                 // Some network file systems do not support locks.
-                Err(TryLockError::Error(_)) => break Some(Renewal::begin(folder, path.clone())?),
+                Err(TryLockError::Error(_)) => break Some(renew(folder, &path)?),
             }
         };
-        Ok(Self { path, file, _renewal: renewal })
+        Ok(Self { path, file, renewal })
     }
 
     /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
@@ -115,51 +108,49 @@ impl Locked {
     }
 }
 
-impl Renewal {
-    /// Writes this program's name into the lock file, and renews it from now on.
-    ///
-    /// # Errors
-    /// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
-    fn begin(folder: &Path, path: PathBuf) -> Result<Self> {
-        let renewed = fs::metadata(&path).and_then(|facts| facts.modified()).cannot("read", &path)?;
-        let age = renewed.elapsed().unwrap_or_default();
-        ensure!(
-            holder(&path).is_empty() || age > LAPSED,
-            "{}, or was {} s ago; there are no file locks here, so try again when {LOCK} is a minute old",
-            in_use(folder, &path),
-            age.as_secs()
-        );
-        let own = name();
-        fs::write(&path, &own).cannot("write", &path)?;
-        thread::sleep(SETTLED);
-        ensure!(holder(&path) == own, in_use(folder, &path));
-        say!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display());
-        let file = path.clone();
-        let lives = Arc::new(());
-        let alive = Arc::downgrade(&lives);
-        let renew = move || {
-            while alive.strong_count() > 0 {
-                set_time(&file, SystemTime::now());
-                thread::sleep(RENEWED_EVERY);
-            }
-        };
-        thread::Builder::new().name("lock".into()).spawn(renew).context("cannot start a thread for the lock")?;
-        Ok(Self { path, _lives: lives })
-    }
-}
-
-impl Drop for Renewal {
+impl Drop for Locked {
     fn drop(&mut self) {
         // The next training need not wait, unless the file belongs to another one by now. The name stays, as in a file
         // that was locked.
-        if holder(&self.path) == name() {
+        if self.renewal.is_some() && holder(&self.path) == name() {
             set_time(&self.path, UNIX_EPOCH);
         }
     }
 }
 
+/// Writes this program's name into the lock file, and renews it from now on, as long as the result lives.
+///
+/// # Errors
+/// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
+fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
+    let renewed = fs::metadata(path).and_then(|facts| facts.modified()).cannot("read", path)?;
+    let age = renewed.elapsed().unwrap_or_default();
+    ensure!(
+        holder(path).is_empty() || age > LAPSED,
+        "{}, or was {} s ago; there are no file locks here, so try again when {LOCK} is a minute old",
+        in_use(folder, path),
+        age.as_secs()
+    );
+    let own = name();
+    fs::write(path, &own).cannot("write", path)?;
+    thread::sleep(SETTLED);
+    ensure!(holder(path) == own, in_use(folder, path));
+    say!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display());
+    let file = path.to_owned();
+    let lives = Arc::new(());
+    let alive = Arc::downgrade(&lives);
+    let renew = move || {
+        while alive.strong_count() > 0 {
+            set_time(&file, SystemTime::now());
+            thread::sleep(RENEWED_EVERY);
+        }
+    };
+    thread::Builder::new().name("lock".into()).spawn(renew).context("cannot start a thread for the lock")?;
+    Ok(lives)
+}
+
 /// What the lock file of a run folder shows to a reader.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Hold {
     /// A training run holds it.
     Held,
@@ -256,15 +247,15 @@ mod tests {
         fs::write(&path, "").unwrap();
         fs::hard_link(&path, place.path().join("copy")).unwrap();
         let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
-        let renewal = Some(Renewal::begin(place.path(), path.clone()).unwrap());
-        let lock = Locked { path: path.clone(), file, _renewal: renewal }.sign().unwrap();
+        let renewal = Some(renew(place.path(), &path).unwrap());
+        let lock = Locked { path: path.clone(), file, renewal }.sign().unwrap();
         assert_eq!(holder(&path), name());
         drop(lock);
         assert_eq!(holder(&path), name(), "it has failed");
         // The next one need not wait.
         let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
-        let renewal = Some(Renewal::begin(place.path(), path.clone()).unwrap());
-        let lock = Locked { path: path.clone(), file, _renewal: renewal }.sign().unwrap();
+        let renewal = Some(renew(place.path(), &path).unwrap());
+        let lock = Locked { path: path.clone(), file, renewal }.sign().unwrap();
         fs::write(&path, ": process 1 on another").unwrap();
         drop(lock);
         assert_eq!(holder(&path), ": process 1 on another");

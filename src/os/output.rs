@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use std::collections::hash_map::RandomState;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::hash::{BuildHasher, Hasher};
-use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
+use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -101,7 +101,8 @@ pub fn is_abandoned(entry: &DirEntry) -> bool {
 pub struct OutputFile {
     /// The path as the user gave it.
     pub path: PathBuf,
-    file: File,
+    /// Where the content is written.
+    pub file: File,
     /// The temporary name and the final one.
     names: Option<(Unfinished, PathBuf)>,
 }
@@ -168,7 +169,7 @@ impl OutputFile {
         self.complete()
     }
 
-    /// Gives the file its final name, after its content was written through [`std::io::Write`].
+    /// Gives the file its final name, after its content was written.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
@@ -226,7 +227,7 @@ pub fn put_aside(path: &Path, extension: &str) -> io::Result<PathBuf> {
 }
 
 /// The first of `path` and its numbered variants that does not exist yet.
-fn unused_name(path: &Path) -> PathBuf {
+pub fn unused_name(path: &Path) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
     let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
@@ -262,22 +263,6 @@ fn end_of_links(path: &Path) -> io::Result<PathBuf> {
         }
     }
     Err(io::Error::other("too many levels of symbolic links"))
-}
-
-impl Write for OutputFile {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.file.write(bytes)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.file.flush()
-    }
-}
-
-impl Seek for OutputFile {
-    fn seek(&mut self, place: SeekFrom) -> io::Result<u64> {
-        self.file.seek(place)
-    }
 }
 
 #[cfg(test)]

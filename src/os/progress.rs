@@ -17,7 +17,7 @@ const SHOWN_SHARE: f64 = 0.1;
 const NARROWEST: usize = 60;
 
 /// The values shown for an iteration, `NaN` if unknown.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Status {
     /// Control steps so far.
     pub env_steps: u64,

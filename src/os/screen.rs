@@ -7,7 +7,7 @@ use super::progress::is_dumb;
 use super::terminal::is_read;
 
 /// The screen that shows a table. Where stdout is no terminal, lines are not cut, and follow the earlier ones.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Screen {
     /// The number of lines that were shown last.
     shown: Option<usize>,

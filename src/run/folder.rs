@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
 use super::hparams::HPARAMS;
-use crate::os::{Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, write_whole};
+use crate::os::{Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, unused_name, write_whole};
 
 /// The default folder of runs.
 pub(super) const RUNS: &str = "runs/shadow-hand-repose";
@@ -302,15 +302,14 @@ fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     fs::create_dir_all(RUNS).cannot("create the folder of runs", Path::new(RUNS))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
     let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
-    for attempt in 1.. {
-        let again = if attempt == 1 { String::new() } else { format!("-{attempt}") };
-        let path = Path::new(RUNS).join(format!("{time}{suffix}{again}"));
+    let path = Path::new(RUNS).join(format!("{time}{suffix}"));
+    loop {
+        let path = unused_name(&path);
         match fs::create_dir(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
             created => return created.cannot("create the run folder", &path).map(|()| path),
         }
     }
-    unreachable!("the number of attempts is unlimited")
 }
 
 #[cfg(test)]

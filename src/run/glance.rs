@@ -6,11 +6,12 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result, ensure};
 
+use super::checkpoints::modified;
 use super::folder::{CONFIG, FINISHED, METRICS, RUNS};
 use crate::os::{Cannot, Hold, LOCK};
 
 /// The files of a run.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Glance {
     /// When its settings were written or, without settings, when its folder was last changed.
     pub begun: Option<SystemTime>,
@@ -36,9 +37,8 @@ impl Glance {
         if config.is_none() && metrics.is_none() && lock.is_none() {
             return None;
         }
-        let changed = || fs::metadata(folder).and_then(|facts| facts.modified()).ok();
         Some(Self {
-            begun: written(&config).or_else(changed),
+            begun: written(&config).or_else(|| modified(folder)),
             hold: Hold::of(folder),
             // A file with content is the user's.
             is_marked: mark.is_some_and(|facts| facts.len() == 0),

@@ -26,7 +26,7 @@ pub(super) const HPARAMS: &str = "hparams";
 const TENSOR: u32 = 2;
 
 /// What is known of a run before it goes on.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Hparams {
     /// The settings to show, by dotted key.
     pub settings: Table,

@@ -2,7 +2,7 @@
 //!
 //! Rows after the checkpoint that is resumed from are cut off, so that no row is missing or duplicated.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -48,12 +48,12 @@ impl Metrics {
         if found.dropped > 0 {
             notes.push(format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
         }
-        if found.kept < expected && fs::metadata(path).map_or(true, |facts| facts.is_file()) {
+        make_own(path).cannot("write", path)?;
+        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).cannot("write", path)?;
+        if found.kept < expected && path.is_file() {
             let lacking = expected - found.kept;
             notes.push(format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
         }
-        make_own(path).cannot("write", path)?;
-        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).cannot("write", path)?;
         let mut metrics = Self { path: path.to_owned(), file, length: found.length };
         metrics.repair().cannot("write", path)?;
         if found.length == 0 {
@@ -143,6 +143,8 @@ pub(super) fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io:
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn table(rows: &str) -> (tempfile::TempDir, PathBuf) {

@@ -1,14 +1,13 @@
 //! GIF: one palette for the whole film. Each frame holds only what differs from the previous one.
 
 use std::borrow::Cow;
-use std::io::BufWriter;
+use std::io::{BufWriter, Write};
 
-use anyhow::{Result, anyhow};
+use anyhow::Result;
 use color_quant::NeuQuant;
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
 use super::format::{FilmFormat, Frames};
-use crate::os::OutputFile;
 
 /// The number of colours in the palette. The index after them leaves a pixel unchanged.
 const COLOURS: usize = 255;
@@ -18,11 +17,11 @@ const BYTES_FOR_PALETTE: usize = 200 << 20;
 /// The most pixels sampled for choosing the palette.
 const PIXELS_FOR_PALETTE: usize = 400_000;
 
-/// Writes the film and returns the file. Nothing is written until the palette is known.
+/// Writes the film. Nothing is written until the palette is known.
 ///
 /// # Errors
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
-pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Result<OutputFile> {
+pub(super) fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
     let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
     let mut palette = Palette::new(&waiting);
@@ -38,7 +37,7 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
         encoder.write_frame(&Frame { delay, ..changes(&mut palette, width, &previous, &rgb) })?;
         previous = rgb;
     }
-    encoder.into_inner()?.into_inner().map_err(|error| anyhow!("{}", error.error()))
+    Ok(encoder.into_inner()?.flush()?)
 }
 
 /// What differs from the previous frame, if there was one: the smallest rectangle around all changes, or one pixel.

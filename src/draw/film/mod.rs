@@ -13,7 +13,6 @@ use std::thread::{self, JoinHandle};
 
 use anyhow::{Context, Result, bail, ensure};
 
-use self::format::Frames;
 use crate::os::{Destination, OutputFile};
 
 pub use self::format::FilmFormat;
@@ -40,15 +39,17 @@ impl FilmWriter {
     /// # Errors
     /// Fails if the file is neither an MP4 nor a GIF, for a format that the kind of file does not support, or if it cannot be written.
     pub fn create(to: &Destination, format: FilmFormat) -> Result<Self> {
-        let encode: fn(OutputFile, FilmFormat, Frames) -> Result<OutputFile> = match to.ending {
-            "mp4" => mp4::encode,
-            "gif" => gif::encode,
-            other => bail!("{}: a film is an .mp4 or a .gif, not a .{other}", to.path.display()),
-        };
+        let is_gif = to.ending == "gif";
+        ensure!(
+            is_gif || to.ending == "mp4",
+            "{}: a film is an .mp4 or a .gif, not a .{}",
+            to.path.display(),
+            to.ending
+        );
         let [width, height] = format.size;
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
-        ensure!(to.ending == "gif" || even, "{width}x{height}: the width and height of an MP4 film must be even");
-        ensure!(to.ending == "mp4" || format.fps <= 50, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        ensure!(is_gif || even, "{width}x{height}: the width and height of an MP4 film must be even");
+        ensure!(!is_gif || format.fps <= 50, "{} fps: a GIF has at most 50 frames per second", format.fps);
         ensure!(
             format.longest <= MOST_FRAMES,
             "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes",
@@ -56,7 +57,12 @@ impl FilmWriter {
         );
         let file = OutputFile::create(&to.path)?;
         let (frames, incoming) = sync_channel(WAITING);
-        let encode = move || encode(file, format, &mut captioned(incoming, format));
+        let encode = move || {
+            let frames = &mut captioned(incoming, format);
+            let encoded =
+                if is_gif { gif::encode(&file.file, format, frames) } else { mp4::encode(&file.file, format, frames) };
+            encoded.map(|()| file)
+        };
         let encoder = thread::Builder::new().name("film".into()).spawn(encode).context("cannot start a thread")?;
         Ok(Self { path: to.path.clone(), frames, encoder })
     }

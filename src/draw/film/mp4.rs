@@ -3,7 +3,7 @@
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::num::NonZeroU32;
 
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Result, ensure};
 use openh264::OpenH264API;
 use openh264::encoder::{
     Complexity, Encoder, EncoderConfig, FrameRate, FrameType, IntraFramePeriod, RateControlMode, VuiConfig,
@@ -17,17 +17,16 @@ use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::mux::{Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size};
 
 use super::format::{FilmFormat, Frames};
-use crate::os::OutputFile;
 
 /// Seconds between key frames, which are the frames that a player can seek to.
 const KEY_FRAME_EVERY: u32 = 2;
 
-/// Writes the film and returns the file.
+/// Writes the film.
 ///
 /// # Errors
 /// Fails if the encoder cannot be started or skips a frame, if there are more frames than announced, or if the file cannot be
 /// written.
-pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Result<OutputFile> {
+pub(super) fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Result<()> {
     let size = (format.size[0] as usize, format.size[1] as usize);
     let mut encoder = encoder(format.fps)?;
     let mut yuv = YUVBuffer::new(size.0, size.1);
@@ -67,7 +66,7 @@ pub(super) fn encode(file: OutputFile, format: FilmFormat, frames: Frames) -> Re
         file.seek(SeekFrom::Start(offset))?;
         file.write_all(bytes)?;
     }
-    file.into_inner().map_err(|error| anyhow!("{}", error.error()))
+    Ok(file.flush()?)
 }
 
 /// The units of a frame, each behind its length, as the file holds them.
