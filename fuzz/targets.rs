@@ -75,12 +75,11 @@ pub(crate) fn policy(data: &[u8]) -> [bool; 2] {
     let play = |bytes: &[u8]| -> anyhow::Result<()> {
         let checkpoint = Checkpoint::parse(bytes)?;
         let config = load::settings(&checkpoint, Path::new("x.safetensors"), Reader::Player { env_steps: 0 }, &[])?;
-        let net = config.ppo.net();
         let spaces = Record::parse(&checkpoint.hand)?.spaces();
-        let policy = Policy::load(&net, spaces, &checkpoint)?;
+        let policy = Policy::load(&config.ppo, spaces, &checkpoint)?;
         let frozen = policy.freeze();
         let (mut action, mut work) = (vec![0.0; spaces.action_size], frozen.workspace(1));
-        frozen.mean_actions(&vec![0.5; spaces.observation_size], &mut action, &mut work);
+        frozen.compute(&vec![0.5; spaces.observation_size], [&mut action, &mut []], &mut work);
         Ok(())
     };
     [play(data).is_ok(), sealed(data).is_ok_and(|data| play(&data).is_ok())]

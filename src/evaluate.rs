@@ -158,7 +158,7 @@ pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     let player = Player::new(task, Episodes::scored(0, 1));
     let policy = policy.freeze();
     let mut value = [0.0_f32];
-    policy.values(&player.observation, &mut value, &mut policy.workspace(1));
+    policy.compute(&player.observation, [&mut [], &mut value], &mut policy.workspace(1));
     ensure!((value[0] * value[0]).is_finite(), "the values of the policy are not finite");
     Ok(())
 }
@@ -322,7 +322,7 @@ impl Actor<'_> {
     /// Writes the actions of these lanes, of which there is at least one, one row each. Actions of lanes that have ended are not used.
     fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
-            policy.mean_actions(observations, actions, work);
+            policy.compute(observations, [actions, &mut []], work);
         }
         let Spaces { observation_size, action_size: size, .. } = lanes[0].env.spaces();
         if let Actor::Outside(act) = self {

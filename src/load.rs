@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Error, Result, ensure};
 
-use crate::config::{BUILTIN_MODEL, Config, MODEL, NetConfig, Override, Reader, Settings, Source};
+use crate::config::{BUILTIN_MODEL, Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
 use crate::evaluate::Actor;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
@@ -130,7 +130,7 @@ pub struct Loaded {
     /// The hand and the object that it was trained with.
     pub record: Record,
     /// The policy.
-    pub policy: Arc<Policy>,
+    pub policy: Policy,
     /// The checkpoint that holds it.
     pub checkpoint: Checkpoint,
 }
@@ -150,11 +150,9 @@ impl Loaded {
             }
         };
         let (checkpoint, config) = origin.load(overrides)?;
-        let net = config.ppo.net();
         let record = Record::parse(&checkpoint.hand)?;
-        let policy = Policy::load(&net, record.spaces(), &checkpoint)
+        let policy = Policy::load(&config.ppo, record.spaces(), &checkpoint)
             .with_context(|| format!("cannot use the policy {origin}"))?;
-        let policy = Arc::new(policy);
         let name = match &origin {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
             PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
@@ -228,7 +226,7 @@ pub fn is_damage(error: &Error) -> bool {
 /// Fails if they are invalid, belong to another policy, or name a scene that no setting in `sets` names.
 pub fn settings(checkpoint: &Checkpoint, path: &Path, reader: Reader, sets: &[Override]) -> Result<Config> {
     let config = Settings::new().stored(source(checkpoint, path), reader).sets(sets).resolve()?;
-    expect_policy(checkpoint, &config.ppo.net())?;
+    expect_policy(checkpoint, &config.ppo)?;
     Ok(config)
 }
 
@@ -249,7 +247,7 @@ pub fn source(checkpoint: &Checkpoint, path: &Path) -> Source {
 /// Fails as [`settings`] does.
 pub fn for_fork(checkpoint: &Checkpoint, path: &Path, settings: Settings) -> Result<(Config, Config)> {
     let parent = Settings::new().file(source(checkpoint, path)).resolve()?;
-    expect_policy(checkpoint, &parent.ppo.net())?;
+    expect_policy(checkpoint, &parent.ppo)?;
     let Progress { iteration, ref fork, .. } = checkpoint.progress;
     let made = iteration - fork.as_ref().map_or(0, |fork| fork.iteration).min(iteration);
     let mut after = parent.clone();
@@ -264,8 +262,12 @@ fn cannot_use(path: &Path) -> String {
     format!("cannot use {}", path.display())
 }
 
-fn expect_policy(checkpoint: &Checkpoint, net: &NetConfig) -> Result<()> {
-    checkpoint.expect_policy(net, &Record::parse(&checkpoint.hand)?.spaces())
+/// Checks that a checkpoint has a policy with these settings of the learner.
+///
+/// # Errors
+/// Fails if the hand in it cannot be read, or if a tensor is missing or of another shape.
+pub fn expect_policy(checkpoint: &Checkpoint, config: &PpoConfig) -> Result<()> {
+    checkpoint.expect_policy(config, &Record::parse(&checkpoint.hand)?.spaces())
 }
 
 #[cfg(test)]

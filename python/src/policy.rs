@@ -16,7 +16,7 @@ use shadow_repose::goal_times::GoalTimes;
 use shadow_repose::load::{self, Loaded};
 use shadow_repose::os::OutputFile;
 use shadow_repose::play::json_score;
-use shadow_repose::ppo::{FixedPolicy, GROUP};
+use shadow_repose::ppo::{self, GROUP};
 use shadow_repose::repose::{Score, Task};
 use shadow_repose::run;
 use shadow_repose::spaces::Spaces;
@@ -35,7 +35,6 @@ pub(crate) struct Policy {
     loaded: Loaded,
     /// The settings with which it was loaded.
     set: Vec<Override>,
-    fixed: FixedPolicy,
     settings: String,
 }
 
@@ -70,9 +69,9 @@ impl Policy {
         py: Python<'py>,
         observations: PyReadonlyArray2<'py, f32>,
         width: usize,
-        compute: impl Fn(&FixedPolicy, &[f32]) -> Vec<f32> + Sync,
+        compute: impl Fn(&ppo::Policy, &[f32]) -> Vec<f32> + Sync,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let size = self.fixed.policy.spaces.observation_size;
+        let size = self.loaded.policy.spaces.observation_size;
         let [rows, found] = [observations.shape()[0], observations.shape()[1]];
         if found != size {
             return Err(PyValueError::new_err(format!("observations of {found} values, this policy reads {size}")));
@@ -82,14 +81,14 @@ impl Policy {
         let mut shared = WORKERS.try_lock();
         let mut own = Workers::new(1);
         let computed = if rows <= GROUP {
-            py.detach(|| guarded(|| compute(&self.fixed, &seen)))?
+            py.detach(|| guarded(|| compute(&self.loaded.policy, &seen)))?
         } else {
             let workers = match &mut shared {
                 Ok(shared) => shared.get_or_insert_with(|| Workers::new(0)),
                 Err(_) => &mut own,
             };
             let pool = workers.pool()?;
-            py.detach(|| guarded(|| pool.install(|| compute(&self.fixed, &seen))))?
+            py.detach(|| guarded(|| pool.install(|| compute(&self.loaded.policy, &seen))))?
         };
         computed.into_pyarray(py).reshape([rows, width])
     }
@@ -104,8 +103,7 @@ impl Policy {
             let set = overrides(set, false)?;
             let loaded = Loaded::find(Some(&place), &set)?;
             let settings = text(&*loaded.task(&set)?);
-            let fixed = FixedPolicy::new(loaded.policy.clone());
-            anyhow::Ok(Self { loaded, set, fixed, settings })
+            anyhow::Ok(Self { loaded, set, settings })
         };
         py.detach(|| guarded(load))?.map_err(refused)
     }
@@ -130,14 +128,14 @@ impl Policy {
 
     /// The numbers of values in an observation and in an action.
     fn sizes(&self) -> [usize; 2] {
-        let spaces = &self.fixed.policy.spaces;
+        let spaces = &self.loaded.policy.spaces;
         [spaces.observation_size, spaces.action_size]
     }
 
     /// The standard deviation of each action.
     #[getter]
     fn std(&self) -> f32 {
-        self.fixed.policy.std()
+        self.loaded.policy.std()
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`.
@@ -146,8 +144,8 @@ impl Policy {
         py: Python<'py>,
         observations: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let width = self.fixed.policy.spaces.action_size;
-        self.computed(py, observations, width, FixedPolicy::mean_actions)
+        let width = self.loaded.policy.spaces.action_size;
+        self.computed(py, observations, width, ppo::Policy::mean_actions)
     }
 
     /// The values `[B]` of raw observations `[B, O]`.
@@ -157,7 +155,7 @@ impl Policy {
         observations: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray1<f32>>> {
         let rows = observations.shape()[0];
-        self.computed(py, observations, 1, FixedPolicy::values)?.reshape([rows])
+        self.computed(py, observations, 1, ppo::Policy::values)?.reshape([rows])
     }
 }
 

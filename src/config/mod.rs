@@ -35,8 +35,8 @@ pub use layers::{MODEL, Override, Reader, Settings, Source, scene_option};
 pub use ramp::{Geometric, Ramp};
 pub use rules::FARTHEST;
 pub use settings::{
-    Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, NetConfig, OfScene, PpoConfig, Precision,
-    RandomizationConfig, RunConfig, SuccessHold, Symmetry, TrainingConfig,
+    Activation, BUILTIN_MODEL, Backend, ByGroup, Config, EnvConfig, OfScene, PpoConfig, Precision, RandomizationConfig,
+    RunConfig, SuccessHold, Symmetry, TrainingConfig,
 };
 
 #[cfg(test)]

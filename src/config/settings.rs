@@ -230,15 +230,6 @@ pub struct RunConfig {
     pub threads: usize,
 }
 
-/// The settings of a learner that are part of its policy.
-#[derive(Clone, PartialEq, Serialize)]
-pub struct NetConfig {
-    /// The sizes of the hidden layers, the same for actor and critic.
-    pub hidden: Vec<usize>,
-    /// The activation function after each of them.
-    pub activation: Activation,
-}
-
 impl Config {
     /// The number of control steps in the first iteration.
     pub fn steps_per_iteration(&self) -> u64 {
@@ -263,11 +254,6 @@ impl Config {
 }
 
 impl PpoConfig {
-    /// The structure of the policy that is trained.
-    pub fn net(&self) -> NetConfig {
-        NetConfig { hidden: self.hidden.clone(), activation: self.activation }
-    }
-
     /// The number of control steps of each environment in the first iteration.
     pub fn first_horizon(&self) -> usize {
         self.horizon.from.max(1.0) as usize

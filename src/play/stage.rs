@@ -11,7 +11,6 @@ use crate::config::{Override, Settings};
 use crate::evaluate::Actor;
 use crate::load::Loaded;
 use crate::os::{self, Destination, say};
-use crate::ppo::FixedPolicy;
 use crate::repose::Task;
 use crate::run;
 use crate::see::LiveActor;
@@ -19,7 +18,7 @@ use crate::see::LiveActor;
 /// Who acts, and the task.
 pub(super) struct Stage {
     /// The policy, unless the actor needs none.
-    pub policy: Option<(Loaded, FixedPolicy)>,
+    pub policy: Option<Loaded>,
     /// The number of the actor among [`Stage::actors`].
     pub choice: usize,
     pub task: Arc<Task>,
@@ -59,15 +58,17 @@ impl Stage {
         }
         let loaded = Loaded::find(place, set)?;
         let task = task(Some(&loaded), set)?;
-        let fixed = FixedPolicy::new(loaded.policy.clone());
-        Ok(Self { policy: Some((loaded, fixed)), choice: 0, task })
+        Ok(Self { policy: Some(loaded), choice: 0, task })
     }
 
     /// The kinds of actions between which a user may choose, by name.
     pub(super) fn actors(&self) -> Vec<(&'static str, Actor<'_>)> {
         match &self.policy {
-            Some((_, fixed)) => {
-                vec![("deterministic", Actor::Mean(fixed.frozen())), ("stochastic", Actor::Stochastic(fixed.frozen()))]
+            Some(Loaded { policy, .. }) => {
+                vec![
+                    ("deterministic", Actor::Mean(policy.freeze())),
+                    ("stochastic", Actor::Stochastic(policy.freeze())),
+                ]
             }
             None => Actor::WITHOUT_POLICY.into(),
         }
@@ -79,7 +80,7 @@ impl Stage {
 
     /// The policy in its file.
     pub(super) fn loaded(&self) -> Option<&Loaded> {
-        self.policy.as_ref().map(|(loaded, _)| loaded)
+        self.policy.as_ref()
     }
 
     /// Where the policy comes from, or the name of the actor.

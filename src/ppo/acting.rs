@@ -27,7 +27,7 @@ impl Acting<'_> {
         let observations = &block.observations[seen];
         let actions = &mut block.actions[acted.clone()];
         let means = &mut block.means[acted];
-        self.frozen.actions_and_values(observations, (means, &mut block.values[one.clone()]), work);
+        self.frozen.compute(observations, [means, &mut block.values[one.clone()]], work);
         let std = self.frozen.policy.std();
         let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
         let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
@@ -72,7 +72,7 @@ impl Acting<'_> {
             *reward *= self.config.reward_scale as f32;
             if let Some(observation) = cut_off {
                 let mut value = [0.0];
-                self.frozen.values(observation, &mut value, work);
+                self.frozen.compute(observation, [&mut [], &mut value], work);
                 *reward += self.config.gamma as f32 * value[0];
             }
         }
@@ -82,6 +82,6 @@ impl Acting<'_> {
     pub fn finish(&self, block: &mut RolloutBlock, horizon: usize, work: &mut Workspace) {
         let seen = block.step(horizon, self.frozen.policy.spaces.observation_size);
         let one = block.step(horizon, 1);
-        self.frozen.values(&block.observations[seen], &mut block.values[one], work);
+        self.frozen.compute(&block.observations[seen], [&mut [], &mut block.values[one]], work);
     }
 }

@@ -9,7 +9,7 @@ mod tests {
     use super::super::kernels::Arithmetic;
     use super::super::{Policy, Ppo, Rollout};
     use crate::config::{self, Activation, Config, Precision};
-    use crate::ranks::Exchange;
+    use crate::ranks::{Exchange, tree_sum};
     use crate::rng;
     use crate::spaces::{ObjectAndGoal, Spaces};
 
@@ -61,8 +61,8 @@ mod tests {
     /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         let minibatch = ppo.exchange.minibatch(samples);
-        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch).unwrap();
-        let add_up = |parameters, out: &mut [f32]| ppo.backend.add_up(parameters, out);
+        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch, &mut ppo.of_groups).unwrap();
+        let add_up = |parameters, out: &mut [f32]| tree_sum(out, &ppo.of_groups, parameters);
         ppo.slices.reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
         ppo.losses(&sums, minibatch.count)
     }

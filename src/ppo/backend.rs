@@ -1,6 +1,6 @@
 //! The interface for computing gradients, implemented by our own kernels and by candle's tensors, their reference.
 
-use std::ops::{Add, Range};
+use std::ops::Add;
 
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
@@ -59,13 +59,16 @@ pub(super) trait GradientBackend: Send + Sync {
     /// Prepares for the minibatches of a rollout, before any step on it. `policy` is the policy that collected it.
     fn begin(&mut self, _policy: &Policy, _rollout: &Rollout) {}
 
-    /// Computes the gradients of the losses of each group of this minibatch with respect to the parameters of the policy. Returns
-    /// the sums of each group.
+    /// Computes the gradients of the losses of each group of this minibatch with respect to the parameters of the policy. Writes
+    /// them to `gradients`, whose memory is used again. The result is the sums of each group.
     ///
     /// # Errors
     /// Fails if the underlying library fails.
-    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>>;
-
-    /// Writes the sum of the gradients of all groups for these parameters of one net. They are added as a tree.
-    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]);
+    fn gradients(
+        &mut self,
+        policy: &Policy,
+        rollout: &Rollout,
+        of: &Minibatch,
+        gradients: &mut Vec<Vec<f32>>,
+    ) -> Result<Vec<Losses>>;
 }

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, anyhow, bail, ensure};
 use super::format::{Array, Content};
 use super::parameters::{ParameterLayout, View};
 use super::{Normalizer, Policy, Ppo, Progress};
-use crate::config::NetConfig;
+use crate::config::PpoConfig;
 use crate::os::shortened;
 use crate::spaces::Spaces;
 
@@ -159,12 +159,12 @@ impl Checkpoint {
         Ok(all)
     }
 
-    /// Checks that it contains the parameters of such a net, before the sizes in `net` determine an allocation.
+    /// Checks that it contains the parameters of such nets, before the sizes in `config` determine an allocation.
     ///
     /// # Errors
     /// Fails if a tensor is missing or of another shape.
-    pub fn expect_policy(&self, net: &NetConfig, spaces: &Spaces) -> Result<()> {
-        let layout = ParameterLayout::new(&net.hidden, spaces);
+    pub fn expect_policy(&self, config: &PpoConfig, spaces: &Spaces) -> Result<()> {
+        let layout = ParameterLayout::new(&config.hidden, spaces);
         layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
     }
@@ -176,9 +176,9 @@ impl Checkpoint {
         Ok(())
     }
 
-    fn take_policy(&mut self, net: &NetConfig, spaces: Spaces) -> Result<Policy> {
-        self.expect_policy(net, &spaces)?;
-        let mut policy = Policy::new(net, spaces);
+    fn take_policy(&mut self, config: &PpoConfig, spaces: Spaces) -> Result<Policy> {
+        self.expect_policy(config, &spaces)?;
+        let mut policy = Policy::new(config, spaces);
         policy.parameters = self.take_floats("", &policy.layout.views())?;
         policy.log_std = match self.take(LOG_STD)? {
             Array::F32(_, values) if values.iter().all(|&x| x == values[0]) => values[0],
@@ -213,9 +213,9 @@ impl Policy {
     ///
     /// # Errors
     /// Fails if a tensor is missing, of another shape or type, or not part of this policy.
-    pub fn load(net: &NetConfig, spaces: Spaces, checkpoint: &Checkpoint) -> Result<Self> {
+    pub fn load(config: &PpoConfig, spaces: Spaces, checkpoint: &Checkpoint) -> Result<Self> {
         let mut alone = checkpoint.policy_alone();
-        let policy = alone.take_policy(net, spaces)?;
+        let policy = alone.take_policy(config, spaces)?;
         alone.finish()?;
         Ok(policy)
     }
@@ -249,7 +249,7 @@ impl Ppo {
     /// # Errors
     /// Fails if it is not the policy that the configuration describes.
     pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<()> {
-        self.policy = Policy::load(&self.config.net(), self.policy.spaces, checkpoint)?;
+        self.policy = Policy::load(&self.config, self.policy.spaces, checkpoint)?;
         Ok(())
     }
 
@@ -258,7 +258,7 @@ impl Ppo {
     /// # Errors
     /// Fails for a policy alone, or if a tensor is missing, of another shape or type, or has impossible values.
     pub fn restore(&mut self, checkpoint: &mut Checkpoint) -> Result<()> {
-        self.policy = checkpoint.take_policy(&self.config.net(), self.policy.spaces)?;
+        self.policy = checkpoint.take_policy(&self.config, self.policy.spaces)?;
         let views = self.policy.layout.views();
         self.adam.mean = checkpoint.take_floats("adam.mean.", &views)?;
         self.adam.square = checkpoint.take_floats("adam.square.", &views)?;
@@ -279,7 +279,7 @@ impl Ppo {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Backend, Config, PpoConfig};
+    use crate::config::{Backend, Config};
     use crate::ppo::update::Stage;
     use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Exchange;
@@ -325,7 +325,7 @@ mod tests {
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
-        ppo.minibatch_step(&rollout, &Exchange::alone(1).minibatch(&samples), Stage::First).unwrap();
+        ppo.minibatch_step(&rollout, &samples, Stage::First).unwrap();
         ppo
     }
 
@@ -355,7 +355,7 @@ mod tests {
         assert!(bytes.len() < saved(&from).to_bytes().unwrap().len() * 2 / 3);
         let read = Checkpoint::parse(&bytes).unwrap();
         assert_eq!(read.provenance.as_deref(), Some("{}"));
-        let policy = Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &read).unwrap();
+        let policy = Policy::load(&config(Backend::Fused, &[8]), SPACES, &read).unwrap();
         assert_eq!(policy.normalizer, from.policy.normalizer);
         assert_eq!(policy.parameters, from.policy.parameters);
         assert!(refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing"));
@@ -383,7 +383,7 @@ mod tests {
         more.insert("actor.9.weight", Array::F32(vec![1], vec![0.0]));
         let refused = refusal(more.clone(), &mut learner(&[8]));
         assert!(refused.contains("`actor.9.weight` is not part of this policy"), "{refused}");
-        assert!(Policy::load(&config(Backend::Fused, &[8]).net(), SPACES, &more).is_err());
+        assert!(Policy::load(&config(Backend::Fused, &[8]), SPACES, &more).is_err());
         let mut negative = checkpoint;
         negative.insert("adam.square.actor.1.bias", Array::F32(vec![2], vec![0.0, -1.0]));
         let refused = refusal(negative.clone(), &mut learner(&[8]));
@@ -398,7 +398,7 @@ mod tests {
         let checkpoint = saved(&learner(&[8]));
         // Terabytes, if it were allocated.
         let claimed = config(Backend::Fused, &[1 << 20, 1 << 20, 1 << 20]);
-        assert!(Policy::load(&claimed.net(), SPACES, &checkpoint).is_err());
+        assert!(Policy::load(&claimed, SPACES, &checkpoint).is_err());
     }
 
     #[test]

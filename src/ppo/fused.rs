@@ -8,7 +8,6 @@
 //! is the same for any number of threads. After the first minibatch, the only float arrays that are allocated are the
 //! packing buffers of gemm and small temporaries of the sums. bf16 also packs the weights anew for each minibatch.
 
-use std::ops::Range;
 use std::sync::Mutex;
 
 use anyhow::Result;
@@ -16,11 +15,11 @@ use rayon::prelude::*;
 
 use super::backend::{GradientBackend, Losses};
 use super::kernels::{Arithmetic, Purpose, ROWS, Workspace};
-use super::loss::{Loss, Sums};
+use super::loss::Loss;
 use super::policy::Policy;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
-use crate::ranks::{Minibatch, tree_sum};
+use crate::ranks::Minibatch;
 
 /// The gradient backend with our own kernels.
 pub(super) struct Fused {
@@ -28,17 +27,8 @@ pub(super) struct Fused {
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
     workspaces: Vec<Mutex<Workspace>>,
-    /// Results of each group of the last minibatch, for actor and critic.
-    parts: Vec<[Partial; 2]>,
     /// `[B, O]`: network inputs for the samples of the rollout
     seen: Vec<f32>,
-}
-
-/// The result of a job.
-#[derive(Default)]
-struct Partial {
-    gradient: Vec<f32>,
-    sums: Sums,
 }
 
 /// The net that a job works on.
@@ -51,10 +41,10 @@ enum Role {
 impl Fused {
     /// Creates the backend with these settings.
     pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
-        Self { config: config.clone(), arithmetic, workspaces: Vec::new(), parts: Vec::new(), seen: Vec::new() }
+        Self { config: config.clone(), arithmetic, workspaces: Vec::new(), seen: Vec::new() }
     }
 
-    /// Makes room for these groups. The result is the number of rows that pass through a net together, chosen for blocks of equal
+    /// Makes workspaces for these groups. The result is the number of rows that pass through a net together, chosen for blocks of equal
     /// size as far as possible.
     fn reserve(&mut self, policy: &Policy, groups: &[&[u32]]) -> usize {
         let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
@@ -62,10 +52,6 @@ impl Fused {
         self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows >= rows);
         while self.workspaces.len() < rayon::current_num_threads() {
             self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, self.arithmetic)));
-        }
-        self.parts.resize_with(groups.len(), Default::default);
-        for (part, range) in self.parts.iter_mut().flat_map(|nets| nets.iter_mut().zip(policy.layout.nets())) {
-            part.gradient.resize(range.len(), 0.0);
         }
         rows
     }
@@ -84,14 +70,20 @@ impl GradientBackend for Fused {
         parts.into_par_iter().for_each(|(raw, seen)| transform.apply(raw, seen));
     }
 
-    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>> {
+    fn gradients(
+        &mut self,
+        policy: &Policy,
+        rollout: &Rollout,
+        of: &Minibatch,
+        gradients: &mut Vec<Vec<f32>>,
+    ) -> Result<Vec<Losses>> {
         let rows = self.reserve(policy, &of.groups);
         let nets = policy.nets(self.arithmetic, Purpose::Learning);
         let loss = Loss::new(policy, rollout, of.count, &self.config);
         // Passes the samples of a group forward and backward through a net.
-        let job = |(group, role, part): (&[u32], Role, &mut Partial)| {
+        let job = |(group, role, gradient): (&[u32], Role, &mut [f32])| {
             let net = &nets[role as usize];
-            part.sums = loss.of_none();
+            let mut sums = loss.of_none();
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
@@ -101,26 +93,22 @@ impl GradientBackend for Fused {
                 net.forward(block.len(), work);
                 let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
                 match role {
-                    Role::Actor => loss.actor(block, outputs, grad, &mut part.sums),
-                    Role::Critic => loss.critic(block, outputs, grad, &mut part.sums),
+                    Role::Actor => loss.actor(block, outputs, grad, &mut sums),
+                    Role::Critic => loss.critic(block, outputs, grad, &mut sums),
                 }
-                net.backward(block.len(), work, &mut part.gradient, i > 0);
+                net.backward(block.len(), work, gradient, i > 0);
             }
+            loss.of_group(&sums)
         };
+        let [actor, _] = policy.layout.nets();
+        gradients.resize_with(of.groups.len(), || vec![0.0; policy.layout.count()]);
         let mut jobs = Vec::new();
-        for (&group, [actor, critic]) in of.groups.iter().zip(&mut self.parts) {
+        for (&group, gradient) in of.groups.iter().zip(gradients) {
+            let (actor, critic) = gradient.split_at_mut(actor.end);
             jobs.push((group, Role::Actor, actor));
             jobs.push((group, Role::Critic, critic));
         }
-        jobs.into_par_iter().with_max_len(1).for_each(job);
-        Ok(self.parts.iter().map(|[actor, critic]| loss.of_group(&actor.sums, &critic.sums)).collect())
-    }
-
-    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {
-        // The critic's parameters follow the actor's.
-        let actor = self.parts[0][0].gradient.len();
-        let (net, first) = if parameters.start < actor { (Role::Actor, 0) } else { (Role::Critic, actor) };
-        let own = parameters.start - first..parameters.end - first;
-        tree_sum(out, &self.parts.iter().map(|nets| &nets[net as usize].gradient[own.clone()]).collect::<Vec<_>>());
+        let losses: Vec<Losses> = jobs.into_par_iter().with_max_len(1).map(job).collect();
+        Ok(losses.chunks(2).map(|nets| nets[0] + nets[1]).collect())
     }
 }

@@ -31,7 +31,6 @@ pub(super) struct Loss<'a> {
 }
 
 /// Sums over the samples of a group.
-#[derive(Default)]
 pub(super) struct Sums {
     /// All but the KL divergence.
     losses: Losses,
@@ -63,12 +62,12 @@ impl<'a> Loss<'a> {
         Sums { losses: Losses::default(), squared_shifts: vec![0.0; self.action_size] }
     }
 
-    /// The losses of a group, given the sums of [`Loss::actor`] and [`Loss::critic`].
-    pub(super) fn of_group(&self, actor: &Sums, critic: &Sums) -> Losses {
+    /// The losses of a group, given the sums of [`Loss::actor`] or [`Loss::critic`].
+    pub(super) fn of_group(&self, sums: &Sums) -> Losses {
         // The divergence of Gaussians with the same standard deviation.
         let variance = (2.0 * f64::from(self.log_std)).exp();
-        let kl = actor.squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum();
-        Losses { kl, ..actor.losses } + critic.losses
+        let kl = sums.squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum();
+        Losses { kl, ..sums.losses }
     }
 
     /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
@@ -143,7 +142,7 @@ impl<'a> Loss<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Activation, Config, NetConfig};
+    use crate::config::Config;
     use crate::spaces::Spaces;
 
     fn assert_close(found: &[f32], expected: &[f32]) {
@@ -173,8 +172,8 @@ mod tests {
         let mut config = Config::default().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
         (config.value_coef, config.bounds_coef) = (2.0, 0.5);
-        let net = NetConfig { hidden: vec![1], activation: Activation::Elu };
-        let mut policy = Policy::new(&net, spaces);
+        config.hidden = vec![1];
+        let mut policy = Policy::new(&config, spaces);
         policy.log_std = log_std;
         let loss = Loss::new(&policy, &rollout, 3, &config);
         let (mut actor, mut critic) = (loss.of_none(), loss.of_none());
@@ -184,7 +183,7 @@ mod tests {
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut critic);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
-        let sums = loss.of_group(&actor, &critic);
+        let sums = loss.of_group(&actor) + loss.of_group(&critic);
         assert_close(&[-sums.surrogate as f32 / 3.0], &[2.060_326_3]);
         assert_close(&[sums.ratio_error as f32], &[2.892_847_6]);
         assert_eq!(sums.clipped, 2.0);

@@ -41,7 +41,6 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     while seconds.len() < repeats && (seconds.len() < 3 || all < LIMIT) {
         let taken = rayon::scope(|_| {
             let start = Instant::now();
-            let minibatch = ppo.exchange.minibatch(&minibatch);
             ppo.minibatch_step(rollout, &minibatch, Stage::Later).map(|_| start.elapsed())
         });
         let taken = taken?.as_secs_f64();

@@ -35,7 +35,7 @@ pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, ParameterLayout, View};
 pub use perception::{CLIP, InputTransform, Perception};
-pub use policy::{FixedPolicy, FrozenPolicy, GROUP, Policy};
+pub use policy::{FrozenPolicy, GROUP, Policy};
 pub use progress::{Evaluation, Fork, Progress, Rise};
 pub use rollout::{Rollout, RolloutBlock};
 pub use update::UpdateStats;
@@ -60,6 +60,8 @@ pub struct Ppo {
     arithmetic: Arithmetic,
     /// The gradient of all parameters for the last minibatch.
     gradient: Vec<f32>,
+    /// The same of each group of this rank.
+    of_groups: Vec<Vec<f32>>,
     adam: Adam,
     /// The learning rate of the next step.
     learning_rate: f64,
@@ -81,14 +83,14 @@ impl Ppo {
     /// # Errors
     /// Fails if this machine does not support the configured precision.
     pub fn new(config: &PpoConfig, spaces: Spaces, seed: u64, exchange: Exchange) -> Result<Self> {
-        let policy = Policy::random(&config.net(), spaces, config.std.at(0), seed);
+        let policy = Policy::random(config, spaces, seed);
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Fused::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference::new(config)),
+            Backend::Candle => Box::new(Reference { config: config.clone() }),
         };
         let count = policy.layout.count();
-        let slices = exchange.slices(&norm_chunks(&policy.layout.nets()));
+        let slices = exchange.slices(norm_chunks(&policy.layout.nets()));
         Ok(Self {
             config: config.clone(),
             seed,
@@ -96,6 +98,7 @@ impl Ppo {
             backend,
             arithmetic,
             gradient: vec![0.0; count],
+            of_groups: Vec::new(),
             adam: Adam::new(count),
             learning_rate: config.learning_rate,
             away_std: config.away_std.at(0) as f32,

@@ -34,7 +34,6 @@ impl Normalizer {
         let rows = exchange.of_all(arrays.iter().map(|array| array.len() / size).sum()) as f64;
         let mean_of = |f: fn(f64, f64) -> f64, means: &[f64]| -> Vec<f64> {
             let sums = |arrays: &[&[f32]]| column_sums(arrays, means, &perceive, f);
-            let add = |sums: &mut Vec<f64>, more: Vec<f64>| sums.iter_mut().zip(more).for_each(|(sum, x)| *sum += x);
             exchange.sum(arrays, sums, add).into_iter().map(|total| total / rows).collect()
         };
         let mean = mean_of(|x, _| x, &vec![0.0; size]);
@@ -74,7 +73,12 @@ fn column_sums(
     };
     let tasks: Vec<&[f32]> = arrays.iter().flat_map(|array| array.chunks(ROWS_PER_TASK * size)).collect();
     let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
-    (0..size).map(|column| partial.iter().map(|sums| sums[column]).sum()).collect()
+    partial.into_iter().reduce(add).expect("a row")
+}
+
+fn add(mut sums: Vec<f64>, more: Vec<f64>) -> Vec<f64> {
+    sums.iter_mut().zip(more).for_each(|(sum, x)| *sum += x);
+    sums
 }
 
 #[cfg(test)]

@@ -57,11 +57,6 @@ impl ParameterLayout {
         Self { actor: net(spaces.action_size), critic: net(1) }
     }
 
-    /// The layers of the actor, then the layers of the critic.
-    pub fn layers(&self) -> impl Iterator<Item = &Layer> {
-        self.actor.iter().chain(&self.critic)
-    }
-
     /// The number of weights and biases.
     pub fn count(&self) -> usize {
         self.nets()[1].end

@@ -1,7 +1,5 @@
 //! The policy: actor and critic MLPs, one standard deviation for all actions, and observation reading.
 
-use std::sync::Arc;
-
 use rand::RngExt;
 use rayon::prelude::*;
 
@@ -9,7 +7,7 @@ use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Purpose, Workspace};
 use super::parameters::ParameterLayout;
 use super::perception::{InputTransform, Perception};
-use crate::config::{Activation, NetConfig};
+use crate::config::{Activation, PpoConfig};
 use crate::ranks::Exchange;
 use crate::rng;
 use crate::spaces::Spaces;
@@ -34,7 +32,6 @@ pub struct Policy {
     pub activation: Activation,
     /// The sizes and the structure of observations and actions.
     pub spaces: Spaces,
-    perception: Perception,
 }
 
 /// A policy in its current state, for acting. While it lives, the parameters cannot be written to.
@@ -45,32 +42,22 @@ pub struct FrozenPolicy<'a> {
     transform: InputTransform,
 }
 
-/// A policy that never changes, for calls with any number of rows. The results for a row are bit for bit the same whatever the
-/// other rows are, because it always computes [`GROUP`] rows together.
-pub struct FixedPolicy {
-    /// The policy.
-    pub policy: Arc<Policy>,
-    /// Copies of the weights of actor and critic, as a net reads them.
-    copies: [Vec<Vec<f32>>; 2],
-}
-
 impl Policy {
     /// Creates a policy whose parameters are all zero, for environments with these spaces.
-    pub fn new(net: &NetConfig, spaces: Spaces) -> Self {
-        let layout = ParameterLayout::new(&net.hidden, &spaces);
+    pub fn new(config: &PpoConfig, spaces: Spaces) -> Self {
+        let layout = ParameterLayout::new(&config.hidden, &spaces);
         let parameters = vec![0.0; layout.count()];
         let normalizer = Normalizer::new(spaces.observation_size);
-        let perception = Perception::new(&spaces);
-        Self { layout, parameters, log_std: 0.0, normalizer, activation: net.activation, spaces, perception }
+        Self { layout, parameters, log_std: 0.0, normalizer, activation: config.activation, spaces }
     }
 
-    /// Creates an untrained policy with weights drawn from `seed` and this standard deviation.
+    /// Creates an untrained policy with weights drawn from `seed` and the first standard deviation.
     ///
     /// Weights and biases are uniform in ± 1/√inputs, as in PyTorch's `Linear`.
-    pub fn random(net: &NetConfig, spaces: Spaces, std: f64, seed: u64) -> Self {
-        let mut policy = Self { log_std: std.ln() as f32, ..Self::new(net, spaces) };
+    pub fn random(config: &PpoConfig, spaces: Spaces, seed: u64) -> Self {
+        let mut policy = Self { log_std: config.std.at(0).ln() as f32, ..Self::new(config, spaces) };
         let mut rng = rng::stream(seed, "weights", 0);
-        for (i, layer) in policy.layout.layers().enumerate() {
+        for (i, layer) in policy.layout.actor.iter().chain(&policy.layout.critic).enumerate() {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
             let is_last_of_actor = i + 1 == policy.layout.actor.len();
             let of_weights = if is_last_of_actor { bound * LAST_ACTOR_LAYER } else { bound };
@@ -88,13 +75,13 @@ impl Policy {
 
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
-        let perception = self.perception;
+        let perception = Perception::new(&self.spaces);
         self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
     }
 
     /// The way it currently reads observations.
     pub fn input_transform(&self) -> InputTransform {
-        InputTransform::new(self.perception, &self.normalizer)
+        InputTransform::new(Perception::new(&self.spaces), &self.normalizer)
     }
 
     /// Actor and critic.
@@ -115,103 +102,71 @@ impl Policy {
         self.freeze_for(Arithmetic::F32)
     }
 
+    /// The policy in its current state, for a few calls. It costs nothing, but each product rearranges the weights anew.
+    fn freeze_briefly(&self) -> FrozenPolicy<'_> {
+        FrozenPolicy { policy: self, nets: self.plain_nets(), transform: self.input_transform() }
+    }
+
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        FrozenPolicy { policy: self, nets: self.nets(arithmetic, Purpose::Acting), transform: self.input_transform() }
-    }
-}
-
-impl FrozenPolicy<'_> {
-    /// A reusable workspace for [`FrozenPolicy::mean_actions`] and its siblings, which compute `rows` rows at a
-    /// time, in f32.
-    pub fn workspace(&self, rows: usize) -> Workspace {
-        Workspace::new(&self.policy.layout.actor, rows, Arithmetic::F32)
+        FrozenPolicy { nets: self.nets(arithmetic, Purpose::Acting), ..self.freeze_briefly() }
     }
 
-    /// Writes the mean actions `[B, A]` for raw observations `[B, O]`.
-    pub fn mean_actions(&self, observations: &[f32], means: &mut [f32], work: &mut Workspace) {
-        self.forward(observations, &mut [(&self.nets[0], means)], work);
-    }
-
-    /// Writes the values `[B]` of raw observations `[B, O]`.
-    pub fn values(&self, observations: &[f32], values: &mut [f32], work: &mut Workspace) {
-        self.forward(observations, &mut [(&self.nets[1], values)], work);
-    }
-
-    /// Writes both, mean actions and values, and reads the observations only once.
-    pub fn actions_and_values(
-        &self,
-        observations: &[f32],
-        (means, values): (&mut [f32], &mut [f32]),
-        work: &mut Workspace,
-    ) {
-        let [actor, critic] = &self.nets;
-        self.forward(observations, &mut [(actor, means), (critic, values)], work);
-    }
-
-    fn forward(&self, observations: &[f32], outputs: &mut [(&Net, &mut [f32])], work: &mut Workspace) {
-        let size = self.policy.spaces.observation_size;
-        let mut done = 0;
-        for raw in observations.chunks(work.rows * size) {
-            let rows = raw.len() / size;
-            self.transform.apply(raw, &mut work.inputs[..raw.len()]);
-            for (net, out) in &mut *outputs {
-                let width = net.outputs();
-                out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));
-            }
-            done += rows;
-        }
-    }
-}
-
-impl FixedPolicy {
-    /// Fixes a policy.
-    pub fn new(policy: Arc<Policy>) -> Self {
-        Self { copies: policy.plain_nets().map(|net| net.copies()), policy }
-    }
-
-    /// The mean actions `[B, A]` for raw observations `[B, O]`. More than one group is shared among the threads of rayon's
+    /// The mean actions `[B, A]` for raw observations `[B, O]`. The results for a row are bit for bit the same whatever the other
+    /// rows are, because [`GROUP`] rows are always computed together. More than one group is shared among the threads of rayon's
     /// current pool.
     pub fn mean_actions(&self, observations: &[f32]) -> Vec<f32> {
-        let width = self.policy.spaces.action_size;
-        self.in_groups(observations, width, |policy, seen, means, work| policy.mean_actions(seen, means, work))
+        self.in_groups(observations, 0)
     }
 
-    /// The values `[B]` of raw observations `[B, O]`, shared among threads in the same way.
+    /// The values `[B]` of raw observations `[B, O]`, computed in the same way.
     pub fn values(&self, observations: &[f32]) -> Vec<f32> {
-        self.in_groups(observations, 1, |policy, seen, values, work| policy.values(seen, values, work))
+        self.in_groups(observations, 1)
     }
 
-    /// The policy for acting, without copying its weights.
-    pub fn frozen(&self) -> FrozenPolicy<'_> {
-        let policy = &self.policy;
-        let mut nets = policy.plain_nets();
-        nets.iter_mut().zip(&self.copies).for_each(|(net, copies)| net.set_copies(copies));
-        FrozenPolicy { policy, nets, transform: policy.input_transform() }
-    }
-
-    fn in_groups(
-        &self,
-        observations: &[f32],
-        width: usize,
-        compute: impl Fn(&FrozenPolicy, &[f32], &mut [f32], &mut Workspace) + Sync,
-    ) -> Vec<f32> {
-        let frozen = self.frozen();
-        let size = self.policy.spaces.observation_size;
+    /// The outputs of this net.
+    fn in_groups(&self, observations: &[f32], net: usize) -> Vec<f32> {
+        let frozen = self.freeze_briefly();
+        let size = self.spaces.observation_size;
+        let width = frozen.nets[net].outputs();
         let rows = observations.len() / size;
         let mut results = vec![0.0; rows.next_multiple_of(GROUP) * width];
         let group = |(seen, results): (&[f32], &mut [f32])| {
             let mut padded = seen.to_vec();
             padded.resize(GROUP * size, 0.0);
-            compute(&frozen, &padded, results, &mut frozen.workspace(GROUP));
+            let mut outputs = [Default::default(), Default::default()];
+            outputs[net] = results;
+            frozen.compute(&padded, outputs, &mut frozen.workspace(GROUP));
         };
         if rows <= GROUP {
-            observations.chunks(GROUP * size).zip(results.chunks_mut(GROUP * width)).for_each(group);
+            group((observations, &mut results));
         } else {
             observations.par_chunks(GROUP * size).zip(results.par_chunks_mut(GROUP * width)).for_each(group);
         }
         results.truncate(rows * width);
         results
+    }
+}
+
+impl FrozenPolicy<'_> {
+    /// A reusable workspace for [`FrozenPolicy::compute`], which computes `rows` rows at a time, in f32.
+    pub fn workspace(&self, rows: usize) -> Workspace {
+        Workspace::new(&self.policy.layout.actor, rows, Arithmetic::F32)
+    }
+
+    /// Writes the mean actions `[B, A]` and the values `[B]` for raw observations `[B, O]`. An empty slice is left out.
+    pub fn compute(&self, observations: &[f32], mut outputs: [&mut [f32]; 2], work: &mut Workspace) {
+        let size = self.policy.spaces.observation_size;
+        let mut done = 0;
+        for raw in observations.chunks(work.rows * size) {
+            let rows = raw.len() / size;
+            self.transform.apply(raw, &mut work.inputs[..raw.len()]);
+            for (net, out) in self.nets.iter().zip(&mut outputs).filter(|(_, out)| !out.is_empty()) {
+                let width = net.outputs();
+                out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));
+            }
+            done += rows;
+        }
     }
 }
 
@@ -224,8 +179,7 @@ mod tests {
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
         const SIZE: usize = 75;
         let spaces = Spaces { observation_size: SIZE, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
-        let net = Config::default().ppo.net();
-        let policy = FixedPolicy::new(Arc::new(Policy::random(&net, spaces, 0.5, 7)));
+        let policy = Policy::random(&Config::default().ppo, spaces, 7);
         let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
         let actions = policy.mean_actions(&observations);
         let values = policy.values(&observations);
@@ -235,9 +189,9 @@ mod tests {
             assert_eq!(policy.mean_actions(first), actions[..rows * 20], "{rows} rows");
             assert_eq!(policy.values(first), values[..rows], "{rows} rows");
         }
-        let frozen = policy.policy.freeze();
+        let frozen = policy.freeze();
         let mut means = vec![0.0; 64 * 20];
-        frozen.mean_actions(&observations[..64 * SIZE], &mut means, &mut frozen.workspace(64));
+        frozen.compute(&observations[..64 * SIZE], [&mut means, &mut []], &mut frozen.workspace(64));
         assert_eq!(means, actions[..64 * 20], "as a score computes them");
     }
 }

@@ -15,7 +15,7 @@ use super::gae::gae;
 use super::learning_rate;
 use super::parameters::View;
 use super::rollout::{Rollout, RolloutBlock};
-use crate::ranks::Minibatch;
+use crate::ranks::tree_sum;
 use crate::rng;
 
 /// The position of a gradient step among the steps that move the policy. The learning rate follows how far they have moved it.
@@ -85,11 +85,12 @@ impl Ppo {
             }
             let samples = rollout.samples();
             let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
-            let stream = |part| rng::stream(self.seed, "shuffle", iteration << 32 | part);
-            let mut minibatches = self.exchange.minibatches(samples, size, stream);
+            let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
+            let shuffles = self.exchange.own_shards().map(stream).collect();
+            let mut minibatches = self.exchange.epochs(samples, size, shuffles);
             let mut steps = Vec::new();
             for epoch in 0..self.config.epochs {
-                for (part, minibatch) in minibatches.shuffled().enumerate() {
+                for (part, samples) in minibatches().iter().enumerate() {
                     if stop.load(Ordering::Relaxed) {
                         return Ok(None);
                     }
@@ -100,7 +101,7 @@ impl Ppo {
                     } else {
                         Stage::Later
                     };
-                    let step = self.minibatch_step(rollout, &minibatch, stage);
+                    let step = self.minibatch_step(rollout, samples, stage);
                     steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
                 }
             }
@@ -132,28 +133,24 @@ impl Ppo {
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
         let sum = |term: &(dyn Fn(f64) -> f64 + Sync)| {
             let of_blocks = |blocks: &[RolloutBlock]| blocks.iter().flat_map(of).map(|&x| term(f64::from(x))).sum();
-            self.exchange.sum(&rollout.blocks, of_blocks, |sum: &mut f64, more| *sum += more)
+            self.exchange.sum(&rollout.blocks, of_blocks, f64::add)
         };
         let count = self.exchange.of_all(rollout.samples()) as f64;
         let mean = sum(&|x| x) / count;
         (mean, sum(&|x| (x - mean).powi(2)) / count)
     }
 
-    /// Takes one gradient step on a minibatch. The results are the mean losses and the norm of the gradient before clipping.
+    /// Takes one gradient step on the minibatch of these samples of this rank. The results are the mean losses and the norm of the gradient before clipping.
     ///
     /// # Errors
     /// Fails if one of them is not finite. Nothing has moved then.
-    pub(super) fn minibatch_step(
-        &mut self,
-        rollout: &Rollout,
-        minibatch: &Minibatch,
-        stage: Stage,
-    ) -> Result<(Losses, f64)> {
+    pub(super) fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], stage: Stage) -> Result<(Losses, f64)> {
         let nets = self.policy.layout.nets();
-        let sums = self.backend.gradients(&self.policy, rollout, minibatch)?;
+        let minibatch = self.exchange.minibatch(samples);
+        let sums = self.backend.gradients(&self.policy, rollout, &minibatch, &mut self.of_groups)?;
         let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
             Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
-            _ => self.backend.add_up(parameters, out),
+            _ => tree_sum(out, &self.of_groups, parameters),
         };
         let squares = self.slices.reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
         let grad_norm = norm(&squares, &nets);
@@ -181,7 +178,7 @@ impl Ppo {
     pub(super) fn losses(&self, sums: &[Losses], count: usize) -> Losses {
         let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();
-        self.exchange.in_order(own, |sum: &mut Losses, more| *sum = *sum + more).means(count)
+        self.exchange.in_order(own, Losses::add).means(count)
     }
 
     fn check_weights(&self) -> Result<()> {

@@ -18,21 +18,25 @@ use super::Ranks;
 pub struct Exchange {
     /// The number of all shards.
     pub shards: usize,
-    /// All ranks, if this is not the only one.
+    /// The number of this rank.
+    pub(super) rank: usize,
+    /// The number of all ranks.
+    pub(super) size: usize,
+    /// All ranks, if they can talk to each other.
     ranks: Option<Arc<dyn Ranks>>,
     /// The nanoseconds spent, and the bytes sent.
     sent: Arc<[AtomicU64; 2]>,
 }
 
 impl Exchange {
-    /// Creates the exchange of a single shard.
-    pub fn new(ranks: Arc<dyn Ranks>) -> Self {
-        Self { shards: 1, ranks: Some(ranks).filter(|ranks| ranks.size() > 1), sent: Arc::default() }
+    /// Creates the exchange of rank `rank` of `size`, with a single shard.
+    pub fn new(rank: usize, size: usize, ranks: Arc<dyn Ranks>) -> Self {
+        Self { rank, size, ranks: Some(ranks), ..Self::alone(1) }
     }
 
     /// Creates the exchange of one rank that computes all shards.
     pub fn alone(shards: usize) -> Self {
-        Self { shards: 1, ranks: None, sent: Arc::default() }.over(shards).expect("one rank")
+        Self { shards, rank: 0, size: 1, ranks: None, sent: Arc::default() }
     }
 
     /// Deals this number of shards, a power of two, to the ranks.
@@ -40,7 +44,7 @@ impl Exchange {
     /// # Errors
     /// Fails if the number of ranks is not a power of two, or if there are fewer shards.
     pub fn over(self, shards: usize) -> Result<Self> {
-        let ranks = self.ranks();
+        let ranks = self.size;
         ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
         ensure!(
             ranks <= shards,
@@ -57,32 +61,22 @@ impl Exchange {
 
     /// This rank's part of `count` things in a row: parts differ by one thing at most.
     pub fn own(&self, count: usize) -> Range<usize> {
-        part(count, self.rank(), self.ranks())
+        part(count, self.rank, self.size)
     }
 
     /// The number of things of all ranks, if each has `own` of them.
     pub fn of_all(&self, own: usize) -> usize {
-        own * self.ranks()
+        own * self.size
     }
 
     /// Whether there is no other rank.
     pub fn is_alone(&self) -> bool {
-        self.ranks.is_none()
+        self.size == 1
     }
 
     /// Whether this is the rank that reports and saves.
     pub fn is_first(&self) -> bool {
-        self.rank() == 0
-    }
-
-    /// The number of this rank.
-    pub(super) fn rank(&self) -> usize {
-        self.ranks.as_ref().map_or(0, |ranks| ranks.rank())
-    }
-
-    /// The number of all ranks.
-    pub(super) fn ranks(&self) -> usize {
-        self.ranks.as_ref().map_or(1, |ranks| ranks.size())
+        self.rank == 0
     }
 
     /// Ends all ranks at once, of which there are several.
@@ -92,48 +86,43 @@ impl Exchange {
 
     /// Computes `of` from the parts of each shard, and adds the results of all shards in their order. The parts belong to this
     /// rank, shard after shard, equally many for each.
-    pub fn sum<P, T>(&self, parts: &[P], of: impl Fn(&[P]) -> T + Send + Sync, add: impl Fn(&mut T, T)) -> T
-    where
-        P: Sync,
-        T: Serialize + DeserializeOwned + Send,
-    {
+    pub fn sum<P: Sync, T: Serialize + DeserializeOwned + Send>(
+        &self,
+        parts: &[P],
+        of: impl Fn(&[P]) -> T + Send + Sync,
+        add: impl Fn(T, T) -> T,
+    ) -> T {
         self.in_order(parts.par_chunks(parts.len() / self.own_shards().len()).map(of).collect(), add)
     }
 
     /// Adds the results of all shards, of which this rank has its `own`, in the order of the shards.
-    pub fn in_order<T: Serialize + DeserializeOwned>(&self, own: Vec<T>, add: impl Fn(&mut T, T)) -> T {
-        let all = self.all_gather(own).into_iter().flatten();
-        all.reduce(|mut sum, next| {
-            add(&mut sum, next);
-            sum
-        })
-        .expect("there is a shard")
+    pub fn in_order<T: Serialize + DeserializeOwned>(&self, own: Vec<T>, add: impl Fn(T, T) -> T) -> T {
+        self.all_gather(own).into_iter().flatten().reduce(add).expect("there is a shard")
     }
 
     /// The values of all ranks, in their order.
     pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
         let Some(ranks) = &self.ranks else { return vec![own] };
-        let own = to_bytes(&own);
-        let all = self.timed(own.len() * (ranks.size() - 1), || ranks.all_gather(own));
-        all.iter().map(|bytes| from_bytes(bytes)).collect()
+        let own = postcard::to_stdvec(&own).expect("values of known size");
+        let all = self.timed(own.len() * (self.size - 1), || ranks.all_gather(own));
+        all.iter().map(|bytes| postcard::from_bytes(bytes).expect("the ranks run the same program")).collect()
     }
 
     /// The value of the first rank. The others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
-        let Some(ranks) = &self.ranks else { return first.expect("this is the first rank") };
-        from_bytes(&ranks.broadcast(first.map_or(Vec::new(), |value| to_bytes(&value))))
+        self.all_gather(first).swap_remove(0).expect("the first rank has it")
     }
 
     /// Sends each rank its slice, and returns the slices that all have sent, this rank's among them.
-    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>], own: usize) -> Vec<f32> {
+    pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let ranks = self.ranks.as_ref().expect("there are several");
-        self.timed(4 * (numbers.len() - own), || ranks.all_to_all(numbers, slices))
+        self.timed(4 * (numbers.len() - slices[self.rank].len()), || ranks.all_to_all(numbers, slices))
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
-    pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>], own: usize) {
+    pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]) {
         if let Some(ranks) = &self.ranks {
-            self.timed(4 * own * (ranks.size() - 1), || ranks.all_gather_slices(numbers, slices));
+            self.timed(4 * slices[self.rank].len() * (self.size - 1), || ranks.all_gather_slices(numbers, slices));
         }
     }
 
@@ -154,14 +143,6 @@ impl Exchange {
     }
 }
 
-fn to_bytes<T: Serialize>(value: &T) -> Vec<u8> {
-    postcard::to_stdvec(value).expect("values of known size")
-}
-
-fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> T {
-    postcard::from_bytes(bytes).expect("the ranks run the same program")
-}
-
 pub(super) fn part(count: usize, rank: usize, ranks: usize) -> Range<usize> {
     count * rank / ranks..count * (rank + 1) / ranks
 }
@@ -175,35 +156,14 @@ mod tests {
         let exchange = Exchange::alone(4);
         // 1 is lost when added to 1e16: once in this order, never or twice in others.
         let of_shard = |parts: &[f64]| parts.iter().sum::<f64>();
-        assert_eq!(exchange.sum(&[1e16, 1.0, -1e16, 1.0], of_shard, |sum, next| *sum += next), 1.0);
-        assert_eq!(exchange.sum(&[1e16, 1.0, 0.0, 0.0, -1e16, 1.0, 0.0, 1.0], of_shard, |sum, next| *sum += next), 1.0);
+        assert_eq!(exchange.sum(&[1e16, 1.0, -1e16, 1.0], of_shard, |sum, next| sum + next), 1.0);
+        assert_eq!(exchange.sum(&[1e16, 1.0, 0.0, 0.0, -1e16, 1.0, 0.0, 1.0], of_shard, |sum, next| sum + next), 1.0);
     }
 
     #[test]
     fn trainings_that_cannot_be_dealt_to_the_ranks_are_refused() {
-        struct Three;
-        impl Ranks for Three {
-            fn size(&self) -> usize {
-                3
-            }
-            fn rank(&self) -> usize {
-                0
-            }
-            fn all_to_all(&self, _: &[f32], _: &[Range<usize>]) -> Vec<f32> {
-                Vec::new()
-            }
-            fn all_gather_slices(&self, _: &mut [f32], _: &[Range<usize>]) {}
-            fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>> {
-                vec![bytes]
-            }
-            fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
-                bytes
-            }
-            fn abort(&self) -> ! {
-                panic!()
-            }
-        }
-        let refused = Exchange::new(Arc::new(Three)).over(16).err().unwrap().to_string();
+        let three = Exchange { size: 3, ..Exchange::alone(1) };
+        let refused = three.over(16).err().unwrap().to_string();
         assert!(refused.contains("3 ranks") && refused.contains("power of two"), "{refused}");
     }
 }

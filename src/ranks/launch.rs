@@ -70,7 +70,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
         return work(exchange);
     }
     if !exchange.is_first() {
-        os::speak_as(&format!("rank {}", exchange.rank()));
+        os::speak_as(&format!("rank {}", exchange.rank));
     }
     // Leaving the others means waiting for them, and they may be waiting for this one.
     let result = caught(|| work(exchange)).unwrap_or_else(|panic| Err(anyhow!("panic: {panic}")));
@@ -88,7 +88,7 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
 fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
     let Some((_, size)) = launched() else { return Ok((Exchange::alone(1), None)) };
     let (universe, ranks) = super::mpi::join()?;
-    let exchange = Exchange::new(std::sync::Arc::new(ranks));
+    let exchange = Exchange::new(ranks.rank, ranks.size, std::sync::Arc::new(ranks));
     if exchange.is_alone() {
         bail!(
             "{size} processes were started, but MPI did not connect them; under Slurm, start them with srun --mpi=pmix, or with the \

@@ -20,63 +20,33 @@ pub struct Minibatch<'a> {
     pub count: usize,
 }
 
-/// The minibatches of an update.
-pub struct Minibatches {
-    exchange: Exchange,
-    /// The samples of this rank, shard after shard.
-    order: Vec<u32>,
-    /// The samples that a minibatch takes from each shard.
-    of_shard: usize,
-    shuffles: Vec<Rng>,
-}
-
 impl Exchange {
-    /// Deals the `samples` samples of this rank, shard after shard, into minibatches of `size` samples of all ranks. `rng` returns
-    /// the generator that shuffles the samples of a shard.
-    pub fn minibatches(&self, samples: usize, size: usize, rng: impl Fn(u64) -> Rng) -> Minibatches {
-        let shuffles = self.own_shards().map(|shard| rng(shard as u64)).collect();
-        let order = (0..samples as u32).collect();
-        Minibatches { exchange: self.clone(), order, of_shard: size / self.shards, shuffles }
+    /// Deals the `samples` samples of this rank, shard after shard, into minibatches of `size` samples of all ranks. Each call of
+    /// the result gives those of another epoch, as [`Exchange::minibatch`] takes them. `shuffles` has a generator for each shard
+    /// of this rank.
+    pub fn epochs(&self, samples: usize, size: usize, mut shuffles: Vec<Rng>) -> impl FnMut() -> Vec<Vec<u32>> + use<> {
+        let mut order: Vec<u32> = (0..samples as u32).collect();
+        let in_shard = samples / shuffles.len();
+        let of_shard = size / self.shards;
+        move || {
+            order.chunks_mut(in_shard).zip(&mut shuffles).for_each(|(samples, rng)| samples.shuffle(rng));
+            let window =
+                |part: usize| order.chunks(in_shard).flat_map(move |shard| &shard[part * of_shard..][..of_shard]);
+            (0..in_shard / of_shard).map(|part| window(part).copied().collect()).collect()
+        }
     }
 
     /// The minibatch of these samples of this rank, shard after shard, equally many of each.
     pub fn minibatch<'a>(&self, samples: &'a [u32]) -> Minibatch<'a> {
         let in_shard = samples.len() / self.own_shards().len();
-        self.grouped(samples.chunks(in_shard).collect())
-    }
-
-    /// Splits the samples of each shard into groups.
-    fn grouped<'a>(&self, shards: Vec<&'a [u32]>) -> Minibatch<'a> {
-        let in_shard = shards[0].len();
-        let groups = groups_of_shard(in_shard, self.shards);
+        // A power of two, so that all groups can be added as a tree. It depends on nothing but the samples and the shards.
+        let mut groups = (GROUPS / self.shards).max(1);
+        while groups > 1 && in_shard / groups < SMALLEST_GROUP {
+            groups /= 2;
+        }
         let split = |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
-        let groups = shards.into_iter().flat_map(split).collect();
-        Minibatch { groups, count: in_shard * self.shards }
+        Minibatch { groups: samples.chunks(in_shard).flat_map(split).collect(), count: in_shard * self.shards }
     }
-}
-
-impl Minibatches {
-    /// Shuffles the samples of each shard and returns the minibatches of an epoch.
-    pub fn shuffled(&mut self) -> impl Iterator<Item = Minibatch<'_>> {
-        let in_shard = self.order.len() / self.shuffles.len();
-        let shards = self.order.chunks_mut(in_shard);
-        shards.zip(&mut self.shuffles).for_each(|(samples, rng)| samples.shuffle(rng));
-        let this = &*self;
-        (0..in_shard / this.of_shard).map(move |part| {
-            let windows = this.order.chunks(in_shard).map(|shard| &shard[part * this.of_shard..][..this.of_shard]);
-            this.exchange.grouped(windows.collect())
-        })
-    }
-}
-
-/// The number of groups that the `samples` samples of each shard are split into. It is a power of two, so that all groups
-/// can be added as a tree. It depends on nothing but `samples` and `shards`.
-fn groups_of_shard(samples: usize, shards: usize) -> usize {
-    let mut groups = (GROUPS / shards).max(1);
-    while groups > 1 && samples / groups < SMALLEST_GROUP {
-        groups /= 2;
-    }
-    groups
 }
 
 #[cfg(test)]
@@ -87,10 +57,11 @@ mod tests {
     #[test]
     fn an_epoch_takes_each_sample_once_and_equally_many_from_each_shard() {
         let exchange = Exchange::alone(4);
-        let mut minibatches = exchange.minibatches(4 * 96, 4 * 32, |shard| rng::stream(1, "shuffle", shard));
+        let mut epoch = exchange.epochs(4 * 96, 4 * 32, (0..4).map(|shard| rng::stream(1, "shuffle", shard)).collect());
         for _ in 0..2 {
             let mut seen = Vec::new();
-            for minibatch in minibatches.shuffled() {
+            for samples in epoch() {
+                let minibatch = exchange.minibatch(&samples);
                 assert_eq!((minibatch.count, minibatch.groups.len()), (128, 4));
                 for (shard, group) in minibatch.groups.iter().enumerate() {
                     assert!(group.len() == 32 && group.iter().all(|&sample| sample as usize / 96 == shard));

@@ -24,17 +24,11 @@ use pulp::Arch;
 
 pub use exchange::Exchange;
 pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
-pub use minibatches::{Minibatch, Minibatches};
+pub use minibatches::Minibatch;
 pub use slices::Slices;
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.
 pub trait Ranks: Send + Sync {
-    /// The number of ranks.
-    fn size(&self) -> usize;
-
-    /// The index of this rank.
-    fn rank(&self) -> usize;
-
     /// Sends `numbers[slices[i]]` to rank i, for every i. Returns what the ranks have sent to this one, in their order.
     fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32>;
 
@@ -44,27 +38,24 @@ pub trait Ranks: Send + Sync {
     /// The bytes of all ranks, in their order.
     fn all_gather(&self, bytes: Vec<u8>) -> Vec<Vec<u8>>;
 
-    /// The bytes of rank 0.
-    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8>;
-
     /// Ends all ranks at once.
     fn abort(&self) -> !;
 }
 
-/// Writes the sum of `parts`, which have equal length and whose number is a power of two. They are added as a binary
+/// Writes the sum of this range of `parts`, whose number is a power of two. They are added as a binary
 /// tree: first and second, third and fourth, and so on, then these sums in the same way.
-pub fn tree_sum(out: &mut [f32], parts: &[&[f32]]) {
+pub fn tree_sum(out: &mut [f32], parts: &[impl AsRef<[f32]>], range: Range<usize>) {
     match parts {
-        [part] => out.copy_from_slice(part),
+        [part] => out.copy_from_slice(&part.as_ref()[range]),
         [first, second] => {
-            out.copy_from_slice(first);
-            add(out, second);
+            out.copy_from_slice(&first.as_ref()[range.clone()]);
+            add(out, &second.as_ref()[range]);
         }
         _ => {
             let (first, second) = parts.split_at(parts.len() / 2);
             let mut of_second = vec![0.0; out.len()];
-            tree_sum(out, first);
-            tree_sum(&mut of_second, second);
+            tree_sum(out, first, range.clone());
+            tree_sum(&mut of_second, second, range);
             add(out, &of_second);
         }
     }
@@ -85,16 +76,15 @@ mod tests {
     fn parts_are_added_as_a_tree() {
         // A one is lost when added to 1e8. Only ones that are added to each other first count.
         let parts = [1e8f32, 1.0, 1.0, 1.0, -1e8, 3.0, 1.0, 2.0].map(|x| [x, 1.0]);
-        let parts: Vec<&[f32]> = parts.iter().map(|part| &part[..]).collect();
         let mut out = [0.0; 2];
-        tree_sum(&mut out, &parts);
+        tree_sum(&mut out, &parts, 0..2);
         let expected = ((1e8f32 + 1.0) + (1.0 + 1.0)) + ((-1e8f32 + 3.0) + (1.0 + 2.0));
         assert_eq!(out, [expected, 8.0]);
         // Two ranks with half of the parts each give the same result.
         let [mut first, mut second] = [[0.0; 2]; 2];
-        tree_sum(&mut first, &parts[..4]);
-        tree_sum(&mut second, &parts[4..]);
-        tree_sum(&mut out, &[&first, &second]);
+        tree_sum(&mut first, &parts[..4], 0..2);
+        tree_sum(&mut second, &parts[4..], 0..2);
+        tree_sum(&mut out, &[first, second], 0..2);
         assert_eq!(out, [expected, 8.0]);
     }
 }

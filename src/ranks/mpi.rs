@@ -8,19 +8,16 @@ use anyhow::{Context, Result, ensure};
 use mpi::Threading;
 use mpi::datatype::{Partition, PartitionMut};
 use mpi::topology::SimpleCommunicator;
-use mpi::traits::{Communicator, CommunicatorCollectives, Equivalence, Root};
+use mpi::traits::{Communicator, CommunicatorCollectives, Equivalence};
 
 use super::Ranks;
 
 pub(super) use mpi::environment::Universe;
 
-/// The most bytes in one message: MPI counts in 32 bits.
-const LONGEST: usize = 1 << 30;
-
 /// This process among all that were started together.
 pub(super) struct Mpi {
-    rank: usize,
-    size: usize,
+    pub rank: usize,
+    pub size: usize,
 }
 
 /// Starts MPI. When the first value is dropped, MPI ends, which waits for the other processes.
@@ -42,17 +39,10 @@ fn world() -> SimpleCommunicator {
     SimpleCommunicator::world()
 }
 
-/// These numbers as MPI counts them.
-fn counts(numbers: impl Iterator<Item = usize>) -> Vec<i32> {
-    numbers.map(|n| n.try_into().expect("fewer than 2^31 weights, and bytes of states")).collect()
-}
-
-fn lengths(slices: &[Range<usize>]) -> Vec<i32> {
-    counts(slices.iter().map(Range::len))
-}
-
-fn firsts(slices: &[Range<usize>]) -> Vec<i32> {
-    counts(slices.iter().map(|slice| slice.start))
+/// The lengths and the beginnings of slices, as MPI counts them: in 32 bits.
+fn counts(slices: &[Range<usize>]) -> (Vec<i32>, Vec<i32>) {
+    let count = |n: usize| -> i32 { n.try_into().expect("fewer than 2^31 weights, and bytes of states") };
+    slices.iter().map(|slice| (count(slice.len()), count(slice.start))).unzip()
 }
 
 /// The slices of `array` that the ranks write, one after another.
@@ -60,23 +50,17 @@ fn places<'a, T: Equivalence>(
     array: &'a mut [T],
     slices: &[Range<usize>],
 ) -> PartitionMut<'a, [T], Vec<i32>, Vec<i32>> {
-    PartitionMut::new(array, lengths(slices), firsts(slices))
+    let (lengths, firsts) = counts(slices);
+    PartitionMut::new(array, lengths, firsts)
 }
 
 impl Ranks for Mpi {
-    fn size(&self) -> usize {
-        self.size
-    }
-
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
     fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let own = slices[self.rank].len();
         let mut received = vec![0.0; own * self.size];
         let of_ranks: Vec<Range<usize>> = (0..self.size).map(|rank| rank * own..(rank + 1) * own).collect();
-        let sent = Partition::new(numbers, lengths(slices), firsts(slices));
+        let (lengths, firsts) = counts(slices);
+        let sent = Partition::new(numbers, lengths, firsts);
         world().all_to_all_varcount_into(&sent, &mut places(&mut received, &of_ranks));
         received
     }
@@ -99,16 +83,6 @@ impl Ranks for Mpi {
         let mut all = vec![0; end];
         world().all_gather_varcount_into(&bytes[..], &mut places(&mut all, &slices));
         slices.into_iter().map(|slice| all[slice].to_vec()).collect()
-    }
-
-    fn broadcast(&self, mut bytes: Vec<u8>) -> Vec<u8> {
-        let world = world();
-        let first = world.process_at_rank(0);
-        let mut length = bytes.len() as u64;
-        first.broadcast_into(&mut length);
-        bytes.resize(length as usize, 0);
-        bytes.chunks_mut(LONGEST).for_each(|part| first.broadcast_into(part));
-        bytes
     }
 
     fn abort(&self) -> ! {

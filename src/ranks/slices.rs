@@ -22,22 +22,19 @@ pub struct Slices {
 }
 
 impl Exchange {
-    /// Deals the chunks of an array, which follow one another, to the ranks.
-    pub fn slices(&self, chunks: &[Range<usize>]) -> Slices {
-        Slices::new(self.clone(), chunks, (self.rank(), self.ranks()))
+    /// Deals these chunks of an array, which follow one another, to the ranks.
+    pub fn slices(&self, chunks: Vec<Range<usize>>) -> Slices {
+        let end = |count: usize| chunks[..count].last().map_or(0, |chunk| chunk.end);
+        let values = |rank| {
+            let dealt = part(chunks.len(), rank, self.size);
+            end(dealt.start)..end(dealt.end)
+        };
+        let all: Vec<Range<usize>> = (0..self.size).map(values).collect();
+        Slices { exchange: self.clone(), dealt: self.own(chunks.len()), own: all[self.rank].clone(), chunks, all }
     }
 }
 
 impl Slices {
-    fn new(exchange: Exchange, chunks: &[Range<usize>], (rank, ranks): (usize, usize)) -> Self {
-        let end = |count: usize| chunks[..count].last().map_or(0, |chunk| chunk.end);
-        let dealt = (0..ranks).map(|rank| part(chunks.len(), rank, ranks));
-        let all: Vec<Range<usize>> = dealt.map(|dealt| end(dealt.start)..end(dealt.end)).collect();
-        let own = all[rank].clone();
-        let dealt = part(chunks.len(), rank, ranks);
-        Self { exchange, chunks: chunks.to_vec(), dealt, all, own }
-    }
-
     /// Writes to `numbers` the sum over all ranks. `sum` adds up a chunk over the shards of this rank, and the sums of the ranks
     /// are added as a tree. Afterwards `numbers` hold this rank's slice. Returns what `of` computes from each chunk, in the order
     /// of the chunks.
@@ -55,12 +52,11 @@ impl Slices {
             return split(numbers, &self.chunks).into_par_iter().map(sum_and_of).collect();
         }
         split(numbers, &self.chunks).into_par_iter().for_each(|(chunk, out)| sum(chunk, out));
-        let parts = self.exchange.all_to_all(numbers, &self.all, self.own.len());
+        let parts = self.exchange.all_to_all(numbers, &self.all);
         // A rank without values has no chunks either, so the length does not matter.
         let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
         let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
-            let own = chunk.start - self.own.start..chunk.end - self.own.start;
-            tree_sum(out, &parts.iter().map(|part| &part[own.clone()]).collect::<Vec<_>>());
+            tree_sum(out, &parts, chunk.start - self.own.start..chunk.end - self.own.start);
             of(out)
         };
         let own = split(&mut numbers[self.own.clone()], &self.chunks[self.dealt.clone()]);
@@ -69,7 +65,7 @@ impl Slices {
 
     /// Replaces the slices of the other ranks by what these have computed.
     pub fn all_gather(&self, numbers: &mut [f32]) {
-        self.exchange.all_gather_slices(numbers, &self.all, self.own.len());
+        self.exchange.all_gather_slices(numbers, &self.all);
     }
 
     /// The values with the slices of all ranks.
@@ -99,8 +95,12 @@ mod tests {
             (4, vec![0..5, 5..10, 10..12, 12..20]),
             (8, vec![0..0, 0..5, 5..5, 5..10, 10..12, 12..12, 12..17, 17..20]),
         ] {
-            let slices: Vec<Slices> =
-                (0..ranks).map(|rank| Slices::new(Exchange::alone(1), &chunks, (rank, ranks))).collect();
+            let of_rank = |rank| {
+                let mut exchange = Exchange::alone(1);
+                (exchange.rank, exchange.size) = (rank, ranks);
+                exchange.slices(chunks.to_vec())
+            };
+            let slices: Vec<Slices> = (0..ranks).map(of_rank).collect();
             assert_eq!(slices[0].all, expected, "{ranks} ranks");
             let dealt: Vec<Range<usize>> =
                 slices.into_iter().flat_map(|slices| slices.chunks[slices.dealt].to_vec()).collect();

@@ -156,7 +156,10 @@ impl Session {
             sums.iter().for_each(|sums| total += *sums);
             total
         };
-        let steps = exchange.sum(&sums, total, |sum, more| *sum += more);
+        let steps = exchange.sum(&sums, total, |mut sum, more| {
+            sum += more;
+            sum
+        });
         (ended, steps)
     }
 

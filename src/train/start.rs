@@ -260,7 +260,7 @@ fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
 
 /// Checks that a policy with the `stored` settings can begin a training run with these.
 fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig) -> Result<()> {
-    checkpoint.expect_policy(&settings.net(), &Record::parse(&checkpoint.hand)?.spaces())?;
+    load::expect_policy(checkpoint, settings)?;
     let [found, expected] = [stored, settings].map(|settings| (settings.activation, settings.symmetry));
     ensure!(
         found == expected,

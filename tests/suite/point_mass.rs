@@ -232,7 +232,7 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
 /// Returns the mean action of the policy for one observation.
 fn answer(ppo: &Ppo) -> [f32; 2] {
     let (policy, mut means) = (ppo.policy.freeze(), [0.0; 2]);
-    policy.mean_actions(&[0.3, -0.4], &mut means, &mut policy.workspace(1));
+    policy.compute(&[0.3, -0.4], [&mut means, &mut []], &mut policy.workspace(1));
     means
 }
 
@@ -269,7 +269,7 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
         let mut expected = -0.2 * distance;
         if block.dones[i] && distance <= 3.0 {
             let mut value = [0.0];
-            policy.values(&moved, &mut value, &mut work);
+            policy.compute(&moved, [&mut [], &mut value], &mut work);
             expected += 0.9 * value[0];
             let next = 2 * (i + block.step(0, 1).len());
             let goes_on = (0..2).all(|axis| (block.observations[next + axis] - moved[axis]).abs() < 1e-5);

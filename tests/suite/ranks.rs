@@ -36,14 +36,6 @@ impl Seat {
 }
 
 impl Ranks for Seat {
-    fn size(&self) -> usize {
-        self.table.put.lock().unwrap().len()
-    }
-
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
     fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let own = slices[self.rank].clone();
         self.floats(numbers).iter().flat_map(|of_rank| of_rank[own.clone()].to_vec()).collect()
@@ -63,10 +55,6 @@ impl Ranks for Seat {
         all
     }
 
-    fn broadcast(&self, bytes: Vec<u8>) -> Vec<u8> {
-        self.all_gather(bytes).swap_remove(0)
-    }
-
     fn abort(&self) -> ! {
         panic!("rank {} ends all", self.rank)
     }
@@ -80,7 +68,9 @@ fn on_ranks<T: Send>(ranks: usize, shards: usize, work: impl Fn(usize, Exchange)
             let (table, work) = (table.clone(), &work);
             scope.spawn(move || {
                 let threads = rayon::ThreadPoolBuilder::new().num_threads(1 + rank % 2).build().unwrap();
-                threads.install(|| work(rank, Exchange::new(Arc::new(Seat { rank, table })).over(shards).unwrap()))
+                threads.install(|| {
+                    work(rank, Exchange::new(rank, ranks, Arc::new(Seat { rank, table })).over(shards).unwrap())
+                })
             })
         };
         let all: Vec<_> = (0..ranks).map(start).collect();

@@ -184,7 +184,8 @@ fn a_rollout_holds_what_the_environments_show_and_the_policy_perceives_it() {
         let mut turns_matter = 0;
         for (row, &value) in block.acted_on().chunks_exact(OBSERVATION_SIZE).zip(&block.values) {
             let mut found = [0.0];
-            policy.values(&turned(row, [0.5, 0.5, -0.5, 0.5]), &mut found, &mut policy.workspace(1));
+            let turned = turned(row, [0.5, 0.5, -0.5, 0.5]);
+            policy.compute(&turned, [&mut [], &mut found], &mut policy.workspace(1));
             turns_matter += usize::from((found[0] - value).abs() > 1e-4);
         }
         assert_eq!(turns_matter == 0, perceives, "{symmetry}: {turns_matter}");

@@ -5,16 +5,6 @@ use candle_core::{D, Result, Tensor};
 use super::super::backend::Losses;
 use crate::config::PpoConfig;
 
-/// The action distributions of M samples.
-pub(super) struct Gaussian {
-    /// `[M, A]`
-    pub means: Tensor,
-    /// `[A]`: logarithms of the policy's standard deviations
-    pub log_std: Tensor,
-    /// `[M, 1]`: factors on the policy's standard deviations for each sample
-    pub scales: Tensor,
-}
-
 /// The data of a minibatch.
 pub(super) struct Batch {
     /// `[M, O]`: as the nets see them
@@ -23,77 +13,79 @@ pub(super) struct Batch {
     pub actions: Tensor,
     /// `[M, A]`: means of the distributions that the actions were drawn from
     pub old_means: Tensor,
-    /// `[M, 1]`: factors on the standard deviations
+    /// `[A]`: logarithms of the policy's standard deviations
+    pub log_std: Tensor,
+    /// `[M, 1]`: factors on the policy's standard deviations
     pub scales: Tensor,
-    /// `[M]`: log-densities of the actions under those distributions
+    /// `[M, 1]`: log-densities of the actions under those distributions
     pub old_log_probs: Tensor,
-    /// `[M]`: values of the critic at that time
+    /// `[M, 1]`: values of the critic at that time
     pub old_values: Tensor,
-    /// `[M]`
+    /// `[M, 1]`
     pub advantages: Tensor,
-    /// `[M]`
+    /// `[M, 1]`
     pub returns: Tensor,
 }
 
-impl Gaussian {
-    /// The log-density of `actions` `[M, A]` for each sample, `[M]`. It omits the logarithm of the scales, here
-    /// and where the actions were drawn, since only ratios are used.
+impl Batch {
+    /// The log-density of the actions for each sample, `[M, 1]`, under Gaussians with these means `[M, A]`. It omits the logarithm
+    /// of the scales, here and where the actions were drawn, since only ratios are used.
     ///
     /// # Errors
     /// Fails if the shapes do not match.
-    pub(super) fn log_prob(&self, actions: &Tensor) -> Result<Tensor> {
-        let z = (actions - &self.means)?.broadcast_div(&self.log_std.exp()?)?.broadcast_div(&self.scales)?;
+    fn log_prob(&self, means: &Tensor) -> Result<Tensor> {
+        let z = (&self.actions - means)?.broadcast_div(&self.log_std.exp()?)?.broadcast_div(&self.scales)?;
         let constant = 0.5 * std::f64::consts::TAU.ln() * self.log_std.elem_count() as f64;
         let log_scale = (self.log_std.sum_all()? + constant)?;
-        (z.sqr()?.sum(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
+        (z.sqr()?.sum_keepdim(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
     }
 
-    /// The mean over the samples of the KL divergence from the Gaussians with these means `[M, A]` and the same
-    /// standard deviations.
+    /// The mean over the samples of the KL divergence of Gaussians with these means `[M, A]` from those that the actions were
+    /// drawn from.
     ///
     /// # Errors
     /// Fails if the shapes do not match.
-    pub(super) fn kl(&self, old_means: &Tensor) -> Result<Tensor> {
-        let moved = (old_means - self.means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
+    fn kl(&self, means: &Tensor) -> Result<Tensor> {
+        let moved = (&self.old_means - means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
         (moved / (&self.log_std * 2.0)?.exp()?)?.sum_all()? * 0.5
     }
 }
 
 /// The loss that is minimised, a mean over the samples of the minibatch, and the sums over these. The nets have returned
-/// the distribution `new` and `values` `[M]`.
+/// these `means` `[M, A]` and `values` `[M, 1]`.
 ///
 /// Policy: J. Schulman et al., "Proximal policy optimization algorithms" (2017), eq. 7. The value is clipped in the same way.
 ///
 /// # Errors
 /// Fails if the shapes do not match.
-pub(super) fn losses(config: &PpoConfig, batch: &Batch, new: &Gaussian, values: &Tensor) -> Result<(Tensor, Losses)> {
-    let ratios = (new.log_prob(&batch.actions)? - &batch.old_log_probs)?.exp()?;
+pub(super) fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: &Tensor) -> Result<(Tensor, Losses)> {
+    let ratios = (batch.log_prob(means)? - &batch.old_log_probs)?.exp()?;
     let policy = surrogate(config, batch, &ratios)?.neg()?;
     let value = value_error(config, batch, values)?;
-    let excess = (&new.means - new.means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
+    let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
 
-    let ratios = ratios.to_vec1::<f32>()?;
+    let ratios = ratios.flatten_all()?.to_vec1::<f32>()?;
     let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
     let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
     let sums = Losses {
         surrogate: -sum(&policy)?,
         value_error: sum(&value)?,
         excess: sum(&excess)?,
-        kl: sum(&new.kl(&batch.old_means)?)?,
+        kl: sum(&batch.kl(means)?)?,
         clipped: errors().filter(|&error| error > config.clip).count() as f64,
         ratio_error: errors().fold(0.0, f64::max),
     };
     Ok((total, sums))
 }
 
-/// The mean clipped surrogate for these ratios `[M]`.
+/// The mean clipped surrogate for these ratios `[M, 1]`.
 fn surrogate(config: &PpoConfig, batch: &Batch, ratios: &Tensor) -> Result<Tensor> {
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     (ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?.mean_all()
 }
 
-/// The mean clipped squared error of these values `[M]`.
+/// The mean clipped squared error of these values `[M, 1]`.
 fn value_error(config: &PpoConfig, batch: &Batch, values: &Tensor) -> Result<Tensor> {
     let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
     let clipped = (&batch.old_values + step)?;
@@ -110,12 +102,19 @@ mod tests {
         Tensor::from_slice(values, shape, &Device::Cpu).unwrap()
     }
 
-    /// Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales.
-    fn gaussian(means: &[f32], scales: &[f32]) -> Gaussian {
-        Gaussian {
-            means: tensor(means, &[scales.len(), 2]),
+    /// A batch of Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales, whose log-densities are -2.
+    fn batch(actions: &[f32], old_means: &[f32], [scales, old_values, advantages, returns]: [&[f32]; 4]) -> Batch {
+        let column = |values: &[f32]| tensor(values, &[values.len(), 1]);
+        Batch {
+            observations: column(&vec![0.0; scales.len()]),
+            actions: tensor(actions, &[scales.len(), 2]),
+            old_means: tensor(old_means, &[scales.len(), 2]),
             log_std: tensor(&[-0.5, 0.2], &[2]),
-            scales: tensor(scales, &[scales.len(), 1]),
+            scales: column(scales),
+            old_log_probs: column(&vec![-2.0; scales.len()]),
+            old_values: column(old_values),
+            advantages: column(advantages),
+            returns: column(returns),
         }
     }
 
@@ -156,23 +155,16 @@ mod tests {
         let mut config = Config::default().ppo;
         (config.clip, config.value_clip, config.value_coef) = (0.2, 0.3, 2.0);
         let mean = Var::from_tensor(&tensor(&[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &[3, 2])).unwrap();
-        let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3])).unwrap();
-        let actions = tensor(&[0.5, -1.0, -0.3, 0.9, 0.2, 1.5], &[3, 2]);
-        let old = gaussian(&[-0.1, -0.1, 0.4, 0.5, -0.5, 0.5], &[1.0, 1.5, 0.8]);
-        let batch = Batch {
-            observations: tensor(&[0.0; 3], &[3, 1]),
-            old_log_probs: old.log_prob(&actions).unwrap(),
-            actions,
-            old_means: old.means,
-            scales: old.scales.clone(),
-            old_values: tensor(&[0.2, -0.1, 1.0], &[3]),
-            advantages: tensor(&[1.0, 0.5, -2.0], &[3]),
-            returns: tensor(&[0.5, 0.1, 1.9], &[3]),
-        };
-        let new = Gaussian { means: mean.as_tensor().clone(), log_std: old.log_std, scales: old.scales };
-        let (total, sums) = losses(&config, &batch, &new, &value).unwrap();
+        let value = Var::from_tensor(&tensor(&[0.3, -0.6, 1.4], &[3, 1])).unwrap();
+        let mut batch = batch(
+            &[0.5, -1.0, -0.3, 0.9, 0.2, 1.5],
+            &[-0.1, -0.1, 0.4, 0.5, -0.5, 0.5],
+            [&[1.0, 1.5, 0.8], &[0.2, -0.1, 1.0], &[1.0, 0.5, -2.0], &[0.5, 0.1, 1.9]],
+        );
+        batch.old_log_probs = batch.log_prob(&batch.old_means).unwrap();
+        let (total, sums) = losses(&config, &batch, &mean, &value).unwrap();
         let means = sums.means(3);
-        assert_close(&new.log_prob(&batch.actions).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
+        assert_close(&batch.log_prob(&mean).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
         let found = [means.ratio_error, -means.surrogate, means.value_error, means.kl].map(|x| x as f32);
         assert_close(&tensor(&found, &[4]), &[0.721_431, 0.599_859_9, 0.296_666_7, 0.046_028_256]);
         let grads = total.backward().unwrap();
@@ -183,23 +175,12 @@ mod tests {
 
     #[test]
     fn means_beyond_the_bounds_of_actions_are_pulled_back() {
-        let batch = Batch {
-            observations: tensor(&[0.0], &[1, 1]),
-            actions: tensor(&[0.2, 1.5], &[1, 2]),
-            old_means: tensor(&[-0.5, 0.5], &[1, 2]),
-            scales: tensor(&[1.0], &[1, 1]),
-            old_log_probs: tensor(&[-2.0], &[1]),
-            old_values: tensor(&[1.0], &[1]),
-            advantages: tensor(&[-2.0], &[1]),
-            returns: tensor(&[0.9], &[1]),
-        };
+        let batch = batch(&[0.2, 1.5], &[-0.5, 0.5], [&[1.0], &[1.0], &[-2.0], &[0.9]]);
         let mean = Var::from_tensor(&tensor(&[1.5, -0.2], &[1, 2])).unwrap();
         let with = |bounds_coef: f64| {
             let mut config = Config::default().ppo;
             config.bounds_coef = bounds_coef;
-            let Gaussian { log_std, scales, .. } = gaussian(&[0.0; 2], &[1.0]);
-            let new = Gaussian { means: mean.as_tensor().clone(), log_std, scales };
-            let (total, sums) = losses(&config, &batch, &new, &tensor(&[1.4], &[1])).unwrap();
+            let (total, sums) = losses(&config, &batch, &mean, &tensor(&[1.4], &[1, 1])).unwrap();
             assert!((sums.excess - 0.25).abs() < 1e-6);
             total.backward().unwrap().get(&mean).unwrap().clone()
         };
@@ -208,8 +189,8 @@ mod tests {
 
     #[test]
     fn a_distribution_has_no_divergence_from_itself() {
-        let gaussian = gaussian(&[0.3, -2.0], &[3.0]);
-        let kl = gaussian.kl(&gaussian.means).unwrap();
+        let batch = batch(&[0.0; 2], &[0.3, -2.0], [&[3.0], &[0.0], &[0.0], &[0.0]]);
+        let kl = batch.kl(&batch.old_means).unwrap();
         assert!(kl.to_scalar::<f32>().unwrap().abs() < 1e-6);
     }
 }

@@ -15,22 +15,14 @@ use super::backend::{GradientBackend, Losses};
 use super::parameters::Layer;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::{Activation, PpoConfig};
-use crate::ranks::{Minibatch, tree_sum};
+use crate::ranks::Minibatch;
 use crate::spaces::Spaces;
-use loss::{Batch, Gaussian};
+use loss::Batch;
 
 /// The gradient backend in candle.
 pub(super) struct Reference {
-    config: PpoConfig,
-    /// The gradients of the groups of the last minibatch.
-    gradients: Vec<Vec<f32>>,
-}
-
-impl Reference {
-    /// Creates the backend with these settings.
-    pub(super) fn new(config: &PpoConfig) -> Self {
-        Self { config: config.clone(), gradients: Vec::new() }
-    }
+    /// Its settings.
+    pub config: PpoConfig,
 }
 
 /// Gathers these samples of a rollout.
@@ -40,16 +32,17 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
         let located = samples.iter().map(|&sample| rollout.locate(sample));
         located.flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)]).copied().collect()
     };
-    let rows = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
-    let column = |of| Tensor::from_vec(array(1, of), samples.len(), &Device::Cpu);
+    let tensor = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
+    let column = |of| tensor(1, array(1, of));
     let raw = array(observation_size, |block| &block.observations);
     let mut observations = vec![0.0; raw.len()];
     policy.input_transform().apply(&raw, &mut observations);
     Ok(Batch {
-        observations: rows(observation_size, observations)?,
-        actions: rows(action_size, array(action_size, |block| &block.actions))?,
-        old_means: rows(action_size, array(action_size, |block| &block.means))?,
-        scales: rows(1, array(1, |block| &block.noise_scales))?,
+        observations: tensor(observation_size, observations)?,
+        actions: tensor(action_size, array(action_size, |block| &block.actions))?,
+        old_means: tensor(action_size, array(action_size, |block| &block.means))?,
+        log_std: Tensor::full(policy.log_std, action_size, &Device::Cpu)?,
+        scales: column(|block| &block.noise_scales)?,
         old_log_probs: column(|block| &block.log_probs)?,
         old_values: column(|block| &block.values)?,
         advantages: column(|block| &block.advantages)?,
@@ -58,17 +51,21 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
 }
 
 impl GradientBackend for Reference {
-    fn gradients(&mut self, policy: &Policy, rollout: &Rollout, of: &Minibatch) -> Result<Vec<Losses>> {
+    fn gradients(
+        &mut self,
+        policy: &Policy,
+        rollout: &Rollout,
+        of: &Minibatch,
+        gradients: &mut Vec<Vec<f32>>,
+    ) -> Result<Vec<Losses>> {
         let mut sums = Vec::new();
-        self.gradients.clear();
+        gradients.clear();
         for group in &of.groups {
             let batch = gathered(policy, rollout, group)?;
             let mut variables = Vec::new();
             let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
-            let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?.squeeze(1)?;
-            let log_std = Tensor::full(policy.log_std, policy.spaces.action_size, &Device::Cpu)?;
-            let new = Gaussian { means, log_std, scales: batch.scales.clone() };
-            let (total, losses) = loss::losses(&self.config, &batch, &new, &values)?;
+            let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?;
+            let (total, losses) = loss::losses(&self.config, &batch, &means, &values)?;
             sums.push(losses);
             let grads = (total * (group.len() as f64 / of.count as f64))?.backward()?;
             let mut gradient = vec![0.0; policy.layout.count()];
@@ -77,13 +74,9 @@ impl GradientBackend for Reference {
                     gradient[range].copy_from_slice(&grad.flatten_all()?.to_vec1::<f32>()?);
                 }
             }
-            self.gradients.push(gradient);
+            gradients.push(gradient);
         }
         Ok(sums)
-    }
-
-    fn add_up(&self, parameters: Range<usize>, out: &mut [f32]) {
-        tree_sum(out, &self.gradients.iter().map(|gradient| &gradient[parameters.clone()]).collect::<Vec<_>>());
     }
 }
 

@@ -1,7 +1,5 @@
 //! A network on a block of rows: forward and backward, layer by layer, in the cache of one core.
 
-use std::borrow::Cow;
-
 use rayon::prelude::*;
 
 use super::super::parameters;
@@ -34,7 +32,7 @@ struct Dense<'a> {
     /// `[outputs, inputs]`
     weight: Matrix<'a>,
     /// `[inputs, outputs]`: the weight as the forward pass reads it, if a copy was made.
-    weight_t: Option<Cow<'a, [f32]>>,
+    weight_t: Option<Vec<f32>>,
     /// The weight, transposed and as it is, as products in bf16 read it, if it was packed.
     packed: [Option<Packed>; 2],
     /// `[outputs]`
@@ -99,7 +97,7 @@ impl<'a> Net<'a> {
         let learns = purpose == Purpose::Learning;
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
             if !learns {
-                layer.weight_t = Some(layer.transposed().into());
+                layer.weight_t = Some(layer.transposed());
             }
             if let Arithmetic::Bf16(_) = arithmetic {
                 // The lines of the right operands of the forward and of the backward pass.
@@ -110,16 +108,6 @@ impl<'a> Net<'a> {
             }
         }
         jobs.into_par_iter().for_each(|pack| pack());
-    }
-
-    /// Copies of its weights for [`Self::set_copies`].
-    pub(crate) fn copies(&self) -> Vec<Vec<f32>> {
-        self.layers.iter().map(Dense::transposed).collect()
-    }
-
-    /// Gives it copies of its weights, as [`Self::prepare`] makes them for acting.
-    pub(crate) fn set_copies(&mut self, copies: &'a [Vec<f32>]) {
-        self.layers.iter_mut().zip(copies).for_each(|(layer, copy)| layer.weight_t = Some(copy.into()));
     }
 
     /// The number of inputs.
