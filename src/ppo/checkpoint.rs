@@ -6,7 +6,7 @@
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
 
-use super::format::{Array, Content};
+use super::format::{self, Array, Arrays};
 use super::parameters::{ParameterLayout, View};
 use super::{Normalizer, Policy, Ppo, Progress};
 use crate::config::PpoConfig;
@@ -19,23 +19,11 @@ const FORMAT: &str = "shadow-repose checkpoint 5";
 /// The format of files that `scripts/convert` converts.
 const CONVERTIBLE: &str = "shadow-repose checkpoint 4";
 
-/// The text that identifies the physics of the scene.
-const SCENE: &str = "scene";
-
-/// The text that describes the hand and the object of the policy.
-const HAND: &str = "hand";
-
 /// The most bytes of a configuration that are read. Ours take one to two thousand.
 const LONGEST_CONFIG: usize = 1 << 16;
 
-/// The text that says how a published policy was made. `scripts/provenance.py` writes it.
-const PROVENANCE: &str = "provenance";
-
 /// The name of the logarithms of the standard deviations, one for each action: all are equal.
 const LOG_STD: &str = "log_std";
-
-/// The name of the adapted learning rate.
-const LEARNING_RATE: &str = "learning_rate";
 
 /// A checkpoint, or a policy alone, independent of a learner.
 #[derive(Clone, Default)]
@@ -44,13 +32,13 @@ pub struct Checkpoint {
     pub config: String,
     /// The progress of the run.
     pub progress: Progress,
-    /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes.
+    /// How a published policy was made, as JSON: commands, seed, commit, machine, minutes. `scripts/provenance.py` writes it.
     pub provenance: Option<String>,
     /// The fingerprint of the physics of its scene.
     pub scene: String,
     /// The hand and the object that it was trained with, as JSON.
     pub hand: String,
-    content: Content,
+    arrays: Arrays,
 }
 
 impl Checkpoint {
@@ -59,8 +47,8 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the bytes are not a complete checkpoint of this program.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
-        let mut content = Content::parse(bytes)?;
-        let mut text = |key: &str| content.texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
+        let (mut texts, arrays) = format::parse(bytes)?;
+        let mut text = |key: &str| texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
         let format = text("format")?;
         ensure!(format != CONVERTIBLE, "its format is `{format}`; `scripts/convert OLD NEW` writes it as `{FORMAT}`");
         ensure!(format == FORMAT, "its format is `{}`; this program reads `{FORMAT}`", shortened(&format));
@@ -69,13 +57,13 @@ impl Checkpoint {
         ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
         let progress = serde_json::from_str(&text("progress")?)
             .map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
-        let scene = text(SCENE)?;
-        let hand = text(HAND)?;
-        let provenance = content.texts.remove(PROVENANCE);
-        if let Some(key) = content.texts.keys().next() {
+        let scene = text("scene")?;
+        let hand = text("hand")?;
+        let provenance = texts.remove("provenance");
+        if let Some(key) = texts.keys().next() {
             bail!("its metadata has an unknown `{}`", shortened(key));
         }
-        Ok(Self { config, progress, provenance, scene, hand, content })
+        Ok(Self { config, progress, provenance, scene, hand, arrays })
     }
 
     /// The bytes of a file.
@@ -83,18 +71,17 @@ impl Checkpoint {
     /// # Errors
     /// Fails if a value is not finite.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
-        let mut content = self.content.clone();
         let progress = serde_json::to_string(&self.progress)?;
         let always = [
             ("format", FORMAT),
             ("config", &self.config),
             ("progress", &progress),
-            (SCENE, &self.scene),
-            (HAND, &self.hand),
+            ("scene", &self.scene),
+            ("hand", &self.hand),
         ];
-        let provenance = self.provenance.iter().map(|text| (PROVENANCE, text.as_str()));
-        content.texts.extend(always.into_iter().chain(provenance).map(|(key, text)| (key.into(), text.into())));
-        content.to_bytes()
+        let provenance = self.provenance.iter().map(|text| ("provenance", text.as_str()));
+        let texts = always.into_iter().chain(provenance).map(|(key, text)| (key.into(), text.into())).collect();
+        format::to_bytes(texts, &self.arrays)
     }
 
     /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
@@ -103,23 +90,23 @@ impl Checkpoint {
         let needed =
             |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
         let mut alone = self.clone();
-        alone.content.arrays.retain(|name, _| needed(name));
+        alone.arrays.retain(|name, _| needed(name));
         alone.progress.fork = None;
         alone
     }
 
     /// Adds an array.
     pub fn insert(&mut self, name: &str, array: Array) {
-        self.content.arrays.insert(name.to_owned(), array);
+        self.arrays.insert(name.to_owned(), array);
     }
 
     /// The shape of an array, if it exists.
     pub fn shape(&self, name: &str) -> Option<&[usize]> {
-        self.content.arrays.get(name).map(Array::shape)
+        self.arrays.get(name).map(Array::shape)
     }
 
     fn take(&mut self, name: &str) -> Result<Array> {
-        self.content.arrays.remove(name).with_context(|| format!("tensor `{name}` is missing"))
+        self.arrays.remove(name).with_context(|| format!("tensor `{name}` is missing"))
     }
 
     /// Removes an f64 array of any shape and returns its values.
@@ -201,7 +188,7 @@ impl Checkpoint {
     /// # Errors
     /// Fails if one is left, and names it.
     pub fn finish(self) -> Result<()> {
-        match self.content.arrays.keys().next() {
+        match self.arrays.keys().next() {
             Some(name) => bail!("tensor `{}` is not part of this policy", shortened(name)),
             None => Ok(()),
         }
@@ -237,7 +224,7 @@ impl Ppo {
         let log_std = vec![self.policy.log_std; self.policy.spaces.action_size];
         checkpoint.insert(LOG_STD, Array::F32(vec![log_std.len()], log_std));
         checkpoint.insert("adam.steps", Array::U64(vec![1], vec![adam.steps]));
-        checkpoint.insert(LEARNING_RATE, vector(&[self.learning_rate]));
+        checkpoint.insert("learning_rate", vector(&[self.learning_rate]));
         let normalizer = &self.policy.normalizer;
         checkpoint.insert("normalizer.mean", vector(&normalizer.mean));
         checkpoint.insert("normalizer.variance", vector(&normalizer.variance));
@@ -270,7 +257,7 @@ impl Ppo {
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
         ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is not a step count");
         self.adam.steps = steps[0];
-        self.learning_rate = checkpoint.take_vector(LEARNING_RATE, 1)?[0];
+        self.learning_rate = checkpoint.take_vector("learning_rate", 1)?[0];
         ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
         Ok(())
     }
@@ -342,7 +329,7 @@ mod tests {
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
                 assert_eq!(to.learning_rate, 0.123);
                 assert!(to.adam == from.adam && from.adam.mean.iter().any(|&x| x != 0.0));
-                assert_eq!(saved(&to).content, saved(&from).content);
+                assert_eq!(saved(&to).arrays, saved(&from).arrays);
             }
         }
     }
@@ -366,7 +353,7 @@ mod tests {
         let from = learnt(Backend::Fused, 1);
         let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Exchange::alone(1)).unwrap();
         to.begin_with(&saved(&from)).unwrap();
-        assert_eq!(saved(&to).policy_alone().content, saved(&from).policy_alone().content);
+        assert_eq!(saved(&to).policy_alone().arrays, saved(&from).policy_alone().arrays);
         let fresh = config(Backend::Fused, &[8]).learning_rate;
         assert_eq!((to.learning_rate, to.adam.steps), (fresh, 0));
         assert!(learner(&[9]).begin_with(&saved(&from)).is_err());

@@ -3,7 +3,7 @@
 //! The bytes may come from anywhere. Sizes are checked before they determine an allocation, values must be finite, and
 //! content that does not match the checksum is refused.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fmt;
 
 use anyhow::{Context, Result, bail, ensure};
@@ -40,65 +40,56 @@ impl fmt::Display for Damaged {
 
 impl std::error::Error for Damaged {}
 
-/// The content of a file.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Content {
-    /// Texts by name.
-    pub texts: BTreeMap<String, String>,
-    /// Arrays by name.
-    pub arrays: BTreeMap<String, Array>,
+/// Texts by name.
+pub(super) type Texts = BTreeMap<String, String>;
+
+/// Arrays by name.
+pub(super) type Arrays = BTreeMap<String, Array>;
+
+/// The bytes of a file with this content.
+///
+/// # Errors
+/// Fails if an array has a value that is not finite, or a shape that does not match its length.
+pub(super) fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
+    let mut parts = Vec::new();
+    for (name, array) in arrays {
+        ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
+        parts.push((name, array.bytes(), array.shape()));
+    }
+    let mut views = Vec::new();
+    for (name, (kind, bytes), shape) in &parts {
+        views.push((name.to_string(), TensorView::new(*kind, shape.to_vec(), bytes)?));
+    }
+    seal(texts, views)
 }
 
-impl Content {
-    /// The bytes of a file with this content.
-    ///
-    /// # Errors
-    /// Fails if an array has a value that is not finite, or a shape that does not match its length.
-    pub(super) fn to_bytes(&self) -> Result<Vec<u8>> {
-        let mut parts = Vec::new();
-        for (name, array) in &self.arrays {
-            ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
-            parts.push((name, array.bytes(), array.shape()));
-        }
-        let mut views = Vec::new();
-        for (name, (kind, bytes), shape) in &parts {
-            views.push((name.to_string(), TensorView::new(*kind, shape.to_vec(), bytes)?));
-        }
-        seal(self.texts.clone().into_iter().collect(), views)
+/// Parses the bytes of a file.
+///
+/// # Errors
+/// Fails if the bytes were not written by [`to_bytes`], or with [`Damaged`] if they were changed since.
+pub(super) fn parse(bytes: &[u8]) -> Result<(Texts, Arrays)> {
+    let (mut texts, views) = read(bytes)?;
+    let stored = texts.remove(CHECKSUM).context("no checksum: not a file of this program")?;
+    let found = checksum(&texts, &views);
+    ensure!(stored == found, Damaged(format!("damaged: its checksum is {found} instead of {}", shortened(&stored))));
+    let mut arrays = Arrays::new();
+    for (name, view) in views {
+        let array = Array::read(&view).with_context(|| format!("tensor `{}`", shortened(&name)))?;
+        arrays.insert(name, array);
     }
-
-    /// Parses the bytes of a file.
-    ///
-    /// # Errors
-    /// Fails if the bytes were not written by [`Content::to_bytes`], or with [`Damaged`] if they were changed since.
-    pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
-        let (mut texts, views) = read(bytes)?;
-        let stored = texts.remove(CHECKSUM).context("no checksum: not a file of this program")?;
-        let found = checksum(&texts, &views);
-        ensure!(
-            stored == found,
-            Damaged(format!("damaged: its checksum is {found} instead of {}", shortened(&stored)))
-        );
-        let mut arrays = BTreeMap::new();
-        for (name, view) in views {
-            let array = Array::read(&view).with_context(|| format!("tensor `{}`", shortened(&name)))?;
-            arrays.insert(name, array);
-        }
-        Ok(Self { texts: texts.into_iter().collect(), arrays })
-    }
+    Ok((texts, arrays))
 }
 
 /// The file with these texts and arrays and their checksum. The texts are sorted by name, so that files with
 /// equal content are equal. safetensors writes texts in the order of a hash map, which differs from run to run.
-fn seal(mut texts: HashMap<String, String>, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
+fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
-    let mut bytes = safetensors::serialize(views, Some(texts))?;
-    let length = u64::from_le_bytes(*bytes.first_chunk().context("a file begins with the length of its header")?);
-    let header = &mut bytes[8..8 + length as usize];
+    let mut bytes = safetensors::serialize(views, Some(texts.into_iter().collect()))?;
+    let (length, rest) = bytes.split_first_chunk_mut().context("a file begins with the length of its header")?;
+    let header = &mut rest[..u64::from_le_bytes(*length) as usize];
     let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
     parsed.values_mut().filter_map(serde_json::Value::as_object_mut).for_each(serde_json::Map::sort_keys);
     let sorted = serde_json::to_vec(&parsed)?;
-    ensure!(sorted.len() <= header.len(), "sorting made its header longer");
     header.fill(b' ');
     header[..sorted.len()].copy_from_slice(&sorted);
     Ok(bytes)
@@ -117,9 +108,7 @@ pub fn expect_safetensors(bytes: &[u8]) -> Result<()> {
 }
 
 /// The texts of a file, and its arrays sorted by name.
-type Raw<'a> = (HashMap<String, String>, Vec<(String, TensorView<'a>)>);
-
-fn read(bytes: &[u8]) -> Result<Raw<'_>> {
+fn read(bytes: &[u8]) -> Result<(Texts, Vec<(String, TensorView<'_>)>)> {
     expect_safetensors(bytes)?;
     let whole = |error: SafeTensorError| {
         let reason = shortened(&error.to_string());
@@ -129,7 +118,7 @@ fn read(bytes: &[u8]) -> Result<Raw<'_>> {
     let texts = header.metadata().clone().context("no metadata: not a file of this program")?;
     let mut views = SafeTensors::deserialize(bytes).map_err(whole)?.tensors();
     views.sort_by(|(a, _), (b, _)| a.cmp(b));
-    Ok((texts, views))
+    Ok((texts.into_iter().collect(), views))
 }
 
 /// The file with these bytes and a checksum that matches its content, for tests of what follows the checksum.
@@ -143,13 +132,12 @@ pub fn sealed(bytes: &[u8]) -> Result<Vec<u8>> {
 }
 
 /// The CRC-32 of all names, texts, types, shapes and values. It does not depend on the layout of the header.
-fn checksum(texts: &HashMap<String, String>, views: &[(String, TensorView)]) -> String {
+fn checksum(texts: &Texts, views: &[(String, TensorView)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     let mut take = |part: &[u8]| {
         hasher.update(&(part.len() as u64).to_le_bytes());
         hasher.update(part);
     };
-    let texts: BTreeMap<&String, &String> = texts.iter().collect();
     for (key, text) in texts {
         take(key.as_bytes());
         take(text.as_bytes());
@@ -207,17 +195,22 @@ impl Array {
 mod tests {
     use super::*;
 
-    fn content() -> Content {
-        let mut content = Content::default();
-        content.texts.insert("config".into(), "a = 1".into());
-        content.arrays.insert("weight".into(), Array::F32(vec![2, 2], vec![1.5, -2.0, 0.0, 4.0]));
-        content.arrays.insert("count".into(), Array::U64(vec![1], vec![u64::MAX]));
-        content.arrays.insert("mean".into(), Array::F64(vec![2], vec![0.1, 0.2]));
-        content
+    fn content() -> (Texts, Arrays) {
+        let arrays = [
+            ("weight", Array::F32(vec![2, 2], vec![1.5, -2.0, 0.0, 4.0])),
+            ("count", Array::U64(vec![1], vec![u64::MAX])),
+            ("mean", Array::F64(vec![2], vec![0.1, 0.2])),
+        ];
+        let texts = Texts::from([("config".into(), "a = 1".into())]);
+        (texts, arrays.map(|(name, array)| (name.to_owned(), array)).into())
+    }
+
+    fn written((texts, arrays): (Texts, Arrays)) -> Vec<u8> {
+        to_bytes(texts, &arrays).unwrap()
     }
 
     fn refusal(bytes: &[u8]) -> String {
-        format!("{:#}", Content::parse(bytes).unwrap_err())
+        format!("{:#}", parse(bytes).unwrap_err())
     }
 
     /// The position of these bytes in the file.
@@ -227,22 +220,22 @@ mod tests {
 
     #[test]
     fn what_is_written_is_what_is_read() {
-        assert_eq!(Content::parse(&content().to_bytes().unwrap()).unwrap(), content());
+        assert_eq!(parse(&written(content())).unwrap(), content());
     }
 
     #[test]
     fn files_of_equal_content_are_equal() {
         let mut many = content();
-        (0..20).for_each(|i| drop(many.texts.insert(format!("text {i}"), "x".into())));
+        (0..20).for_each(|i| drop(many.0.insert(format!("text {i}"), "x".into())));
         // Each call fills a new hash map, with its own order.
-        let bytes = many.to_bytes().unwrap();
-        assert!((0..20).all(|_| many.clone().to_bytes().unwrap() == bytes));
-        assert_eq!(Content::parse(&bytes).unwrap(), many);
+        let bytes = written(many.clone());
+        assert!((0..20).all(|_| written(many.clone()) == bytes));
+        assert_eq!(parse(&bytes).unwrap(), many);
     }
 
     #[test]
     fn every_changed_bit_of_texts_and_numbers_is_found() {
-        let bytes = content().to_bytes().unwrap();
+        let bytes = written(content());
         let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
         for bit in 0..8 * (bytes.len() - header) {
             let mut changed = bytes.clone();
@@ -256,7 +249,7 @@ mod tests {
 
     #[test]
     fn cut_off_and_foreign_files_are_refused() {
-        let bytes = content().to_bytes().unwrap();
+        let bytes = written(content());
         for length in [0, 7, 8, 100, bytes.len() / 2, bytes.len() - 1] {
             assert!(refusal(&bytes[..length]).contains("cut off"));
         }
@@ -266,7 +259,7 @@ mod tests {
 
     #[test]
     fn a_header_that_claims_to_be_huge_is_refused_unread() {
-        let mut bytes = content().to_bytes().unwrap();
+        let mut bytes = written(content());
         for length in [LARGEST_HEADER + 1, 1 << 40, u64::MAX] {
             bytes[..8].copy_from_slice(&length.to_le_bytes());
             assert!(refusal(&bytes).contains("not a safetensors file"));
@@ -291,9 +284,9 @@ mod tests {
     #[test]
     fn numbers_that_are_not_finite_are_neither_written_nor_read() {
         let mut bad = content();
-        bad.arrays.insert("weight".into(), Array::F32(vec![1], vec![f32::NAN]));
-        assert!(bad.to_bytes().unwrap_err().to_string().contains("`weight` is not finite"));
-        let mut bytes = content().to_bytes().unwrap();
+        bad.1.insert("weight".into(), Array::F32(vec![1], vec![f32::NAN]));
+        assert!(to_bytes(bad.0, &bad.1).unwrap_err().to_string().contains("`weight` is not finite"));
+        let mut bytes = written(content());
         let at = find(&bytes, &0.2_f64.to_le_bytes());
         bytes[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
         assert!(refusal(&bytes).contains("checksum"));

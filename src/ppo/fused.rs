@@ -43,18 +43,6 @@ impl Fused {
     pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
         Self { config: config.clone(), arithmetic, workspaces: Vec::new(), seen: Vec::new() }
     }
-
-    /// Makes workspaces for these groups. The result is the number of rows that pass through a net together, chosen for blocks of equal
-    /// size as far as possible.
-    fn reserve(&mut self, policy: &Policy, groups: &[&[u32]]) -> usize {
-        let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
-        let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        self.workspaces.retain_mut(|work| work.get_mut().expect("no job has panicked").rows >= rows);
-        while self.workspaces.len() < rayon::current_num_threads() {
-            self.workspaces.push(Mutex::new(Workspace::new(&policy.layout.actor, rows, self.arithmetic)));
-        }
-        rows
-    }
 }
 
 impl GradientBackend for Fused {
@@ -77,7 +65,11 @@ impl GradientBackend for Fused {
         of: &Minibatch,
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>> {
-        let rows = self.reserve(policy, &of.groups);
+        let workspace = || Mutex::new(Workspace::new(&policy.layout.actor, ROWS, self.arithmetic));
+        self.workspaces.resize_with(rayon::current_num_threads(), workspace);
+        // The rows that pass through a net together: blocks of equal size as far as possible.
+        let samples = of.groups.iter().map(|group| group.len()).max().unwrap_or(0);
+        let rows = samples.div_ceil(samples.div_ceil(ROWS));
         let nets = policy.nets(self.arithmetic, Purpose::Learning);
         let loss = Loss::new(policy, rollout, of.count, &self.config);
         // Passes the samples of a group forward and backward through a net.
@@ -87,7 +79,7 @@ impl GradientBackend for Fused {
             let thread = rayon::current_thread_index().expect("runs on a rayon thread");
             let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
             for (i, block) in group.chunks(rows).enumerate() {
-                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(net.inputs())) {
+                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(policy.spaces.observation_size)) {
                     row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
                 }
                 net.forward(block.len(), work);

@@ -1,5 +1,6 @@
 //! The learning rate, which keeps the KL divergence of an update near the desired one.
 
+use super::Ppo;
 use crate::config::PpoConfig;
 
 /// The learning rate after a minibatch, given the KL divergence of the current policy from the policy that collected, as
@@ -16,21 +17,21 @@ pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f
     }
 }
 
-/// The learning rate of a fork with the settings `config`. It is the configured rate if the user changed it or fixed
-/// it, else the adapted rate within its bounds. The parent had the settings `before` and had adapted it to `rate`.
-pub(super) fn reconciled(rate: f64, before: &PpoConfig, config: &PpoConfig) -> f64 {
-    if config.desired_kl.0.to == 0.0 || config.learning_rate != before.learning_rate {
-        return config.learning_rate;
+impl Ppo {
+    /// Brings the learning rate of a fork, whose parent had the settings `before` and had adapted it, in line with its own
+    /// settings. It is the configured rate if the user changed it or fixed it, else the adapted rate within its bounds.
+    pub fn reconcile_learning_rate(&mut self, before: &PpoConfig) {
+        let config = &self.config;
+        let [lowest, highest] = config.learning_rate_range;
+        let is_kept = config.desired_kl.0.to != 0.0 && config.learning_rate == before.learning_rate;
+        self.learning_rate = if is_kept { self.learning_rate.clamp(lowest, highest) } else { config.learning_rate };
     }
-    let [lowest, highest] = config.learning_rate_range;
-    rate.clamp(lowest, highest)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::{Config, Geometric, Ramp};
-    use crate::ppo::Ppo;
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
 
@@ -77,7 +78,11 @@ mod tests {
         for (rate, configured, desired, expected) in
             [(7e-4, 1e-3, 0.01, 7e-4), (7e-4, 6e-4, 0.01, 6e-4), (7e-4, 1e-3, 0.0, 1e-3), (1e-4, 1e-3, 0.01, 5e-4)]
         {
-            assert_eq!(reconciled(rate, &before, &config(configured, Ramp::constant(desired))), expected);
+            let config = config(configured, Ramp::constant(desired));
+            let mut ppo = Ppo::new(&config, SPACES, 0, Exchange::alone(1)).unwrap();
+            ppo.learning_rate = rate;
+            ppo.reconcile_learning_rate(&before);
+            assert_eq!(ppo.learning_rate, expected);
         }
     }
 

@@ -158,11 +158,6 @@ impl Ppo {
     pub fn noise(&self, iteration: u64, block: usize) -> Rng {
         rng::stream(self.seed, "action noise", iteration << 32 | block as u64)
     }
-
-    /// Brings the learning rate of a fork, whose parent had the settings `before`, in line with its own settings.
-    pub fn reconcile_learning_rate(&mut self, before: &PpoConfig) {
-        self.learning_rate = learning_rate::reconciled(self.learning_rate, before, &self.config);
-    }
 }
 
 #[cfg(test)]

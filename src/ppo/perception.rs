@@ -40,20 +40,15 @@ impl Perception {
     #[inline(always)]
     pub fn canonicalize(&self, observation: &mut [f32]) {
         let Some(ObjectAndGoal { object, goal, .. }) = self.object_and_goal else { return };
-        let best = self.nearest(quaternion(observation, object));
+        let q = quaternion(observation, object);
+        // The cosine of half the angle that remains to the unrotated orientation. All are computed first, so that the loop vectorises.
+        let close = self.rotations.map(|s| (q[0] * s[0] - q[1] * s[1] - q[2] * s[2] - q[3] * s[3]).abs());
+        let best = self.rotations[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })];
         for place in [object, goal] {
             let turned = quat::mul(quaternion(observation, place), best);
             let turned = if turned[0] < 0.0 { turned.map(|x| -x) } else { turned };
             observation[place..place + 4].copy_from_slice(&turned);
         }
-    }
-
-    /// The rotation about the cube's own axes that brings the cube closest to its unrotated orientation.
-    #[inline(always)]
-    fn nearest(&self, q: [f32; 4]) -> [f32; 4] {
-        // The cosine of half the remaining angle for each rotation. All are computed first, so that the loop vectorises.
-        let close = self.rotations.map(|s| (q[0] * s[0] - q[1] * s[1] - q[2] * s[2] - q[3] * s[3]).abs());
-        self.rotations[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })]
     }
 }
 

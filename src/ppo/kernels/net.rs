@@ -110,11 +110,6 @@ impl<'a> Net<'a> {
         jobs.into_par_iter().for_each(|pack| pack());
     }
 
-    /// The number of inputs.
-    pub(crate) fn inputs(&self) -> usize {
-        self.layers[0].inputs
-    }
-
     /// The number of outputs.
     pub(crate) fn outputs(&self) -> usize {
         self.layers.last().expect("a net has layers").outputs
