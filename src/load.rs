@@ -12,7 +12,7 @@ use anyhow::{Context, Error, Result, ensure};
 use crate::config::{BUILTIN_MODEL, Config, MODEL, Override, PpoConfig, Reader, Settings, Source};
 use crate::evaluate::Actor;
 use crate::os::{self, say};
-use crate::ppo::{Checkpoint, Damaged, Policy, Progress, expect_safetensors};
+use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
 use crate::repose::{Record, Task};
 use crate::run;
 
@@ -183,8 +183,7 @@ impl Loaded {
 /// # Errors
 /// Fails if the file cannot be read, is damaged, or is not one of this program.
 pub fn read(path: &Path) -> Result<Checkpoint> {
-    let bytes = os::read_bytes_if(path, |start| expect_safetensors(start).with_context(|| cannot_use(path)))?;
-    Checkpoint::parse(&bytes).with_context(|| cannot_use(path))
+    Checkpoint::parse(&os::read_bytes(path)?).with_context(|| cannot_use(path))
 }
 
 /// The first of the listed files (newest first) that is not damaged. A warning names each one before it. A file

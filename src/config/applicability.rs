@@ -30,8 +30,10 @@ pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
 fn users(key: &str) -> &'static [&'static str] {
     match key {
         "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.patience" => &["train"],
-        key if key.starts_with("hand.") => &["train", "bench", "play", "view", "export"],
-        key if key.starts_with("env.") && key != "env.num_envs" => &["train", "bench", "play", "view", "export"],
+        "env.num_envs" => &["train", "bench"],
+        key if ["env.", "hand."].iter().any(|begin| key.starts_with(begin)) => {
+            &["train", "bench", "play", "view", "export"]
+        }
         _ => &["train", "bench"],
     }
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::LazyLock;
 
+use toml::Value::{Array, Float, Integer};
 use toml::{Table, Value};
 
 use super::BASE;
@@ -143,19 +144,17 @@ fn inner(expected: &Table, value: &Value) -> Option<Table> {
 /// Converts `value` to the type of the base's value. The error describes that type.
 fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
     match (expected, value) {
-        (Value::Float(_), Value::Float(x)) if !x.is_finite() => Err("a finite number".into()),
-        (Value::Float(_), Value::Float(_)) | (Value::String(_), Value::String(_)) => Ok(value.clone()),
-        (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(*i as f64)),
-        (Value::Integer(_), Value::Integer(i)) if *i >= 0 => Ok(value.clone()),
+        (Float(_), Float(x)) if !x.is_finite() => Err("a finite number".into()),
+        (Float(_), Float(_)) | (Value::String(_), Value::String(_)) => Ok(value.clone()),
+        (Float(_), Integer(i)) => Ok(Float(*i as f64)),
+        (Integer(_), Integer(i)) if *i >= 0 => Ok(value.clone()),
         // Users write large numbers of steps as 1e8.
-        (Value::Integer(_), Value::Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => {
-            Ok(Value::Integer(*x as i64))
-        }
-        (Value::Array(expected), Value::Array(values)) => {
+        (Integer(_), Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => Ok(Integer(*x as i64)),
+        (Array(expected), Array(values)) => {
             // An empty list is a list of names.
             let one = expected.first().cloned().unwrap_or(Value::String(String::new()));
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
-            typed.map(Value::Array).map_err(|rule| format!("an array of values that are each {rule}"))
+            typed.map(Array).map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
@@ -170,10 +169,10 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
 /// What a value in the place of this one must be.
 fn type_of(expected: &Value) -> String {
     let text = match expected {
-        Value::Float(_) => "a number",
-        Value::Integer(_) => "a whole number, not negative",
+        Float(_) => "a number",
+        Integer(_) => "a whole number, not negative",
         Value::String(_) => "a string",
-        Value::Array(_) => return format!("an array, e.g. {expected}"),
+        Array(_) => return format!("an array, e.g. {expected}"),
         Value::Table(table) if is_ramp(table) => "a number, or { from = …, to = …, steps = …, after = … }",
         Value::Table(table) if table.is_empty() => {
             "a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }"

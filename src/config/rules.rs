@@ -225,18 +225,17 @@ impl Rules {
 
     /// Checks a number, both ends of a ramp, or the numbers of all groups.
     fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: impl Display) {
-        let value = lookup(table, key).expect("a setting");
-        let numbers = match value.as_table() {
-            // The other parts of a ramp are counts of steps.
-            Some(parts) => {
-                let parts = parts.iter().filter(|(_, value)| value.is_float());
-                parts.map(|(part, value)| (format!("{key}.{part}"), value)).collect()
-            }
-            None => vec![(key.to_owned(), value)],
-        };
-        for (name, value) in numbers {
+        let mut check = |name: &str, value: &Value| {
             let x = number(value).expect("a number");
-            self.check(holds(x), &name, brief(x), &rule);
+            self.check(holds(x), name, brief(x), &rule);
+        };
+        match lookup(table, key).expect("a setting") {
+            // The other parts of a ramp are counts of steps.
+            Value::Table(parts) => {
+                let floats = parts.iter().filter(|(_, value)| value.is_float());
+                floats.for_each(|(part, value)| check(&format!("{key}.{part}"), value));
+            }
+            value => check(key, value),
         }
     }
 }

@@ -14,9 +14,6 @@ const LARGEST_TEXT: u64 = 1 << 20;
 /// The most bytes of a binary file. The largest policy that the settings allow, its optimizer and 65536 environments take less.
 const LARGEST_BYTES: u64 = 1 << 30;
 
-/// The bytes at the beginning of a file that are looked at first.
-const BEGINNING: u64 = 64;
-
 /// An operation on a file or folder, whose error says what could not be done.
 pub trait Cannot<T> {
     /// Says that one cannot `do_what` with `path`.
@@ -49,25 +46,14 @@ pub fn read_text(path: &Path) -> Result<String> {
 /// # Errors
 /// Fails if the file cannot be read, is not a regular file, or is larger than any file of this program.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
-    read_bytes_if(path, |_| Ok(()))
-}
-
-/// Reads the bytes of a regular file if its beginning passes a check, before there is memory for the rest.
-///
-/// # Errors
-/// Fails if the check does, or as [`read_bytes`] does.
-pub fn read_bytes_if(path: &Path, check: impl Fn(&[u8]) -> Result<()>) -> Result<Vec<u8>> {
     let facts = fs::metadata(path).cannot("read", path)?;
     ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
     let size = facts.len();
     ensure!(size <= LARGEST_BYTES, "{}: {size} bytes is larger than any file of this program", path.display());
-    let mut file = File::open(path).cannot("read", path)?;
     let mut bytes = Vec::new();
-    file.by_ref().take(BEGINNING).read_to_end(&mut bytes).cannot("read", path)?;
-    check(&bytes)?;
     let room = bytes.try_reserve_exact(size as usize);
     room.with_context(|| format!("{}: there is no memory for its {size} bytes", path.display()))?;
-    file.take(LARGEST_BYTES).read_to_end(&mut bytes).cannot("read", path)?;
+    File::open(path).and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes)).cannot("read", path)?;
     Ok(bytes)
 }
 

@@ -59,8 +59,8 @@ impl Requests {
         signal_hook::flag::register(SIGXFSZ, Arc::default()).context("cannot catch signals")?;
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
-        let listener = thread::Builder::new().name("signals".into());
-        listener.spawn(move || shared.listen_loop(&mut signals, saves)).context("cannot start a thread for signals")?;
+        let listen = move || shared.listen_loop(&mut signals, saves);
+        thread::Builder::new().spawn(listen).context("cannot start a thread for signals")?;
         Ok(requests)
     }
 
@@ -108,7 +108,7 @@ impl Requests {
     pub fn stop_after(&self, limit: Duration) -> Result<()> {
         let stop = self.stop.clone();
         let left = limit.saturating_sub(self.since.elapsed());
-        let clock = thread::Builder::new().name("time limit".into()).spawn(move || {
+        let clock = thread::Builder::new().spawn(move || {
             thread::sleep(left);
             stop.store(true, Ordering::Relaxed);
         });

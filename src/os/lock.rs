@@ -145,7 +145,7 @@ fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
             thread::sleep(RENEWED_EVERY);
         }
     };
-    thread::Builder::new().name("lock".into()).spawn(renew).context("cannot start a thread for the lock")?;
+    thread::Builder::new().spawn(renew).context("cannot start a thread for the lock")?;
     Ok(lives)
 }
 

@@ -17,7 +17,7 @@ mod terminal;
 mod threads;
 
 pub use destination::Destination;
-pub use file::{Cannot, Stamp, expect_named, read_bytes, read_bytes_if, read_text, same_file, stamp};
+pub use file::{Cannot, Stamp, expect_named, read_bytes, read_text, same_file, stamp};
 pub use interrupt::{Requests, exit_code};
 pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};

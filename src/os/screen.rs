@@ -40,7 +40,7 @@ impl Screen {
 /// Lines as a text, cut to the width of the terminal on which it is printed, if there is one.
 pub fn text_of(lines: &[String]) -> String {
     let width = Term::stdout().size_checked().map(|(_, columns)| usize::from(columns));
-    let cut = |line: &'_ String| width.map_or(line.clone(), |width| truncate_str(line, width, "…").into_owned());
+    let cut = |line: &String| width.map_or(line.clone(), |width| truncate_str(line, width, "…").into_owned());
     lines.iter().map(|line| cut(line) + "\n").collect()
 }
 

@@ -122,11 +122,9 @@ pub(super) fn live(
 /// in.
 pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Override]) -> Result<ExitCode> {
     let cannot = || format!("cannot use the trace {}", path.display());
-    let is_begun = |start: &[u8]| {
-        ensure!(start.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());
-        Ok(())
-    };
-    let text = String::from_utf8(os::read_bytes_if(path, is_begun)?).with_context(cannot)?;
+    let bytes = os::read_bytes(path)?;
+    ensure!(bytes.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());
+    let text = String::from_utf8(bytes).with_context(cannot)?;
     let header = header(&text).with_context(cannot)?;
     if let Some(set) = set.iter().find(|set| set.key != MODEL && !set.key.starts_with("hand.")) {
         bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set", set.key);

@@ -99,7 +99,7 @@ fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// Fails if the bytes do not begin like a safetensors file.
-pub fn expect_safetensors(bytes: &[u8]) -> Result<()> {
+fn expect_safetensors(bytes: &[u8]) -> Result<()> {
     ensure!(!bytes.starts_with(b"version "), "a Git LFS pointer: `git lfs pull` fetches the file itself");
     ensure!(!(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)), "an ONNX file, not a safetensors file");
     let length = bytes.first_chunk().map_or(1, |length| u64::from_le_bytes(*length));

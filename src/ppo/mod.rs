@@ -29,7 +29,7 @@ use anyhow::Result;
 pub use acting::Acting;
 pub use backend::Losses;
 pub use checkpoint::Checkpoint;
-pub use format::{Array, Damaged, expect_safetensors, sealed};
+pub use format::{Array, Damaged, sealed};
 pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;

@@ -4,7 +4,7 @@ use std::fs::{self, Metadata};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 
 use super::checkpoints::modified;
 use super::folder::{CONFIG, FINISHED, METRICS, RUNS};
@@ -61,7 +61,6 @@ pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf
         return Ok(Vec::new());
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
-    let entries = entries.collect::<std::io::Result<Vec<_>>>().with_context(|| path.display().to_string())?;
     let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());
-    Ok(entries.into_iter().filter(is_folder).map(|entry| entry.path()).collect())
+    Ok(entries.flatten().filter(is_folder).map(|entry| entry.path()).collect())
 }

@@ -25,20 +25,11 @@ pub(super) const HPARAMS: &str = "hparams";
 /// The class of data of a tensor (`DataClass` in TensorBoard's summary.proto).
 const TENSOR: u32 = 2;
 
-/// What is known of a run before it goes on.
-#[derive(Clone, Default)]
-pub struct Hparams {
-    /// The settings to show, by dotted key.
-    pub settings: Table,
-    /// The goals of its best evaluation, if there was one.
-    pub goals: Option<f64>,
-}
-
-/// Begins the row of the run in `folder` anew, at this step.
+/// Begins the row of the run in `folder` anew, at this step, with these settings by dotted key.
 ///
 /// # Errors
 /// Fails if its file cannot be written.
-pub(super) fn begin(folder: &Path, step: u64, hparams: &Hparams) -> Result<EventFile> {
+pub(super) fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
     let folder = folder.join(HPARAMS);
     if !folder.exists() {
         fs::create_dir(&folder).cannot("create", &folder)?;
@@ -48,7 +39,7 @@ pub(super) fn begin(folder: &Path, step: u64, hparams: &Hparams) -> Result<Event
         fs::remove_file(&old).cannot("remove", &old)?;
     }
     let events = EventFile::create(&folder, step, &Descriptions::new(), "")?;
-    events.values(vec![session_value("session_start_info", 3, &start_info(&hparams.settings)?)?], step)?;
+    events.values(vec![session_value("session_start_info", 3, &start_info(settings)?)?], step)?;
     Ok(events)
 }
 

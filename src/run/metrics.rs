@@ -24,35 +24,34 @@ pub(super) struct Metrics {
 }
 
 impl Metrics {
-    /// Opens or creates the table with this header, to continue after the rows of these iterations. Also returns notes about rows
+    /// Opens or creates the table with this header, to continue after the rows of these iterations. Tells of rows
     /// that are cut off or missing. A table with a different header is kept under another name.
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn open(path: &Path, header: &str, iterations: Range<u64>) -> Result<(Self, Vec<String>)> {
+    pub(super) fn open(path: &Path, header: &str, iterations: Range<u64>, mut tell: impl FnMut(&str)) -> Result<Self> {
         let found = match File::open(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
             file => file.and_then(|file| rows(file, header, iterations.end)).cannot("write", path)?,
         };
-        let mut notes = Vec::new();
         let mut expected = iterations.end - iterations.start;
         if found.is_none() {
             let aside = put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
             let aside = aside.display();
-            notes.push(format!(
+            tell(&format!(
                 "{METRICS} has a different header from the one this program writes; it was renamed to {aside}"
             ));
             expected = 0;
         }
         let found = found.unwrap_or_default();
         if found.dropped > 0 {
-            notes.push(format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
+            tell(&format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
         }
         make_own(path).cannot("write", path)?;
         let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).cannot("write", path)?;
         if found.kept < expected && path.is_file() {
             let lacking = expected - found.kept;
-            notes.push(format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
+            tell(&format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
         }
         let mut metrics = Self { path: path.to_owned(), file, length: found.length };
         metrics.repair().cannot("write", path)?;
@@ -60,7 +59,7 @@ impl Metrics {
             metrics.row(&format!("{header}\n"))?;
             sync_folder(path).cannot("write", path)?;
         }
-        Ok((metrics, notes))
+        Ok(metrics)
     }
 
     /// Adds a row, which ends with a line feed.
@@ -154,6 +153,12 @@ mod tests {
         (place, path)
     }
 
+    fn open(path: &Path, header: &str, iterations: Range<u64>) -> (Metrics, Vec<String>) {
+        let mut notes = Vec::new();
+        let metrics = Metrics::open(path, header, iterations, |note| notes.push(note.to_owned())).unwrap();
+        (metrics, notes)
+    }
+
     #[test]
     fn rows_behind_the_checkpoint_and_half_rows_are_cut_off() {
         for (rows, iterations, dropped, kept) in [
@@ -163,7 +168,7 @@ mod tests {
             ("", 3, 0, ""),
         ] {
             let (_place, path) = table(rows);
-            let (mut metrics, notes) = Metrics::open(&path, "iteration,loss", 0..iterations).unwrap();
+            let (mut metrics, notes) = open(&path, "iteration,loss", 0..iterations);
             metrics.row("9,9\n").unwrap();
             let said = |text: &str| notes.iter().any(|note| note.contains(text));
             assert_eq!(said("dropped"), dropped > 0, "{notes:?}");
@@ -177,7 +182,7 @@ mod tests {
     fn a_table_with_other_columns_is_kept_under_another_name() {
         let (place, path) = table("1,0.5\n");
         for columns in ["iteration,return", "iteration,loss"] {
-            let (_, notes) = Metrics::open(&path, columns, 0..1).unwrap();
+            let (_, notes) = open(&path, columns, 0..1);
             assert!(notes.len() == 1 && notes[0].contains("different header"), "{notes:?}");
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("{columns}\n"));
         }
@@ -191,7 +196,7 @@ mod tests {
     fn a_header_that_did_not_fit_is_written_again() {
         let (place, path) = table("");
         fs::write(&path, "iterat").unwrap();
-        Metrics::open(&path, "iteration,loss", 0..3).unwrap();
+        open(&path, "iteration,loss", 0..3);
         assert_eq!(fs::read_to_string(&path).unwrap(), "iteration,loss\n");
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
     }
@@ -199,7 +204,7 @@ mod tests {
     #[test]
     fn a_table_that_was_deleted_or_replaced_is_noticed() {
         let (_place, path) = table("");
-        let (mut metrics, _) = Metrics::open(&path, "iteration,loss", 0..0).unwrap();
+        let (mut metrics, _) = open(&path, "iteration,loss", 0..0);
         metrics.sync().unwrap();
         fs::remove_file(&path).unwrap();
         metrics.row("1,2\n").unwrap();

@@ -18,7 +18,6 @@ pub use events::SETTINGS;
 pub use folder::{RunFolder, newest_run, resolve_checkpoint};
 pub use glance::{Glance, folders_of_runs};
 pub use histogram::{Histogram, histogram};
-pub use hparams::Hparams;
 pub use kept::{expect_other_policy, expect_output};
 pub use report::Report;
 pub use summary::Descriptions;

@@ -8,11 +8,12 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use toml::Table;
 
 use super::events::{EventFile, cut_off_after};
 use super::folder::METRICS;
 use super::histogram::Histogram;
-use super::hparams::{self, HPARAMS, Hparams};
+use super::hparams::{self, HPARAMS};
 use super::metrics::Metrics;
 use super::summary::Descriptions;
 use crate::os::{Status, StatusLine};
@@ -27,8 +28,10 @@ pub struct Report {
     pub settings: String,
     events: Log<EventFile>,
     metrics: Log<Metrics>,
-    /// The settings and the best evaluation, for TensorBoard.
-    pub hparams: Hparams,
+    /// The settings by dotted key, for TensorBoard's HPARAMS.
+    pub hparams: Table,
+    /// The goals of the best evaluation, if there was one.
+    pub best: Option<f64>,
     /// The row of TensorBoard's HPARAMS.
     session: Log<EventFile>,
     /// From the iteration before the first one of the run to the last one that was logged.
@@ -110,7 +113,8 @@ impl Report {
             settings: String::new(),
             events: Log::new("the event file"),
             metrics: Log::new(METRICS),
-            hparams: Hparams::default(),
+            hparams: Table::new(),
+            best: None,
             session: Log::new(HPARAMS),
             iterations: 0..0,
             env_steps: 0,
@@ -136,9 +140,12 @@ impl Report {
         });
         let is_first = !self.metrics.failing;
         self.metrics.open(progress, || {
-            let (metrics, notes) = Metrics::open(&folder.join(METRICS), &self.header, iterations.clone())?;
-            notes.iter().filter(|_| is_first).for_each(|note| progress.say(note));
-            Ok(metrics)
+            let tell = |note: &str| {
+                if is_first {
+                    progress.say(note);
+                }
+            };
+            Metrics::open(&folder.join(METRICS), &self.header, iterations.clone(), tell)
         });
         self.session.open(progress, || hparams::begin(folder, *env_steps, &self.hparams));
     }
@@ -159,8 +166,8 @@ impl Report {
         self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, histograms));
         self.metrics.write(&self.progress, |metrics| metrics.row(&row));
         if !status.evaluation.is_nan() {
-            let best = self.hparams.goals.map_or(status.evaluation, |goals| goals.max(status.evaluation));
-            self.hparams.goals = Some(best);
+            let best = self.best.map_or(status.evaluation, |goals| goals.max(status.evaluation));
+            self.best = Some(best);
             let drop_rate = values.iter().find(|(name, _)| name.as_ref() == "eval/drop_rate");
             let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
             let metrics = [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", status.steps_per_s)];

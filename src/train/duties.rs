@@ -15,7 +15,7 @@ use crate::config::{EnvConfig, scene_option};
 use crate::os::{self, Requests, Status, StatusLine, say};
 use crate::ppo::{Checkpoint, Rise};
 use crate::repose::{HEADLINE, Score, divergence, measure};
-use crate::run::{Hparams, Report};
+use crate::run::Report;
 
 /// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
 const FAR: f64 = 10.0;
@@ -73,11 +73,11 @@ impl Lead {
         let config = &session.config;
         let tags = tags(config.randomization.happens());
         let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
-        let hparams = Hparams { settings: config.dotted(), goals: session.best.map(|best| best.goals) };
         let mut report = Report::new(&saver.held.folder.path, &tags, progress);
         report.descriptions = described(&tags);
         report.settings = config.to_text();
-        report.hparams = hparams;
+        report.hparams = config.dotted();
+        report.best = session.best.map(|best| best.goals);
         Self { report, saver, quiet, diverged: 0, warned: false, far: 0 }
     }
 
