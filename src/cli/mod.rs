@@ -31,17 +31,10 @@ const TASK: &str = "Task";
 const OUTPUT: &str = "Output";
 const PICTURE: &str = "Film, picture and window";
 
-/// Two examples for the end of a help.
-macro_rules! examples {
-    ($first:literal, $second:literal) => {
-        concat!("Examples:\n  shadow-repose ", $first, "\n  shadow-repose ", $second)
-    };
-}
-
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 #[derive(Parser)]
 #[command(arg_required_else_help = true, disable_help_flag = true, max_term_width = 100)]
-#[command(after_help = examples!("play --ckpt builtin", "train"))]
+#[command(after_help = "Examples:\n  shadow-repose play --ckpt builtin\n  shadow-repose train")]
 pub struct Cli {
     /// The command to run.
     #[command(subcommand)]
@@ -55,37 +48,46 @@ pub struct Cli {
 #[derive(Subcommand)]
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
-    #[command(after_help = examples!("train --seed 1 --name first", "train --resume"))]
+    #[command(after_help = "Examples:\n  shadow-repose train --seed 1 --name first\n  shadow-repose train --resume")]
     Train(TrainArgs),
     /// Play a policy in a window or a browser, as a film, or for its score alone
-    #[command(after_help = examples!("play --ckpt builtin --headless", "play --ckpt builtin --web"))]
+    #[command(
+        after_help = "Examples:\n  shadow-repose play --ckpt builtin --headless\n  shadow-repose play --ckpt builtin --web"
+    )]
     Play(PlayArgs),
     /// Show the scene without a policy, in a window or a browser
-    #[command(after_help = examples!("view --actions wave", "view --web"))]
+    #[command(after_help = "Examples:\n  shadow-repose view --actions wave\n  shadow-repose view --web")]
     View(ViewArgs),
     /// Write a policy as an ONNX file, for programs in other languages
-    #[command(after_help = examples!("export --out policy.onnx", "export --ckpt builtin --out builtin.onnx"))]
+    #[command(
+        after_help = "Examples:\n  shadow-repose export --out policy.onnx\n  shadow-repose export --ckpt builtin --out builtin.onnx"
+    )]
     Export(ExportArgs),
     /// Plot the learning curves of runs as SVG or PNG
-    #[command(after_help = examples!("plot runs/shadow-hand-repose/*", "plot RUN --metric eval/goals --out goals.png"))]
+    #[command(after_help = concat!(
+        "Examples:\n  shadow-repose plot runs/shadow-hand-repose/*",
+        "\n  shadow-repose plot RUN --metric eval/goals --out goals.png"
+    ))]
     Plot(PlotArgs),
     /// List runs with state, time left, steps, goals and settings, or compare two runs
-    #[command(after_help = examples!("runs --watch", "runs RUN RUN"))]
+    #[command(after_help = "Examples:\n  shadow-repose runs --watch\n  shadow-repose runs RUN RUN")]
     Runs(RunsArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
-    #[command(after_help = examples!("bench", "bench --only training --threads 4"))]
+    #[command(after_help = "Examples:\n  shadow-repose bench\n  shadow-repose bench --only training --threads 4")]
     Bench(BenchArgs),
     /// Print completions for a shell
-    #[command(after_help = examples!(
-        "completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
-        "completions zsh > ~/.zfunc/_shadow-repose"
+    #[command(after_help = concat!(
+        "Examples:\n  shadow-repose completions bash > ~/.local/share/bash-completion/completions/shadow-repose",
+        "\n  shadow-repose completions zsh > ~/.zfunc/_shadow-repose"
     ))]
     Completions {
         /// Shell to print completions for
         shell: clap_complete::Shell,
     },
     /// Print a manual page
-    #[command(after_help = examples!("man | man -l -", "man > ~/.local/share/man/man1/shadow-repose.1"))]
+    #[command(
+        after_help = "Examples:\n  shadow-repose man | man -l -\n  shadow-repose man > ~/.local/share/man/man1/shadow-repose.1"
+    )]
     Man,
 }
 

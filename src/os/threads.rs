@@ -1,6 +1,6 @@
 //! The worker threads of the program.
 
-use anyhow::{Error, Result, anyhow, ensure};
+use anyhow::{Result, anyhow, ensure};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 /// The most worker threads per core. More would only take turns.
@@ -11,8 +11,7 @@ const MOST_THREADS: usize = 16;
 /// # Errors
 /// Fails if the number is too large, if the system refuses the threads, or on a second call.
 pub fn start_threads(threads: usize) -> Result<()> {
-    // The text of this error already contains the text of its source.
-    pool(threads)?.build_global().map_err(|error| cannot_start(threads, error))
+    start(threads, ThreadPoolBuilder::build_global)
 }
 
 /// A pool of its own with this number of worker threads (0: one per core), in which a caller can install work.
@@ -20,16 +19,14 @@ pub fn start_threads(threads: usize) -> Result<()> {
 /// # Errors
 /// Fails if the number is too large, or if the system refuses the threads.
 pub fn thread_pool(threads: usize) -> Result<ThreadPool> {
-    pool(threads)?.build().map_err(|error| cannot_start(threads, error))
+    start(threads, ThreadPoolBuilder::build)
 }
 
-fn pool(threads: usize) -> Result<ThreadPoolBuilder> {
+fn start<T>(threads: usize, build: fn(ThreadPoolBuilder) -> Result<T, ThreadPoolBuildError>) -> Result<T> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let most = MOST_THREADS * cores;
     ensure!(threads <= most, "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core");
-    Ok(ThreadPoolBuilder::new().num_threads(threads))
-}
-
-fn cannot_start(threads: usize, error: ThreadPoolBuildError) -> Error {
-    anyhow!("cannot start {threads} worker threads: {error}")
+    // The text of this error already contains the text of its source.
+    let started = build(ThreadPoolBuilder::new().num_threads(threads));
+    started.map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))
 }
