@@ -25,7 +25,7 @@
 //! | [`mod@runs`] | a table of run folders; two of them compared | cli, config, os, run |
 //! | [`mod@bench`] | the speed of this machine | agent, cli, config, env, os, ppo, ranks, repose, rng, schedule, sim, spaces |
 //! | [`manual`] | shell completions and a manual page | cli, os |
-//! | [`cli`] | the structure of the command line | config, evaluate, os, see, sim |
+//! | [`cli`] | the structure of the command line | config, evaluate, os, sim |
 //! | [`see`] | rendering of the task: window, film, picture, page | draw, env, evaluate, os, repose, sim |
 //! | [`trace`] | episodes as JSON lines | env, evaluate, repose |
 //! | [`goal_times`] | statistics of the time to reach a goal | config, env, evaluate |
@@ -36,7 +36,7 @@
 //! | [`mod@env`] | many environments, in blocks that step without a barrier or all at once; no hand in it | ranks, rng, schedule, sim, spaces |
 //! | [`ppo`] | the learner: flat parameters, policy, two gradient backends (`fused`, ours; `candle`), one Adam, checkpoints | config, os, quat, ranks, rng, spaces |
 //! | [`config`] | all settings, their defaults and rules | os, sim |
-//! | [`sim`] | the only interface to MuJoCo | os, quat, schedule |
+//! | [`sim`] | the only interface to MuJoCo | draw, os, quat, schedule |
 //! | [`run`] | the folder of a run and its logs | os, sim |
 //! | [`draw`] | charts, films, pictures and pages as files | os |
 //! | [`os`] | the system around the program: files, terminal, signals, locks, pip, a server for a page | - |

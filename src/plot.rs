@@ -36,11 +36,10 @@ const SMOOTH: usize = 50;
 /// The most names that are suggested for one that is not known.
 const SUGGESTIONS: usize = 3;
 
-/// A run: name, place on the x axis in each row, lengths of the smoothing windows, names of all columns, and the requested columns.
+/// A run: name, place on the x axis in each row, names of all columns, and the requested columns.
 struct RunTable {
     name: String,
     along: Vec<f64>,
-    windows: Vec<usize>,
     names: Vec<String>,
     columns: HashMap<String, Vec<f64>>,
 }
@@ -70,7 +69,9 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     } else {
         runs.iter().map(|run| run.name.clone()).collect()
     };
-    let panels = metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, args)).collect();
+    let window = window(&runs, args.smooth);
+    let panels =
+        metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, window, args.seeds)).collect();
     Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
     let plural = if runs.len() == 1 { "" } else { "s" };
     say!("{}: {} run{plural}", args.out.path.display(), runs.len());
@@ -87,10 +88,10 @@ fn known_name<'a>((usual, other): Metric<'a>, runs: &[RunTable]) -> &'a str {
 }
 
 /// The panel of a metric: a curve for each run, or for several seeds one curve and a band.
-fn panel(name: &str, runs: &[RunTable], args: &PlotArgs) -> Subplot {
+fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
     let mut title = tag(name).map_or_else(|| name.to_owned(), |known| known.title);
-    let mut curves: Vec<Curve> = runs.iter().map(|run| run.curve(name)).collect();
-    if args.seeds {
+    let mut curves: Vec<Curve> = runs.iter().map(|run| run.curve(name, window)).collect();
+    if seeds {
         curves.retain(|curve| !curve.points.is_empty());
         if curves.len() < runs.len() {
             title += &format!(" ({} of {} seeds)", curves.len(), runs.len());
@@ -101,53 +102,49 @@ fn panel(name: &str, runs: &[RunTable], args: &PlotArgs) -> Subplot {
     Subplot { title, curves, nothing: nothing.to_owned() }
 }
 
-/// Reads each run that can be drawn, and warns of each that cannot.
+/// Reads the table of each run once, however many names the run has, e.g. a link `latest`. Warns of each that cannot be drawn.
 ///
 /// # Errors
 /// Fails if none of them can be drawn.
 fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
-    let tables = tables(args, wanted)?;
-    // A window is as many steps for all runs, so that a table with fewer rows, as in docs/curves, is not smoothed more.
-    let steps = || tables.iter().map(|(_, table)| &table.columns[ALONG[0]]);
-    let shortest = steps().map(Vec::len).min().unwrap_or(0);
-    let rows = args.smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
-    let in_row = steps().filter_map(|steps| Some(steps.get(1)? - steps[0]));
-    let window = rows as f64 * in_row.fold(f64::INFINITY, f64::min);
-    let run = |(place, MetricsTable { names, columns }): (&Path, MetricsTable)| {
-        let along = match args.along {
-            Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
-            Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
-        };
-        let windows = lengths_of_windows(&columns[ALONG[0]], window);
-        RunTable { name: name_of(place), along, windows, names, columns }
-    };
-    Ok(tables.into_iter().map(run).collect())
-}
-
-/// Reads the table of each run once, however many names the run has, e.g. a link `latest`.
-fn tables<'a>(args: &'a PlotArgs, wanted: &[&str]) -> Result<Vec<(&'a Path, MetricsTable)>> {
     let required = match args.along {
         Along::Steps => &ALONG[..1],
         Along::Hours => &ALONG,
     };
-    let mut tables: Vec<(&Path, MetricsTable)> = Vec::new();
+    let mut runs = Vec::new();
     let mut known = HashSet::new();
     for (i, place) in args.runs.iter().enumerate() {
         let whole = run::table_of(place).canonicalize();
         if whole.is_ok_and(|whole| !known.insert(whole)) {
             continue;
         }
-        let rows = run::read_metrics(place, required, wanted).and_then(|table| {
+        let table = run::read_metrics(place, required, wanted).and_then(|table| {
             ensure!(!table.columns[ALONG[0]].is_empty(), "{}: no rows yet", place.display());
             Ok(table)
         });
-        match rows {
-            Ok(table) => tables.push((place, table)),
-            Err(error) if tables.is_empty() && i + 1 == args.runs.len() => return Err(error),
+        match table {
+            Ok(MetricsTable { names, columns }) => {
+                let along = match args.along {
+                    Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
+                    Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
+                };
+                runs.push(RunTable { name: name_of(place), along, names, columns });
+            }
+            Err(error) if runs.is_empty() && i + 1 == args.runs.len() => return Err(error),
             Err(error) => say!("warning: {error:#}; skipped"),
         }
     }
-    Ok(tables)
+    Ok(runs)
+}
+
+/// The control steps that are averaged into a point. They are as many for all runs, so that a table with fewer rows, as in docs/curves,
+/// is not smoothed more.
+fn window(runs: &[RunTable], smooth: Option<usize>) -> f64 {
+    let steps = || runs.iter().map(|run| &run.columns[ALONG[0]]);
+    let shortest = steps().map(Vec::len).min().unwrap_or(0);
+    let rows = smooth.unwrap_or((shortest / 10).clamp(1, SMOOTH));
+    let in_row = steps().filter_map(|steps| Some(steps.get(1)? - steps[0]));
+    rows as f64 * in_row.fold(f64::INFINITY, f64::min)
 }
 
 /// Checks that each of these columns is in at least one run, and warns of the runs without it.
@@ -178,14 +175,13 @@ fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
 }
 
 impl RunTable {
-    /// The curve of a metric, without points if the run has no such column.
-    fn curve(&self, name: &str) -> Curve {
+    /// The curve of a metric, without points if the run has no such column. Each evaluation counts by itself, at the step at which it
+    /// was made. Other values are averaged over windows of so many steps.
+    fn curve(&self, name: &str, window: f64) -> Curve {
         let Some(values) = self.columns.get(name) else { return Curve::default() };
         let dots = name.starts_with(EVALUATION);
-        // Each evaluation counts by itself, at the step at which it was made.
-        let each = vec![1; values.len()];
-        let points = smooth(&self.along, values, if dots { &each } else { &self.windows });
-        Curve { points, band: Vec::new(), dots }
+        let lengths = if dots { vec![1; values.len()] } else { lengths_of_windows(&self.columns[ALONG[0]], window) };
+        Curve { points: smooth(&self.along, values, &lengths), band: Vec::new(), dots }
     }
 }
 

@@ -8,7 +8,7 @@ use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
 use crate::config::{EnvConfig, Override};
-use crate::draw::{self, BarChart, HeatMap, Picture, PictureFile};
+use crate::draw::{self, BarChart, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Destination, Requests, number, say};
 use crate::repose::{Score, Task, measure};
@@ -223,7 +223,9 @@ fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
     BarChart {
         title: format!("Goals kept under a change: {checkpoint}, {episodes} episodes a row"),
         bars: bars.collect(),
-        map: HeatMap { columns: named("friction", &FRICTIONS), rows: named("mass", &MASSES), cells },
+        columns: named("friction", &FRICTIONS),
+        rows: named("mass", &MASSES),
+        cells,
     }
 }
 

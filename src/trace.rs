@@ -24,6 +24,11 @@ impl Trace {
     pub fn new(task: &Task, actor: &str, checkpoint: Option<&str>, seed: u64) -> Self {
         let config = &task.config;
         let hand = &task.hand;
+        // The entries that are not zero: row, column and value.
+        let mirror = task.mirror().map(|matrix| -> Value {
+            let entries = matrix.iter().enumerate().filter(|(_, value)| **value != 0.0);
+            entries.map(|(i, value)| json!([i / hand.layout.size, i % hand.layout.size, value])).collect()
+        });
         let mut header = json!({
             "sim_dt": config.sim_dt,
             "ctrl_dt": config.ctrl_dt,
@@ -45,7 +50,7 @@ impl Trace {
             "fingertip_names": hand.parts.fingertips,
             "quaternion_order": "wxyz",
             "vel_obs_scale": config.vel_obs_scale,
-            "mirror_matrix": task.mirror().map(|matrix| entries(&matrix, hand.layout.size)),
+            "mirror_matrix": mirror,
         });
         add_settings(config, &mut header);
         Self { header, episodes: Vec::new(), last: usize::MAX }
@@ -117,12 +122,6 @@ fn record(moment: &Moment) -> Value {
         "diverged": details.diverged,
         "obs": obs,
     })
-}
-
-/// The entries of a square matrix that are not zero: row, column and value.
-fn entries(matrix: &[f32], size: usize) -> Value {
-    let entries = matrix.iter().enumerate().filter(|(_, value)| **value != 0.0);
-    entries.map(|(i, value)| json!([i / size, i % size, value])).collect()
 }
 
 /// Floats as doubles, so that a reader gets exactly the same values.

@@ -8,12 +8,13 @@ use anyhow::{Context, Result, bail};
 
 use crate::cli::{Made, ViewArgs, expect_together, usage_error};
 use crate::config::{Config, Settings, expect_used};
-use crate::evaluate::{Actor, Episodes, Player};
-use crate::os::{self, OutputFile, say};
+#[cfg(any(feature = "video", feature = "viewer"))]
+use crate::evaluate::Episodes;
+use crate::evaluate::{Actor, Player};
+use crate::os::{self, say};
 use crate::repose::Task;
-use crate::run;
 use crate::see;
-use crate::sim::Camera;
+use crate::sim::{Camera, Look};
 
 /// What to do where no window can be opened.
 const INSTEAD: &str = "Without a window, --web shows the hand in a browser, and --out hand.png draws it.";
@@ -34,23 +35,41 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let file = args.settings.config.as_deref();
     let config = Settings::new().user_file(file)?.sets(&args.settings.set).resolve()?;
     let choice = Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
-    let shot = args.shot.sized(args.size, args.quality);
-    let load = || task_for_display(&config, &shot);
+    let look = args.shot.sized(args.size, args.quality);
+    let load = || task_for_display(&config, &look);
     match (&args.out, args.web) {
+        #[cfg(not(feature = "video"))]
+        (Some(_), _) => bail!(see::NO_FILMS),
+        #[cfg(feature = "video")]
         (Some(to), _) => {
-            run::expect_output(&to.path, file, config.env.model_file())?;
-            let output = OutputFile::create(&to.path)?;
-            draw(output, &load()?, choice, Episodes::scored(args.seed, 1), args.at)
+            crate::run::expect_output(&to.path, file, config.env.model_file())?;
+            let output = os::OutputFile::create(&to.path)?;
+            let (_, actor) = &Actor::WITHOUT_POLICY[choice];
+            let [width, height] = see::screenshot(output, &load()?, actor, Episodes::scored(args.seed, 1), args.at)?;
+            say!("{}: {width}x{height}", to.path.display());
         }
-        (None, Some(port)) => show_on_page(port, &load()?, choice, args.seed, shot.camera),
-        (None, None) => show(&load()?, choice, Episodes::scored(args.seed, usize::MAX)),
+        (None, Some(port)) => show_on_page(port, &load()?, choice, args.seed, look.camera)?,
+        #[cfg(not(feature = "viewer"))]
+        (None, None) => bail!("{}. {INSTEAD}", see::NO_WINDOWS),
+        #[cfg(feature = "viewer")]
+        (None, None) => show(&load()?, choice, args.seed)?,
     }
+    Ok(())
+}
+
+#[cfg(feature = "viewer")]
+fn show(task: &Arc<Task>, choice: usize, seed: u64) -> Result<()> {
+    match see::Window::open(task, Actor::WITHOUT_POLICY.into(), choice) {
+        Ok(window) => os::say_line(&window.play(task, Episodes::scored(seed, usize::MAX))?),
+        Err(error) => bail!("{error:#}\n  {INSTEAD}"),
+    }
+    Ok(())
 }
 
 /// Loads the task, and prints what the settings replace in the user's scene.
-fn task_for_display(config: &Config, shot: &see::Shot) -> Result<Arc<Task>> {
+fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
     let task = Task::new(config)?;
-    let task = see::task_for_display(&task, shot)?;
+    let task = see::task_for_display(&task, look)?;
     if config.env.model_file().is_some() {
         os::say_line(task.table().trim_end());
     }
@@ -70,32 +89,4 @@ fn show_on_page(port: u16, task: &Arc<Task>, choice: usize, seed: u64, camera: O
     };
     let acting = see::LiveActor { step: Rc::new(step), policy: None, task: task.clone() };
     see::Live::open(port, (&about, camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
-}
-
-#[cfg(feature = "video")]
-fn draw(output: OutputFile, task: &Arc<Task>, choice: usize, episodes: Episodes, seconds: f64) -> Result<()> {
-    let path = output.path.clone();
-    let (_, actor) = &Actor::WITHOUT_POLICY[choice];
-    let [width, height] = see::screenshot(output, task, actor, episodes, seconds)?;
-    say!("{}: {width}x{height}", path.display());
-    Ok(())
-}
-
-#[cfg(not(feature = "video"))]
-fn draw(_: OutputFile, _: &Arc<Task>, _: usize, _: Episodes, _: f64) -> Result<()> {
-    bail!(see::NO_FILMS)
-}
-
-#[cfg(feature = "viewer")]
-fn show(task: &Arc<Task>, choice: usize, episodes: Episodes) -> Result<()> {
-    match see::Window::open(task, Actor::WITHOUT_POLICY.into(), choice) {
-        Ok(window) => os::say_line(&window.play(task, episodes)?),
-        Err(error) => bail!("{error:#}\n  {INSTEAD}"),
-    }
-    Ok(())
-}
-
-#[cfg(not(feature = "viewer"))]
-fn show(_: &Arc<Task>, _: usize, _: Episodes) -> Result<()> {
-    bail!("{}. {INSTEAD}", see::NO_WINDOWS)
 }

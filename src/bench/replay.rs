@@ -28,8 +28,6 @@ pub(super) struct RecordingEnv {
     env: Repose,
     task: Arc<Task>,
     randomization: Option<Arc<Randomization>>,
-    /// The scene of the episodes that have drawn nothing.
-    nominal: Scene,
     starts: Vec<Start>,
     /// The controls of each step, and the random force on the object, if there are such forces.
     steps: Vec<(Vec<f64>, Option<[f64; 3]>)>,
@@ -49,7 +47,6 @@ impl RecordingEnv {
             env: Repose::randomized(task, randomization),
             task: task.clone(),
             randomization: randomization.cloned(),
-            nominal: nominal.clone(),
             starts: Vec::new(),
             steps: Vec::new(),
             bare: Simulation::new(nominal),
@@ -78,11 +75,8 @@ impl RecordingEnv {
         self.scenes.clear();
         for Start { draw, .. } in &self.starts {
             if *draw != self.drawn.0 {
-                let scene = match (&self.randomization, draw) {
-                    (Some(randomization), Some(draw)) => randomization.scene_of(draw, &self.task),
-                    _ => self.nominal.clone(),
-                };
-                self.drawn = (draw.clone(), scene);
+                let scene = self.randomization.as_ref().map(|all| all.scene_of(draw.as_ref(), &self.task.hand));
+                self.drawn = (draw.clone(), scene.unwrap_or_else(|| self.task.scene.clone()));
             }
             self.scenes.push(self.drawn.1.clone());
         }
@@ -102,7 +96,8 @@ impl RecordingEnv {
     /// Continues from the recorded state after this number of steps, if there is one.
     fn go_on(&mut self, steps: usize) {
         if let Some(i) = self.starts.iter().position(|start| start.after == steps) {
-            self.bare.start_replay(&self.starts[i].state, &self.scenes[i]);
+            self.bare.change_scene(&self.scenes[i]);
+            self.bare.restore(&self.starts[i].state).expect("a state of the same scene");
         }
     }
 }

@@ -15,8 +15,7 @@ use clap::{ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand, 
 use crate::config::{Config, Override};
 use crate::evaluate::Actor;
 use crate::os::Destination;
-use crate::see;
-use crate::sim::{self, Camera, Quality};
+use crate::sim::{self, Camera, Look, Quality};
 pub use results::{Along, PlotArgs, RunsArgs};
 use together::given;
 pub use together::{Made, expect_together};
@@ -315,8 +314,8 @@ pub struct ShotArgs {
 
 impl ShotArgs {
     /// What to show, with this size and quality.
-    pub fn sized(&self, size: [u32; 2], quality: Quality) -> see::Shot {
-        see::Shot { size, camera: self.camera, quality, plain: self.plain }
+    pub fn sized(&self, size: [u32; 2], quality: Quality) -> Look {
+        Look { dress: None, size, camera: self.camera, quality, plain: self.plain }
     }
 }
 

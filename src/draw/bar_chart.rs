@@ -20,24 +20,18 @@ pub struct NamedBar {
     pub note: String,
 }
 
-/// Values over two quantities. Nothing is drawn without rows.
-pub struct HeatMap {
-    /// The names of the columns.
-    pub columns: Vec<String>,
-    /// The names of the rows.
-    pub rows: Vec<String>,
-    /// The values, from 0 to about 1, row by row.
-    pub cells: Vec<Vec<f64>>,
-}
-
-/// Bars from 0 to about 1, and a map.
+/// Bars from 0 to about 1, and below them a map of values over two quantities.
 pub struct BarChart {
     /// The title.
     pub title: String,
     /// The bars, from top to bottom.
     pub bars: Vec<NamedBar>,
-    /// The map.
-    pub map: HeatMap,
+    /// The names of the columns of the map.
+    pub columns: Vec<String>,
+    /// The names of the rows of the map.
+    pub rows: Vec<String>,
+    /// The values of the map, from 0 to about 1, row by row.
+    pub cells: Vec<Vec<f64>>,
 }
 
 // Lengths in pixels.
@@ -60,11 +54,11 @@ const BAR: RGBColor = COLOURS[0];
 impl Picture for BarChart {
     fn size(&self) -> Result<[u32; 2]> {
         let bars = ROW * (1 + self.bars.len() as i32);
-        let map = CELL * (1 + self.map.rows.len() as i32);
+        let map = CELL * (1 + self.rows.len() as i32);
         Ok([WIDTH as u32, (TITLE + bars + GAP + map + GAP) as u32])
     }
 
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()> {
         area.fill(&WHITE)?;
         draw_text(&area, &self.title, (WIDTH / 2, TITLE / 2), (HPos::Center, 16, BLACK))?;
         let bottom = TITLE + ROW * self.bars.len() as i32;
@@ -73,9 +67,14 @@ impl Picture for BarChart {
             draw_text(&area, &value.to_string(), (along(value), bottom + ROW / 2), (HPos::Center, 12, BLACK))?;
         }
         for (bar, row) in self.bars.iter().zip(0..) {
-            bar.draw(&area, TITLE + ROW * row + ROW / 2)?;
+            let middle = TITLE + ROW * row + ROW / 2;
+            draw_text(&area, &bar.name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
+            draw_text(&area, &bar.note, (WIDTH - NOTES + 8, middle), (HPos::Left, 12, BLACK))?;
+            let corners = [(along(0.0), middle - 7), (along(bar.value), middle + 7)];
+            area.draw(&Rectangle::new(corners, BAR.filled()))?;
+            area.draw(&PathElement::new(bar.interval.map(|value| (along(value), middle)), BLACK))?;
         }
-        self.map.draw(&area, bottom + ROW + GAP)?;
+        self.draw_map(&area, bottom + ROW + GAP)?;
         Ok(area.present()?)
     }
 }
@@ -85,19 +84,8 @@ fn along(value: f64) -> i32 {
     NAMES + (f64::from(WIDTH - NAMES - NOTES) * value.clamp(0.0, MOST) / MOST) as i32
 }
 
-impl NamedBar {
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: &DrawingArea<B, Shift>, middle: i32) -> Result<()> {
-        draw_text(area, &self.name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
-        draw_text(area, &self.note, (WIDTH - NOTES + 8, middle), (HPos::Left, 12, BLACK))?;
-        let corners = [(along(0.0), middle - 7), (along(self.value), middle + 7)];
-        area.draw(&Rectangle::new(corners, BAR.filled()))?;
-        area.draw(&PathElement::new(self.interval.map(|value| (along(value), middle)), BLACK))?;
-        Ok(())
-    }
-}
-
-impl HeatMap {
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: &DrawingArea<B, Shift>, top: i32) -> Result<()> {
+impl BarChart {
+    fn draw_map(&self, area: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>, top: i32) -> Result<()> {
         let width = (WIDTH - NAMES - NOTES) / self.columns.len() as i32;
         let left = |column: i32| NAMES + width * column;
         for (name, column) in self.columns.iter().zip(0..) {
@@ -146,9 +134,14 @@ mod tests {
             interval: [value - 0.1, value + 0.1],
             note: "some".into(),
         };
-        let map = HeatMap { columns: vec!["a".into()], rows: vec!["b".into()], cells: vec![vec![0.5]] };
         let bars = vec![bar("whole", 1.0), bar("half", 0.5), bar("unknown", f64::NAN)];
-        let svg = svg(&BarChart { title: "title".into(), bars, map });
+        let svg = svg(&BarChart {
+            title: "title".into(),
+            bars,
+            columns: vec!["a".into()],
+            rows: vec!["b".into()],
+            cells: vec![vec![0.5]],
+        });
         let colour = format!("fill=\"#{:02X}{:02X}{:02X}\"", BAR.0, BAR.1, BAR.2);
         let width =
             |line: &str| line.split("width=\"").nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();
@@ -165,8 +158,8 @@ mod tests {
     fn no_character_that_xml_does_not_allow_is_drawn() {
         let odd = || "a\u{1}\u{ffff}<".to_owned();
         let bars = vec![NamedBar { name: odd(), value: 1.0, interval: [1.0; 2], note: odd() }];
-        let map = HeatMap { columns: vec![odd()], rows: vec![odd()], cells: vec![vec![0.5]] };
-        let svg = svg(&BarChart { title: odd(), bars, map });
+        let cells = vec![vec![0.5]];
+        let svg = svg(&BarChart { title: odd(), bars, columns: vec![odd()], rows: vec![odd()], cells });
         assert_eq!(svg.matches("a\u{fffd}\u{fffd}&lt;").count(), 5, "{svg}");
     }
 }

@@ -80,7 +80,7 @@ pub trait Picture {
     ///
     /// # Errors
     /// Fails if the font cannot be used.
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()>;
+    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()>;
 
     /// Writes the picture.
     ///
@@ -132,8 +132,8 @@ impl PictureFile {
 }
 
 /// Draws text in the middle of a line at this height.
-pub(super) fn draw_text<B: DrawingBackend<ErrorType: 'static>>(
-    area: &DrawingArea<B, Shift>,
+pub(super) fn draw_text(
+    area: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
     text: &str,
     at: (i32, i32),
     (across, size, colour): (HPos, i32, RGBColor),
@@ -161,7 +161,7 @@ impl Picture for Chart {
         Ok([width, height])
     }
 
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(&self, area: DrawingArea<B, Shift>) -> Result<()> {
+    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()> {
         area.fill(&WHITE)?;
         let rows = self.legend_rows(area.dim_in_pixel().0);
         let (top, below) = area.split_vertically(legend_height(&rows));
@@ -233,9 +233,9 @@ fn legend_height(rows: &[LegendRow]) -> u32 {
 
 impl Subplot {
     /// Draws the panel into `part`, with a label of the x axis if it is the last.
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(
+    fn draw(
         &self,
-        part: &DrawingArea<B, Shift>,
+        part: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
         x: std::ops::Range<f64>,
         along: Option<&str>,
     ) -> Result<()> {
@@ -278,9 +278,9 @@ impl Curve {
         self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
     }
 
-    fn draw<B: DrawingBackend<ErrorType: 'static>>(
+    fn draw(
         &self,
-        chart: &mut ChartContext<B, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
+        chart: &mut ChartContext<impl DrawingBackend<ErrorType: 'static>, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
         (colour, dash): (ShapeStyle, i32),
     ) -> Result<()> {
         let points = || self.points.iter().map(|&[x, y]| (x, y));

@@ -6,8 +6,8 @@ mod chart;
 mod film;
 mod page;
 
-pub use bar_chart::{BarChart, HeatMap, NamedBar};
+pub use bar_chart::{BarChart, NamedBar};
 pub use chart::{Chart, Curve, Picture, PictureFile, Subplot};
 #[cfg(feature = "video")]
-pub use film::{CaptionedFrame, FilmFormat, FilmWriter, write_png};
+pub use film::{FilmFormat, FilmWriter, write_png};
 pub use page::{Mesh, Page};

@@ -73,25 +73,17 @@ impl Page {
             hash(&style),
             if is_live { "self" } else { "none" }
         );
-        let value = |name: &str| match name {
-            "POLICY" => policy.clone(),
-            "STYLE" => style.clone(),
-            // A path may contain text that ends a script.
-            "META" => self.meta.to_string().replace('<', "\\u003c"),
-            "SCENE" => packed(self.scene.to_string().as_bytes()),
-            "ROWS" if self.rows.is_empty() => String::new(),
-            "ROWS" => packed(&rows),
-            "MESHES" if meshes.is_empty() => String::new(),
-            "MESHES" => packed(&meshes.concat()),
-            "CODE" => code.clone(),
-            other => panic!("the page asks for {other}"),
-        };
-        let mut parts = PAGE.split("{{");
-        let first = parts.next().unwrap_or_default().to_owned();
-        parts.fold(first, |page, part| {
-            let (name, rest) = part.split_once("}}").expect("the page's braces are closed");
-            page + &value(name) + rest
-        })
+        // The last one may quote any text: what asks for another one, or ends a script.
+        let values = [
+            ("POLICY", policy),
+            ("STYLE", style),
+            ("CODE", code),
+            ("SCENE", packed(self.scene.to_string().as_bytes())),
+            ("ROWS", packed(&rows)),
+            ("MESHES", packed(&meshes.concat())),
+            ("META", self.meta.to_string().replace('<', "\\u003c")),
+        ];
+        values.iter().fold(PAGE.to_owned(), |page, (name, value)| page.replace(&format!("{{{{{name}}}}}"), value))
     }
 }
 
@@ -106,7 +98,11 @@ fn hash(text: &str) -> String {
     format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(text)))
 }
 
+/// Bytes as compressed text, or nothing.
 fn packed(bytes: &[u8]) -> String {
+    if bytes.is_empty() {
+        return String::new();
+    }
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
     encoder.write_all(bytes).expect("memory takes all");
     BASE64_STANDARD.encode(encoder.finish().expect("memory takes all"))

@@ -8,14 +8,14 @@ use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use toml::Table;
 
-use super::files::PageFile;
 use super::stage::Stage;
 use crate::config::{MODEL, Override, Reader, Settings, Source, short};
 use crate::load::PolicySource;
 use crate::os::{self, Destination, Stamp, say};
 use crate::repose::Task;
 use crate::run::{self, RunFolder};
-use crate::see::{self, About, Live, Shot};
+use crate::see::{self, About, Live, Replay};
+use crate::sim::Look;
 
 /// The text for the origin of a built-in policy.
 const BUILT_IN: &str = "built into the program";
@@ -77,7 +77,7 @@ impl Followed {
 /// Fails if the port cannot be opened.
 pub(super) fn live(
     (port, hands): (u16, u64),
-    shot: &Shot,
+    shot: &Look,
     stage: Stage,
     mut followed: Option<Followed>,
     (seed, set): (u64, &[Override]),
@@ -120,7 +120,7 @@ pub(super) fn live(
 /// # Errors
 /// Fails if the file is no trace, or if the HTML file cannot be written. Fails if the user does not name a scene that is not built
 /// in.
-pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Override]) -> Result<ExitCode> {
+pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Look, set: &[Override]) -> Result<ExitCode> {
     let cannot = || format!("cannot use the trace {}", path.display());
     let bytes = os::read_bytes(path)?;
     ensure!(bytes.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());
@@ -135,12 +135,14 @@ pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Shot, set: &[Over
     let joints = json!(task.hand.parts.joints);
     ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
     run::expect_output(&to.path, Some(path), task.config.model_file())?;
-    let mut page = PageFile::begin(to, &task, shot, 0)?;
+    let mut page = Replay::begin(to, &task, shot, 0)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {
         say!("note: {left_out} more episodes of {} are not in the HTML file", path.display());
     }
-    page.finish(&recorded(&header))?;
+    let actor = header["actor"].as_str().filter(|actor| actor.is_ascii() && !actor.is_empty()).unwrap_or("policy");
+    let policy = header["checkpoint"].as_str().map(|place| (place.to_owned(), place));
+    page.finish(&described(actor, policy, header["seed"].as_u64()))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -149,13 +151,6 @@ fn header(text: &str) -> Result<Value> {
     let header = serde_json::from_str::<Value>(text.lines().next().unwrap_or_default()).ok();
     let header = header.filter(|header| header.get("observation").is_some());
     header.context("it does not begin with the header of a trace")
-}
-
-/// What a page says about a trace with this header.
-fn recorded(header: &Value) -> About {
-    let actor = header["actor"].as_str().filter(|actor| actor.is_ascii() && !actor.is_empty()).unwrap_or("policy");
-    let policy = header["checkpoint"].as_str().map(|place| (place.to_owned(), place));
-    described(actor, policy, header["seed"].as_u64())
 }
 
 /// The settings of the header of a trace as a configuration file.

@@ -27,6 +27,8 @@ use crate::evaluate::Episodes;
 use crate::os::{self, Requests, say};
 use crate::robustness::robustness;
 use crate::see;
+#[cfg(feature = "viewer")]
+use crate::sim::Look;
 
 /// What to do where no window can be opened.
 const INSTEAD: &str = "Without a window, --web shows the hand in a browser, --out hand.html writes a file for one, and --headless scores.";
@@ -70,7 +72,7 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
 
 /// Plays in a window. If none can be opened and none was asked for, plays for the score.
 #[cfg(feature = "viewer")]
-fn show(stage: &Stage, shot: &see::Shot, args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
+fn show(stage: &Stage, shot: &Look, args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
     let task = see::task_for_display(&stage.task, shot)?;
     match see::Window::open(&task, stage.actors(), stage.choice) {
         Ok(window) => os::say_line(&window.play(&task, episodes(args, u64::MAX))?),

@@ -7,22 +7,21 @@ use clap::Error;
 use crate::cli::{Made, PlayArgs, expect_together, usage_error};
 use crate::os::Destination;
 use crate::robustness::TableOutput;
-use crate::see::Shot;
-use crate::sim::Quality;
+use crate::sim::{Look, Quality};
 
 /// What to do.
 pub(super) enum Plan {
     /// Play in a window.
     #[cfg_attr(not(feature = "viewer"), expect(dead_code, reason = "a build without windows refuses them"))]
-    Window(Shot),
+    Window(Look),
     /// Play at this port for a browser.
-    Web(u16, Shot),
+    Web(u16, Look),
     /// Play for a score.
     Score(Outputs),
     /// Play for scores under changes.
     Robustness(TableOutput),
     /// Write the page of the trace in this file.
-    Replay(PathBuf, Destination, Shot),
+    Replay(PathBuf, Destination, Look),
 }
 
 /// What comes out of playing for a score.
@@ -31,7 +30,7 @@ pub(super) struct Outputs {
     pub page: Option<Destination>,
     pub trace: Option<Destination>,
     /// What is seen in film and page.
-    pub shot: Shot,
+    pub shot: Look,
     /// The frames of the film per second of simulated time.
     #[cfg_attr(not(feature = "video"), expect(dead_code, reason = "a build without films refuses them"))]
     pub fps: u32,
@@ -45,38 +44,28 @@ impl Plan {
     /// # Errors
     /// Fails with a usage error if the options do not go together.
     pub(super) fn of(args: &PlayArgs, opens_windows: bool) -> Result<Self, Error> {
-        let plan = Self::by_options(args, opens_windows)?;
-        let mut given = args.given.clone();
-        given.extend(args.out.iter().map(|to| format!("--out FILE.{}", to.ending)));
-        expect_together(&plan.made(), &given).map_err(|text| usage_error("play", &text))?;
-        Ok(plan)
-    }
-
-    fn by_options(args: &PlayArgs, opens_windows: bool) -> Result<Self, Error> {
         let picture = only(&args.out, "pictures of a table", &["svg", "png"])?;
         let outputs = Outputs::of(args)?;
-        Ok(match (&args.from_trace, &outputs.page, args.web) {
-            (Some(trace), Some(page), _) => Self::Replay(trace.clone(), page.clone(), outputs.shot),
-            _ if args.robustness => Self::Robustness(TableOutput { picture, json: args.json }),
-            (_, _, Some(port)) => Self::Web(port, outputs.shot),
+        let (plan, made) = match (&args.from_trace, &outputs.page, args.web) {
+            (Some(trace), Some(page), _) => (Self::Replay(trace.clone(), page.clone(), outputs.shot), vec![Made::Page]),
+            _ if args.robustness => {
+                (Self::Robustness(TableOutput { picture, json: args.json }), vec![Made::Robustness])
+            }
+            (_, _, Some(port)) => (Self::Web(port, outputs.shot), vec![Made::Web]),
             _ if !args.wants_result() && (args.window || opens_windows) => {
-                Self::Window(shot(args, [1280, 720], Quality::High))
+                (Self::Window(shot(args, [1280, 720], Quality::High)), vec![Made::Window])
             }
-            _ => Self::Score(outputs),
-        })
-    }
-
-    fn made(&self) -> Vec<Made> {
-        match self {
-            Self::Window(_) => vec![Made::Window],
-            Self::Web(..) => vec![Made::Web],
-            Self::Robustness(_) => vec![Made::Robustness],
-            Self::Replay(..) => vec![Made::Page],
-            Self::Score(Outputs { film, page, .. }) => {
-                let film = film.iter().map(|_| Made::Picture);
-                [Made::Score].into_iter().chain(film).chain(page.iter().map(|_| Made::Page)).collect()
+            _ => {
+                let mut made = vec![Made::Score];
+                made.extend(outputs.film.iter().map(|_| Made::Picture));
+                made.extend(outputs.page.iter().map(|_| Made::Page));
+                (Self::Score(outputs), made)
             }
-        }
+        };
+        let mut given = args.given.clone();
+        given.extend(args.out.iter().map(|to| format!("--out FILE.{}", to.ending)));
+        expect_together(&made, &given).map_err(|text| usage_error("play", &text))?;
+        Ok(plan)
     }
 }
 
@@ -99,7 +88,7 @@ impl Outputs {
 }
 
 /// What is seen, with this size and quality unless the user says others.
-fn shot(args: &PlayArgs, size: [u32; 2], quality: Quality) -> Shot {
+fn shot(args: &PlayArgs, size: [u32; 2], quality: Quality) -> Look {
     args.shot.sized(args.size.unwrap_or(size), args.quality.unwrap_or(quality))
 }
 

@@ -26,7 +26,7 @@ use crate::see;
 pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Requests) -> Result<ExitCode> {
     let task = &stage.task;
     let actor = &stage.actor();
-    let place = stage.loaded().map(|loaded| loaded.origin.to_string());
+    let place = stage.origin();
     let mut files = Files::begin(stage, episodes, outputs)?;
     let mut goal_times = GoalTimes::new(&task.config);
     let mut observe = |moment: &Moment| {

@@ -83,9 +83,14 @@ impl Stage {
         self.policy.as_ref()
     }
 
+    /// Where the policy comes from.
+    pub(super) fn origin(&self) -> Option<String> {
+        self.loaded().map(|loaded| loaded.origin.to_string())
+    }
+
     /// Where the policy comes from, or the name of the actor.
     pub(super) fn place(&self) -> String {
-        self.loaded().map_or_else(|| self.actor().name().to_owned(), |loaded| loaded.origin.to_string())
+        self.origin().unwrap_or_else(|| self.actor().name().to_owned())
     }
 
     /// The actor of a page that shows this task.

@@ -37,12 +37,10 @@ impl Conditions {
         self.twisted = false;
         self.bias.clear();
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
-        match (&self.randomization, &self.draw) {
-            (Some(randomization), Some(draw)) => {
-                randomization.vary(sim, draw, task);
-                sensing::combine(&mut self.bias, randomization.draw_bias(draw, rng).into_iter());
-            }
-            _ => sim.share_model(),
+        let Some(randomization) = &self.randomization else { return };
+        sim.change_scene(&randomization.scene_of(self.draw.as_ref(), &task.hand));
+        if let Some(draw) = &self.draw {
+            sensing::combine(&mut self.bias, randomization.draw_bias(draw, rng).into_iter());
         }
     }
 

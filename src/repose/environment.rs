@@ -20,7 +20,7 @@ use crate::config::SuccessHold;
 use crate::env::{End, Env, EnvState, Resumable, SavedEnv, Transition};
 use crate::quat::{self, Quat};
 use crate::rng::{self, Rng};
-use crate::sim::{Actuator, Pose, Simulation, Validity};
+use crate::sim::{Actuator, Pose, Simulation};
 use crate::spaces::Spaces;
 
 /// One Shadow Hand with its cube.
@@ -130,7 +130,7 @@ impl Repose {
         let left = quat::mul(self.goal, quat::conj(self.object().orientation));
         let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
         self.recorder.record(&self.sim, action, self.last.push, torque);
-        self.last.diverged = self.sim.step(self.task.config.substeps()) == Validity::Diverged;
+        self.last.diverged = self.sim.step(self.task.config.substeps());
         if self.last.diverged {
             // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
             self.send();

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 
 use super::hand::Hand;
 use super::physics::{Physics, QUANTITIES, SHARED, normal, sizes};
@@ -13,16 +13,15 @@ use super::sensing::NoiseStd;
 use super::task::Task;
 use crate::config::RandomizationConfig;
 use crate::rng::{self, Rng};
-use crate::sim::{Scene, Simulation, Variants, origin};
+use crate::sim::{Scene, origin};
 
 /// The random physics, noise and delays of a training run.
 pub struct Randomization {
     pub(super) config: RandomizationConfig,
     /// The scene of the episodes that are not randomised. It has the physics of the task.
     pub nominal: Scene,
-    variants: Variants,
-    /// The factor on the lengths of the object in each variant. The last one is the nominal scene.
-    sizes: Vec<f64>,
+    /// The scenes with another size of the object, each behind the factor on its lengths. The last one is the nominal scene.
+    scenes: Vec<(f64, Scene)>,
     noise: NoiseStd,
     bias: NoiseStd,
 }
@@ -62,11 +61,12 @@ impl Randomization {
         let nominal = if shifts { task.scene_with(1.0, true)? } else { task.scene.clone() };
         let mut sizes = sizes(config.cube_size);
         sizes.push(1.0);
-        let scene = |&size: &f64| if size == 1.0 { Ok(nominal.clone()) } else { task.scene_with(size, shifts) };
-        let scenes = sizes.iter().map(scene).collect::<Result<_>>().context("randomization.cube_size")?;
-        let variants = Variants::new(scenes).with_context(|| origin(task.config.model_file()))?;
-        let config = config.clone();
-        Ok(Some(Arc::new(Self { variants, config, nominal, sizes, noise, bias })))
+        let scene = |size| Ok((size, if size == 1.0 { nominal.clone() } else { task.scene_with(size, shifts)? }));
+        let scenes = sizes.into_iter().map(scene).collect::<Result<Vec<_>>>().context("randomization.cube_size")?;
+        let alike = scenes.iter().all(|(_, scene)| scene.has_structure_of(&nominal));
+        let file = || origin(task.config.model_file());
+        ensure!(alike, "{}: its structure changes with the size of the object", file());
+        Ok(Some(Arc::new(Self { config: config.clone(), nominal, scenes, noise, bias })))
     }
 
     /// Draws the physics of the episode that owns `rng`. The generator's position does not matter. Returns `None` if the episode is
@@ -93,20 +93,12 @@ impl Randomization {
         randomized.then_some(EpisodePhysics { physics, has_noise, has_bias, has_pushes })
     }
 
-    /// Gives the simulation the physics of a draw. Its state must be reset after it.
-    pub fn vary(&self, simulation: &mut Simulation, draw: &EpisodePhysics, task: &Task) {
-        self.variants.vary(simulation, self.variant(draw), &draw.physics.changes(&task.hand));
-    }
-
-    /// A scene with the physics of a draw.
-    pub fn scene_of(&self, draw: &EpisodePhysics, task: &Task) -> Scene {
-        self.variants.scene(self.variant(draw), &draw.physics.changes(&task.hand))
-    }
-
-    /// The number of the scene with the size of a draw.
-    fn variant(&self, draw: &EpisodePhysics) -> usize {
-        let [size] = draw.physics["cube_size"] else { unreachable!("one factor") };
-        self.sizes.iter().position(|other| *other == size).expect("a size that can be drawn, or the nominal one")
+    /// The scene of an episode: with the physics that it has drawn, or the nominal one.
+    pub fn scene_of(&self, draw: Option<&EpisodePhysics>, hand: &Hand) -> Scene {
+        let Some(EpisodePhysics { physics, .. }) = draw else { return self.nominal.clone() };
+        let sized = self.scenes.iter().find(|(size, _)| physics["cube_size"] == [*size]);
+        let (_, scene) = sized.expect("a size that can be drawn, or the nominal one");
+        scene.varied(&physics.changes(hand))
     }
 
     /// The noise on the observations of an episode, if there is any.

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::draw::Page;
 use crate::env::Env;
 use crate::repose::{Repose, Task, TaskReward, task_terms};
-use crate::sim::{Camera, Drawing, DrawnCamera};
+use crate::sim::{Camera, Drawing};
 
 /// The scalars before the terms of the reward.
 const SCALARS: [&str; 4] = ["step", "error", "held", "goals"];
@@ -20,16 +20,6 @@ const LARGEST: f64 = 1e9;
 /// The largest count: a page counts in 16 bits.
 pub(super) const MOST: u32 = 32_767;
 
-/// Near enough to the built-in hand for hand, cube and goal to fill the picture.
-const NEAR: DrawnCamera = DrawnCamera {
-    azimuth: 142.0,
-    elevation: -33.0,
-    distance: 0.58,
-    center: [0.315, 0.0, 0.362],
-    fovy: 40.0,
-    fit: false,
-};
-
 /// The scene of a task, and where the numbers of a row are.
 pub(super) struct Columns {
     /// The task, which was loaded for display.
@@ -37,12 +27,8 @@ pub(super) struct Columns {
     /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place. Mocap bodies other than the
     /// goal stay.
     drawing: Drawing,
-    /// The number of values in `qpos`.
-    positions: usize,
     /// Where the orientation of the goal begins.
     goal: usize,
-    /// Where quaternions begin.
-    quaternions: Vec<usize>,
 }
 
 impl Columns {
@@ -50,23 +36,24 @@ impl Columns {
         let is_builtin = task.config.model_file().is_none();
         let mut drawing = task.scene.drawing(task.hand.side().filter(|_| is_builtin), camera);
         if is_builtin && camera.is_none() {
-            drawing.camera = NEAR;
+            // Near enough for hand, cube and goal to fill the picture.
+            drawing.scene["camera"] = json!({
+                "azimuth": 142.0,
+                "elevation": -33.0,
+                "distance": 0.58,
+                "center": [0.315, 0.0, 0.362],
+                "fovy": 40.0,
+                "fit": false,
+            });
         }
-        let positions = drawing.positions();
-        let quaternions = drawing.quaternions();
-        let goal = positions + 7 * task.hand.goal.0;
+        let goal = drawing.positions + 7 * task.hand.goal.0;
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
-        Self { task: task.clone(), drawing, positions, goal: goal + 3, quaternions }
+        Self { task: task.clone(), drawing, goal: goal + 3 }
     }
 
     /// How many numbers give the poses.
     fn poses(&self) -> usize {
         self.drawing.start.len()
-    }
-
-    /// The names of the scalars.
-    fn scalars() -> Vec<&'static str> {
-        SCALARS.into_iter().chain(Self::terms()).collect()
     }
 
     /// The names of the terms of the reward.
@@ -112,12 +99,12 @@ impl Columns {
         };
         let scalars = [count("step")?, value(&record["rot_dist"], "rot_dist")?, count("held")?, count("goals")?];
         let reward: Result<Vec<f64>> = Self::terms().map(|term| value(&record["reward"][term], term)).collect();
-        Ok(self.row(&list("qpos", self.positions)?, &list("goal", 4)?, scalars, &reward?))
+        Ok(self.row(&list("qpos", self.drawing.positions)?, &list("goal", 4)?, scalars, &reward?))
     }
 
     fn row(&self, qpos: &[f64], goal: &[f64], scalars: [f64; SCALARS.len()], reward: &[f64]) -> Vec<f64> {
         let mut row = self.drawing.start.clone();
-        row[..self.positions].copy_from_slice(qpos);
+        row[..self.drawing.positions].copy_from_slice(qpos);
         row[self.goal..self.goal + 4].copy_from_slice(goal);
         row.extend(scalars.iter().chain(reward));
         // The physics of the last step of an episode may have diverged.
@@ -135,7 +122,7 @@ impl Columns {
 
     /// Chooses the signs of the quaternions of a row to continue the row before: q and -q are the same rotation.
     pub(super) fn go_on(&self, row: &mut [f64], before: &[f64]) {
-        for &place in &self.quaternions {
+        for &place in &self.drawing.quaternions {
             let same: f64 = (place..place + 4).map(|i| row[i] * before[i]).sum();
             if same < 0.0 {
                 row[place..place + 4].iter_mut().for_each(|x| *x = -*x);
@@ -143,22 +130,10 @@ impl Columns {
         }
     }
 
-    /// The page of these rows, with more entries for what it says of itself. Only the first one has meshes.
-    pub(super) fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Result<Page> {
-        let mut meta = self.meta(about);
-        for (key, value) in more.as_object().into_iter().flatten() {
-            meta[key] = value.clone();
-        }
-        let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
-        let meshes = std::mem::take(&mut self.drawing.meshes).into_iter();
-        let meshes = meshes.map(|mesh| (mesh.corners, mesh.triangles)).collect();
-        let scene = serde_json::to_value(&self.drawing).context("the scene")?;
-        Ok(Page { meta, scene, meshes, rows, counts })
-    }
-
-    fn meta(&self, about: &About) -> Value {
+    /// The page of these rows, with more entries for what it says of itself. Only the first one has a scene.
+    pub(super) fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Page {
         let config = &self.task.config;
-        json!({
+        let mut meta = json!({
             "format": 1,
             "title": about.title,
             "program": format!("shadow-repose {}", env!("CARGO_PKG_VERSION")),
@@ -171,10 +146,18 @@ impl Columns {
             "hold": config.max_consecutive_successes,
             "hands": 1,
             "numbers": self.poses(),
-            "scalars": Self::scalars(),
-            "terms": Self::terms().collect::<Vec<_>>(),
+            "scalars": Vec::from_iter(SCALARS.into_iter().chain(Self::terms())),
+            "terms": Vec::from_iter(Self::terms()),
             "live": false,
-        })
+        });
+        for (key, value) in more.as_object().into_iter().flatten() {
+            meta[key] = value.clone();
+        }
+        let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
+        let Drawing { scene, start, meshes, .. } = &mut self.drawing;
+        let mut scene = scene.take();
+        scene["start"] = json!(start);
+        Page { meta, scene, meshes: std::mem::take(meshes), rows, counts }
     }
 }
 

@@ -1,4 +1,4 @@
-//! The task in a scene for display: the real hand's meshes, a camera, a quality.
+//! The task in a scene for display: the real hand's meshes, how it is seen.
 
 use std::sync::Arc;
 
@@ -7,38 +7,24 @@ use anyhow::{Error, Result};
 use super::dress::{dress, mesh_files};
 use crate::os;
 use crate::repose::Task;
-use crate::sim::{Camera, Look, Quality};
+use crate::sim::Look;
 
-/// How a scene is shown.
-#[derive(Clone, Copy, Debug)]
-pub struct Shot {
-    /// Width and height in pixels.
-    pub size: [u32; 2],
-    /// A camera that replaces the scene's own.
-    pub camera: Option<Camera>,
-    /// The quality of rendering.
-    pub quality: Quality,
-    /// Whether the hand's primitives are shown in place of its meshes.
-    pub plain: bool,
-}
-
-/// Loads the task for display. If the meshes are not available, prints a note and shows the primitives.
+/// Loads the task for display with this look, which gets the hand's meshes unless it is plain. If the meshes are not available,
+/// prints a note and shows the primitives.
 ///
 /// # Errors
 /// Fails like [`Task::for_display`].
-pub fn task_for_display(task: &Task, shot: &Shot) -> Result<Arc<Task>> {
+pub fn task_for_display(task: &Task, look: &Look) -> Result<Arc<Task>> {
     let note = |error: &Error| os::say!("note: {error:#}; primitives are shown instead");
     // Only the built-in hand has meshes.
-    let prefix = task.hand.side().filter(|_| !shot.plain && task.config.model_file().is_none());
+    let prefix = task.hand.side().filter(|_| !look.plain && task.config.model_file().is_none());
     let meshes =
         |prefix: &str| os::hand_meshes(&mesh_files()).inspect_err(note).ok().map(|meshes| dress(prefix, meshes));
-    let Shot { size, camera, quality, .. } = *shot;
-    let mut look = Look { dress: prefix.and_then(meshes), size, camera, quality };
-    let shown = task.for_display(&look);
+    let dressed = Look { dress: prefix.and_then(meshes), ..look.clone() };
+    let shown = task.for_display(&dressed);
     match &shown {
-        Err(error) if look.dress.is_some() => note(error),
+        Err(error) if dressed.dress.is_some() => note(error),
         _ => return shown,
     }
-    look.dress = None;
-    task.for_display(&look)
+    task.for_display(look)
 }

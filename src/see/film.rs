@@ -1,9 +1,8 @@
 //! Films of consecutive episodes, and single pictures, without a display.
 
 use std::sync::Arc;
-use std::time::Instant;
 
-use anyhow::{Result, ensure};
+use anyhow::Result;
 
 use crate::draw::{FilmFormat, FilmWriter, write_png};
 use crate::env::Env;
@@ -21,9 +20,7 @@ pub struct Film {
     longest: u64,
     /// The frames of the current episode so far: frame k shows it k / fps seconds after its start.
     drawn: u64,
-    all_frames: u64,
     bar: Bar,
-    begun: Instant,
 }
 
 impl Film {
@@ -39,7 +36,7 @@ impl Film {
         let renderer = Renderer::new(&task.scene)?;
         let writer = FilmWriter::create(to, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
         let bar = progress_bar(all, "frames", "film");
-        Ok(Self { renderer, writer, fps, longest, drawn: 0, all_frames: 0, bar, begun: Instant::now() })
+        Ok(Self { renderer, writer, fps, longest, drawn: 0, bar })
     }
 
     /// Adds the frames that are due at `moment`, each with a caption.
@@ -47,7 +44,6 @@ impl Film {
     /// # Errors
     /// Fails if OpenGL, the encoder or the file does. [`Film::abandon`] returns the cause if it was the encoder or the file.
     pub fn observe(&mut self, moment: &Moment) -> Result<()> {
-        ensure!(!self.writer.failed(), "the film cannot be continued");
         let env = moment.env;
         if moment.step.is_none() {
             self.drawn = 0;
@@ -57,9 +53,8 @@ impl Film {
         let until = time + if moment.ends() { -1e-9 } else { 1e-9 };
         while self.drawn < self.longest && self.drawn as f64 / f64::from(self.fps) <= until {
             let picture = self.renderer.draw(&env.sim)?.to_vec();
-            self.writer.push((picture, caption(env, moment.episode, time)));
+            self.writer.push((picture, caption(env, moment.episode, time)))?;
             self.drawn += 1;
-            self.all_frames += 1;
             self.bar.inc(1);
         }
         if moment.ends() {
@@ -81,9 +76,9 @@ impl Film {
     pub fn finish(self) -> Result<String> {
         self.writer.finish(true)?;
         let [width, height] = self.renderer.size();
-        let frames = self.all_frames;
+        let frames = self.bar.position();
         let seconds = frames as f64 / f64::from(self.fps);
-        let rate = frames as f64 / self.begun.elapsed().as_secs_f64();
+        let rate = frames as f64 / self.bar.elapsed().as_secs_f64();
         Ok(format!("{width}x{height}, {frames} frames, {seconds:.2} s, rendered at {rate:.1} frames/s"))
     }
 }

@@ -54,8 +54,8 @@ pub struct Live {
 struct LiveHand {
     player: Player,
     acting: LiveActor,
-    /// The number of its episode.
-    episode: usize,
+    /// What the page says of its episode.
+    about: Value,
     has_ended: bool,
     /// The sum since the last row.
     reward: TaskReward,
@@ -80,12 +80,11 @@ impl Live {
         if let Some(sliders) = &sliders {
             more["sliders"] = sliders.described();
         }
-        let page = columns.page(about, more, Vec::new())?;
+        let page = columns.page(about, more, Vec::new());
         let key = page.key();
-        let seed = about.seed.unwrap_or(0);
-        let episodes = Episodes::scored(seed, usize::MAX);
+        let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
         let hands: Vec<_> = (0..hands).map(|episode| LiveHand::new(acting.clone(), episode, episodes)).collect();
-        let hello = hello(&key, seed, &hands, sliders.as_ref());
+        let hello = hello(&key, &hands, sliders.as_ref());
         let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
         let port = server.port;
         let machine = Machine::this().name;
@@ -131,7 +130,7 @@ impl Live {
 
     fn begin(&mut self, hand: usize, episode: usize, acting: LiveActor) {
         self.hands[hand] = LiveHand::new(acting, episode, self.episodes);
-        let mut about = self.hands[hand].about(self.episodes.seed);
+        let mut about = self.hands[hand].about.clone();
         about["hand"] = hand.into();
         // First, so that a viewer who comes in between knows it.
         self.greet();
@@ -139,7 +138,7 @@ impl Live {
     }
 
     fn greet(&self) {
-        self.server.greet(&hello(&self.key, self.episodes.seed, &self.hands, self.sliders.as_ref()));
+        self.server.greet(&hello(&self.key, &self.hands, self.sliders.as_ref()));
     }
 
     /// The row of all hands, as the page reads it.
@@ -157,16 +156,11 @@ impl LiveHand {
     /// Begins one of these episodes, by its number.
     fn new(acting: LiveActor, episode: usize, episodes: Episodes) -> Self {
         let player = Player::new(&acting.task, Episodes { first: episode, ..episodes });
-        Self { player, acting, episode, has_ended: false, reward: TaskReward::default() }
-    }
-
-    /// What the page says of its episode, which is drawn from this seed.
-    fn about(&self, seed: u64) -> Value {
-        let mut about = json!({ "seed": format!("{seed}, episode {}", self.episode) });
-        if let Some(policy) = &self.acting.policy {
+        let mut about = json!({ "seed": format!("{}, episode {episode}", episodes.seed) });
+        if let Some(policy) = &acting.policy {
             about["policy"] = policy.as_str().into();
         }
-        about
+        Self { player, acting, about, has_ended: false, reward: TaskReward::default() }
     }
 
     fn step(&mut self) {
@@ -177,8 +171,8 @@ impl LiveHand {
 }
 
 /// The first event for a viewer: the key of the page, and what is under way.
-fn hello(key: &str, seed: u64, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
-    let episodes: Vec<Value> = hands.iter().map(|hand| hand.about(seed)).collect();
+fn hello(key: &str, hands: &[LiveHand], sliders: Option<&Sliders>) -> String {
+    let episodes: Vec<&Value> = hands.iter().map(|hand| &hand.about).collect();
     let mut hello = json!({ "key": key, "episodes": episodes });
     if let Some(sliders) = sliders {
         hello["controls"] = sliders.values();
@@ -211,6 +205,6 @@ mod tests {
         assert_eq!(seconds(&live), 10.0);
         live.begin(0, 1, acting(&second));
         assert_eq!(seconds(&live), 3.0);
-        assert_eq!(live.hands[0].episode, 1);
+        assert_eq!(live.hands[0].about["seed"], "0, episode 1");
     }
 }

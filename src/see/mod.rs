@@ -16,7 +16,7 @@ mod sliders;
 mod window;
 
 pub use columns::About;
-pub use display::{Shot, task_for_display};
+pub use display::task_for_display;
 pub use dress::{dress, mesh_files};
 #[cfg(feature = "video")]
 pub use film::{Film, screenshot};

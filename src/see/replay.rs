@@ -1,17 +1,17 @@
 //! Episodes as one HTML file.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 
 use super::columns::{About, Columns, MOST};
-use crate::draw::Page;
+use super::display::task_for_display;
 use crate::env::End;
 use crate::evaluate::Moment;
+use crate::os::{Destination, OutputFile, say};
 use crate::repose::{Task, TaskReward};
-use crate::sim::Camera;
+use crate::sim::Look;
 
 /// The most episodes of a file, and the most steps of all of them. A browser reads the file at once, and 1000 steps add 57 kB.
 const MOST_EPISODES: usize = 20;
@@ -19,24 +19,21 @@ const MOST_STEPS: usize = 60_000;
 
 /// Episodes that become a file.
 pub struct Replay {
+    /// The file.
+    pub output: OutputFile,
     columns: Columns,
-    /// By their numbers.
-    episodes: BTreeMap<usize, Recorded>,
-}
-
-/// An episode: its rows, and how it ended.
-#[derive(Default)]
-struct Recorded {
-    rows: Vec<Vec<f64>>,
-    end: Option<&'static str>,
+    /// The rows of each episode, and how it ended, by its number.
+    episodes: BTreeMap<usize, (Vec<Vec<f64>>, Option<&'static str>)>,
 }
 
 impl Replay {
-    /// Begins a file of so many `episodes` of `task`, which was loaded for display, perhaps with another camera than its own.
+    /// Begins a file of so many `episodes` of `task` with this look.
     ///
     /// # Errors
-    /// Fails if they are longer than a page can count, or than a browser opens soon.
-    pub fn new(task: &Arc<Task>, camera: Option<Camera>, episodes: usize) -> Result<Self> {
+    /// Fails if it cannot be written, or if the episodes are longer than a page can count, or than a browser opens soon.
+    pub fn begin(to: &Destination, task: &Task, look: &Look, episodes: usize) -> Result<Self> {
+        let output = OutputFile::create(&to.path)?;
+        let task = task_for_display(task, look)?;
         let steps = task.config.max_episode_steps();
         let all = steps as usize * episodes;
         ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
@@ -45,7 +42,7 @@ impl Replay {
             "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}"
         );
         ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes");
-        Ok(Self { columns: Columns::new(task, camera), episodes: BTreeMap::new() })
+        Ok(Self { output, columns: Columns::new(&task, look.camera), episodes: BTreeMap::new() })
     }
 
     /// Records a moment of an episode.
@@ -87,7 +84,7 @@ impl Replay {
 
     /// Adds a row to an episode, and how the episode ended, if it did, by the name that a trace gives it.
     fn add(&mut self, episode: usize, mut row: Vec<f64>, end: Option<&'static str>) {
-        let Recorded { rows, end: ended } = self.episodes.entry(episode).or_default();
+        let (rows, ended) = self.episodes.entry(episode).or_default();
         if let Some(before) = rows.last() {
             self.columns.go_on(&mut row, before);
             if end == Some("diverged") {
@@ -105,15 +102,15 @@ impl Replay {
         *ended = end;
     }
 
-    /// The file.
+    /// Writes the file.
     ///
     /// # Errors
-    /// Fails if there are no episodes.
-    pub fn page(mut self, about: &About) -> Result<Page> {
+    /// Fails if there are no episodes, or if it cannot be written.
+    pub fn finish(mut self, about: &About) -> Result<()> {
         ensure!(!self.episodes.is_empty(), "it has no records of an episode");
         let mut rows = Vec::new();
         let mut episodes = Vec::new();
-        for Recorded { rows: own, end } in self.episodes.into_values() {
+        for (own, end) in self.episodes.into_values() {
             let end = match end {
                 Some("diverged") => "the physics diverged",
                 Some("terminated") => "the object was dropped",
@@ -123,6 +120,10 @@ impl Replay {
             episodes.push(json!({ "row": rows.len(), "hand": 0, "end": end }));
             rows.extend(own);
         }
-        self.columns.page(about, json!({ "episodes": episodes }), rows)
+        let html = self.columns.page(about, json!({ "episodes": episodes }), rows).html();
+        let path = self.output.path.display().to_string();
+        self.output.finish(html.as_bytes())?;
+        say!("{path}: {} kB", html.len().div_ceil(1000));
+        Ok(())
     }
 }

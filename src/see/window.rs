@@ -35,7 +35,7 @@ impl<'a> Window<'a> {
     /// Fails if there is no display or a library is missing. The message names the packages that provide it.
     pub fn open(task: &Task, actors: Vec<(&'static str, Actor<'a>)>, first: usize) -> Result<Self> {
         let (names, actors) = actors.into_iter().unzip();
-        let viewer = Viewer::open(&task.scene, "shadow-repose", names, first)?;
+        let viewer = Viewer::open(&task.scene, names, first)?;
         os::say_line(KEYS);
         Ok(Self { viewer, actors })
     }
@@ -47,7 +47,11 @@ impl<'a> Window<'a> {
     pub fn play(mut self, task: &Arc<Task>, episodes: Episodes) -> Result<String> {
         let mut player = Player::new(task, episodes);
         let mut tally = Tally::default();
-        let mut curves = curves(task);
+        let level = Some(task.config.success_tolerance.to_degrees());
+        let mut curves = [
+            Trend { name: "rotation error, degrees (line: tolerance)", level, ..Trend::default() },
+            Trend { name: "reward of a step", ..Trend::default() },
+        ];
         let mut clock = Clock::new(task.config.ctrl_dt);
         // Ends the episode and starts the next one, if there is one.
         let next = |player: &mut Player, tally: &mut Tally, is_complete: bool| {
@@ -112,30 +116,13 @@ impl Tally {
         self.goals += episode.goals;
     }
 
-    /// What happened in the episodes before the current one, including episodes that the user ended.
-    fn before(&self) -> String {
-        match self.episodes {
-            0 => "nothing yet".to_owned(),
-            count => format!("{} goals, {} drops in {count} episodes", self.goals, self.drops),
-        }
-    }
-
     fn summary(&self) -> String {
         let Self { steps, completed, drops, goals, .. } = self;
         format!("shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached")
     }
 }
 
-/// The curves of the error and the reward, without points.
-fn curves(task: &Task) -> [Trend; 2] {
-    let level = Some(task.config.success_tolerance.to_degrees());
-    [
-        Trend { name: "rotation error, degrees (line: tolerance)", level, ..Trend::default() },
-        Trend { name: "reward of a step", ..Trend::default() },
-    ]
-}
-
-/// Adds the last of so many steps to the curves.
+/// Adds the last of so many steps to the curves of the error and the reward.
 fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
     let step = &env.last;
     for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.iter().sum()]) {
@@ -160,6 +147,11 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
     });
     let fraction = env.held as f32 / asked as f32;
     let hold = Gauge { name: "held", fraction, signed: false, text: format!("{} of {asked} steps", env.held) };
+    // The episodes before the current one, including episodes that the user ended.
+    let before = match tally.episodes {
+        0 => "nothing yet".to_owned(),
+        count => format!("{} goals, {} drops in {count} episodes", tally.goals, tally.drops),
+    };
     let angle = |radians: f64| format!("{:.1}° = {radians:.3} rad", radians.to_degrees());
     Readout {
         rows: vec![
@@ -167,7 +159,7 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
             ("rotation error", angle(env.rot_dist())),
             ("tolerance", angle(config.success_tolerance)),
             ("episode", format!("{episode}, {:.2} s", f64::from(stats.length) * config.ctrl_dt)),
-            ("before", tally.before()),
+            ("before", before),
         ],
         bars: vec![("within the tolerance", vec![hold]), ("reward of this step", terms.collect())],
         curves: curves.to_vec(),

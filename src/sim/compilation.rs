@@ -72,13 +72,6 @@ impl Compilation {
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
         ensure!(!file.is_some_and(Path::is_dir), "env.model must name a MuJoCo scene, but this is a folder");
         ensure!(file.is_none_or(Path::is_file), "env.model must name a MuJoCo scene, but there is no such file");
-        if self.keeps_all() {
-            let model = file.map_or_else(|| MjModel::from_xml_string(BUILTIN), MjModel::from_xml);
-            if let Ok(model) = model {
-                return Ok(model);
-            }
-            // The wrapper cuts off this message at 100 bytes. The way below gives it whole.
-        }
         self.spec(file)?.compile().map_err(refused)
     }
 
@@ -106,16 +99,6 @@ impl Compilation {
             add_goal(&mut spec, &without_goal.compile(file)?, name, goal)?;
         }
         Ok(spec)
-    }
-
-    /// Sets the options of a compiled scene.
-    pub(super) fn set_options(&self, model: &mut MjModel) {
-        model.opt_mut().timestep = self.timestep;
-        match self.cone {
-            Cone::Scene => {}
-            Cone::Pyramidal => model.opt_mut().cone = mjCONE_PYRAMIDAL as i32,
-            Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
-        }
     }
 }
 
@@ -149,8 +132,7 @@ pub fn origin(file: Option<&Path>) -> String {
 /// all shapes have a position and an orientation: a file can give them in many ways.
 fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Result<()> {
     ensure!(spec.body_mut(goal).is_none(), "has a body `{goal}` that is no mocap body");
-    let no_body = || format!("has no body `{name}`");
-    let object = compiled.name_to_id(mjOBJ_BODY, name).with_context(no_body)?;
+    let object = compiled.name_to_id(mjOBJ_BODY, name).context("a body of the compiled scene")?;
     let frames = frames_within(compiled, object);
     let shown = spec.world_body_mut().add_body();
     shown.with_name(goal).with_pos(compiled.body_pos()[object]).with_mocap(true);

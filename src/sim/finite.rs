@@ -1,7 +1,5 @@
 //! The check for infinite or NaN values in a scene: MuJoCo accepts them, and the physics then diverges immediately.
 
-use std::io::Read;
-
 use anyhow::{Context, Result, anyhow};
 use mujoco_rs::prelude::MjModel;
 use tempfile::NamedTempFile;
@@ -15,12 +13,15 @@ use crate::os::shortened;
 /// # Errors
 /// Fails if there is no room for a temporary file.
 pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
-    let context =
-        "cannot check that the numbers of the scene are finite; set TMPDIR=PATH to a folder for a temporary file";
-    let file = NamedTempFile::new().context(context)?;
-    model.print(file.path()).map_err(|error| anyhow!("{error}")).context(context)?;
-    let mut text = Vec::new();
-    file.reopen().and_then(|mut file| file.read_to_end(&mut text)).context(context)?;
+    let printed = || {
+        let file = NamedTempFile::new()?;
+        model.print(file.path()).map_err(|error| anyhow!("{error}"))?;
+        Ok(std::fs::read(file.path())?)
+    };
+    let text: Result<Vec<u8>> = printed();
+    let text = text.context(
+        "cannot check that the numbers of the scene are finite; set TMPDIR=PATH to a folder for a temporary file",
+    )?;
     let found = first_in(&String::from_utf8_lossy(&text));
     let found = found.map(|(quantity, object)| {
         // A degree of freedom has no name, but it belongs to a joint that may have one.

@@ -4,19 +4,13 @@
 
 use std::path::Path;
 
-use anyhow::{Result, anyhow};
+use anyhow::{Context, Result, anyhow};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::SpecItem;
 use mujoco_rs::wrappers::mj_editing::MjsBody;
 
 use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
-
-/// The opacity of the colours of an object.
-const SOLID: f32 = 1.0;
-
-/// The opacity of the colours of a goal.
-const CLEAR: f32 = 0.7;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
 const FACES: [[f32; 3]; 6] =
@@ -35,7 +29,8 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
     let shown = |body: usize| {
         let name = model.id_to_name(mjOBJ_BODY, body).filter(|name| !name.is_empty())?;
         let is_goal = model.body_mocapid()[body] >= 0;
-        let opacity = if is_goal { CLEAR } else { SOLID };
+        // A goal can be seen through.
+        let opacity = if is_goal { 0.7 } else { 1.0 };
         (is_goal || name == compilation.object).then_some((name, plain_box(model, body)?, opacity))
     };
     let boxes: Vec<_> = (1..model.nbody() as usize).filter_map(shown).collect();
@@ -54,7 +49,7 @@ pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation)
         sky.with_rgb1([0.74, 0.78, 0.83]).with_rgb2([0.42, 0.49, 0.58]);
     }
     for (name, half, opacity) in boxes {
-        let body = spec.body_mut(name).ok_or_else(|| anyhow!("there is no body {name}"))?;
+        let body = spec.body_mut(name).context("a body of the compiled scene")?;
         colour_faces(body, half, opacity);
     }
     spec.compile().map(Some).map_err(|error| anyhow!("{error}"))

@@ -71,6 +71,8 @@ pub struct Look {
     pub camera: Option<Camera>,
     /// The quality of pictures.
     pub quality: Quality,
+    /// Whether the hand's primitives are shown in place of its meshes.
+    pub plain: bool,
 }
 
 impl Look {

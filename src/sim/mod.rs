@@ -28,15 +28,15 @@ mod variation;
 mod viewer;
 
 pub use compilation::{Compilation, Cone, origin};
-pub use drawing::{Drawing, DrawnCamera, DrawnMesh};
+pub use drawing::Drawing;
 pub use fatal::{before_fatal_error, stepping};
 pub use files::scene_files;
 pub use look::{Camera, Dress, Look, Piece, Quality};
 pub use mujoco_rs::mujoco_version;
 pub use scene::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Scene};
-pub use simulation::{Pose, Simulation, Validity, Velocity};
+pub use simulation::{Pose, Simulation, Velocity};
 pub use structure::Parts;
-pub use variation::{Change, Variants};
+pub use variation::Change;
 
 #[cfg(feature = "viewer")]
 pub use panel::{Controls, Gauge, Readout, SPEEDS, Trend};

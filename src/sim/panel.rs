@@ -67,17 +67,12 @@ pub struct Controls {
 /// The state of the panel between two frames.
 pub(super) struct Panel {
     /// The names of the choices.
-    choices: Vec<&'static str>,
+    pub choices: Vec<&'static str>,
     pub readout: Readout,
     pub controls: Controls,
 }
 
 impl Panel {
-    pub(super) fn new(choices: Vec<&'static str>, choice: usize) -> Self {
-        let controls = Controls { paused: false, speed: 1.0, choice, steps: 0, reset: false, new_goal: false };
-        Self { choices, readout: Readout::default(), controls }
-    }
-
     /// Draws the panel at the right of the window and handles clicks and key presses.
     pub(super) fn show(&mut self, ui: &mut Ui) {
         if !ui.egui_wants_keyboard_input() {

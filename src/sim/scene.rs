@@ -7,10 +7,9 @@ use anyhow::{Context, Result, bail, ensure};
 use mujoco_rs::prelude::{MjModel, MjtDisableBit, MjtObjBase};
 
 use super::Look;
-use super::compilation::{Compilation, origin};
+use super::compilation::{Compilation, Cone, origin};
 use super::constants::*;
 use super::fatal::quieten_mujoco;
-use super::fingerprint::fingerprint;
 use super::finite::not_finite;
 use super::furnish::furnished;
 use crate::os::shortened;
@@ -103,17 +102,13 @@ impl Scene {
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
     pub fn load_for_display(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
-        let mut scene = Self::load(file, compilation)?;
-        if let (None, Some(dress)) = (file, &look.dress) {
-            scene = Self::checked(dress.compile(compilation)?, compilation)?;
-        }
-        // A scene to which nothing can be added is shown as it is.
-        if let Some(file) = file
-            && let Ok(Some(model)) = furnished(file, &scene.model, compilation)
-        {
-            scene = Self::checked(model, compilation)?;
-        }
-        Ok(scene)
+        let scene = Self::load(file, compilation)?;
+        let changed = match file {
+            None => look.dress.as_ref().map(|dress| dress.compile(compilation)).transpose()?,
+            // A scene to which nothing can be added is shown as it is.
+            Some(file) => furnished(file, &scene.model, compilation).unwrap_or_default(),
+        };
+        changed.map_or(Ok(scene), |model| Self::checked(model, compilation))
     }
 
     /// Sets the camera, and the size and quality of pictures, for a variation of the scene `nominal` that is not shared yet.
@@ -131,7 +126,12 @@ impl Scene {
 
     fn checked(mut model: MjModel, compilation: &Compilation) -> Result<Self> {
         let own_timestep = model.opt().timestep;
-        compilation.set_options(&mut model);
+        model.opt_mut().timestep = compilation.timestep;
+        match compilation.cone {
+            Cone::Scene => {}
+            Cone::Pyramidal => model.opt_mut().cone = mjCONE_PYRAMIDAL as i32,
+            Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
+        }
         let halves = model.opt().integrator != mjINT_RK4 as i32;
         ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
         for (flag, bit) in NEEDED {
@@ -142,19 +142,9 @@ impl Scene {
         Ok(Self { model: Arc::new(model), own_timestep })
     }
 
-    /// A checksum (CRC-32) of the physics of the scene: the same for another path, other names and another look.
-    pub fn fingerprint(&self) -> String {
-        fingerprint(&self.model)
-    }
-
     /// The size of the compiled scene in bytes.
     pub fn size(&self) -> usize {
         self.model.size()
-    }
-
-    /// The number of geoms.
-    pub fn geoms(&self) -> usize {
-        self.model.ngeom() as usize
     }
 
     /// The number of controls.
@@ -247,7 +237,7 @@ impl Scene {
             Frame::Body(Body(body)) => body,
             Frame::Site(site) => self.model.site_bodyid()[site] as usize,
         };
-        Body(self.model.body_rootid()[body] as usize)
+        Body(self.root_of(body))
     }
 
     /// Finds the mocap body `name`.

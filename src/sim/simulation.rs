@@ -9,50 +9,26 @@ use super::constants::*;
 use super::{Actuator, Body, Frame, Mocap, Scene};
 use crate::quat::{self, Quat};
 
-/// The validity of the state after a step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[must_use]
-pub enum Validity {
-    /// The state can be used.
-    Sound,
-    /// The state or a control was not finite or was far too large. MuJoCo has reset what it could not use.
-    Diverged,
-}
-
 /// MuJoCo's name for everything that the next step depends on.
 const EVERYTHING: u32 = mjSTATE_INTEGRATION as u32;
 
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
     pub(super) data: MjData<Arc<MjModel>>,
-    /// The model of the scene while the simulation uses one of its own.
-    shared: Option<Arc<MjModel>>,
-    /// Its own model while it uses the shared one.
-    spare: Option<MjModel>,
 }
 
 impl Simulation {
     /// Creates a simulation of `scene` in its default state.
     pub fn new(scene: &Scene) -> Self {
-        Self { data: MjData::new(scene.model.clone()), shared: None, spare: None }
+        Self { data: MjData::new(scene.model.clone()) }
     }
 
-    /// Goes back to the model of the scene, if it was given another one. The state must be reset after it.
-    pub fn share_model(&mut self) {
-        self.spare = self.take_own_model();
-    }
-
-    /// Goes back to the model of the scene. Its own model, if there was one, is handed over.
-    pub(super) fn take_own_model(&mut self) -> Option<MjModel> {
-        match self.shared.take() {
-            Some(shared) => Arc::into_inner(self.data.swap_model(shared)),
-            None => self.spare.take(),
-        }
-    }
-
-    /// Uses a model of its own.
-    pub(super) fn set_own_model(&mut self, model: MjModel) {
-        self.shared = Some(self.data.swap_model(Arc::new(model)));
+    /// Continues in another scene. The state must be reset after it.
+    ///
+    /// # Panics
+    /// Panics if the structure of the scene is another one.
+    pub fn change_scene(&mut self, scene: &Scene) {
+        self.data.swap_model(scene.model.clone());
     }
 
     /// Resets to the default state and clears warm start and warnings. Call [`Simulation::refresh`] after changing the state.
@@ -65,29 +41,21 @@ impl Simulation {
         self.data.step1();
     }
 
-    /// Takes `substeps` physics steps with constant controls.
+    /// Takes `substeps` physics steps with constant controls. Returns whether the state diverged: it or a control was not finite or
+    /// was far too large, and MuJoCo has reset what it could not use.
     ///
     /// `mj_step` would leave the bodies one substep behind the joints. Its two halves in the opposite order are bit for bit the
     /// same computation and end with both at the same instant.
-    pub fn step(&mut self, substeps: usize) -> Validity {
+    #[must_use]
+    pub fn step(&mut self, substeps: usize) -> bool {
         for _ in 0..substeps {
             self.data.step2();
             self.data.step1();
             if self.diverged() {
-                return Validity::Diverged;
+                return true;
             }
         }
-        Validity::Sound
-    }
-
-    /// Begins a replay with [`Simulation::step_whole`] from the state of a simulation of `scene`, which is this simulation's scene
-    /// or a variation of it.
-    ///
-    /// # Panics
-    /// Panics if the scene or the state is of another kind.
-    pub fn start_replay(&mut self, state: &[f64], scene: &Scene) {
-        self.data.swap_model(scene.model.clone());
-        self.data.set_state(state, EVERYTHING).expect("a state of the same scene");
+        false
     }
 
     /// Takes `substeps` steps of plain `mj_step`: the physics alone, for comparison. The bodies are one substep behind the joints.

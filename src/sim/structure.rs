@@ -66,7 +66,13 @@ impl Scene {
             parts.actuators = self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
         }
         let actuators = parts.actuators.iter().filter_map(|name| self.model.name_to_id(mjOBJ_ACTUATOR, name));
-        let trees = self.trees_of(actuators);
+        let moved = actuators.flat_map(|actuator| self.wraps(actuator)).filter_map(|(kind, id, _)| match kind {
+            mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
+            mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
+            _ => None,
+        });
+        // The world is no tree.
+        let trees: BTreeSet<usize> = moved.map(|body| self.root_of(body as usize)).filter(|tree| *tree > 0).collect();
         let is_hinge = |&joint: &usize| {
             trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
                 && self.model.jnt_type()[joint] == mjJNT_HINGE
@@ -104,7 +110,7 @@ impl Scene {
     }
 
     /// The number of the first body of the tree that a body belongs to.
-    fn root_of(&self, body: usize) -> usize {
+    pub(super) fn root_of(&self, body: usize) -> usize {
         self.model.body_rootid()[body] as usize
     }
 
@@ -139,20 +145,6 @@ impl Scene {
             carries[parent] = true;
         }
         (1..count).filter(|&body| moved[body] && !carries[body]).collect()
-    }
-
-    /// The first bodies of the trees that these actuators move.
-    fn trees_of(&self, actuators: impl Iterator<Item = usize>) -> BTreeSet<usize> {
-        let mut trees = BTreeSet::new();
-        for (kind, id, _) in actuators.flat_map(|actuator| self.wraps(actuator)) {
-            match kind {
-                mjWRAP_JOINT => trees.insert(self.root_of(self.model.jnt_bodyid()[id] as usize)),
-                mjWRAP_SITE => trees.insert(self.root_of(self.model.site_bodyid()[id] as usize)),
-                _ => false,
-            };
-        }
-        trees.remove(&0);
-        trees
     }
 
     /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path

@@ -1,6 +1,6 @@
 //! The rotations that map a body onto itself: its shapes that can touch, and its inertia.
 
-use mujoco_rs::prelude::{MjModel, MjtGeomBase};
+use mujoco_rs::prelude::MjtGeomBase;
 
 use super::constants::*;
 use super::placing::{Placed, frames_within, geoms_within, inside, touches};
@@ -15,23 +15,14 @@ struct Shape {
     /// What it is, and the number of its mesh or height field, -1 for none.
     kind: (MjtGeomBase, i32),
     size: [f64; 3],
-    position: [f64; 3],
-    orientation: Quat,
-}
-
-/// The distribution of mass in the frame of the body.
-#[derive(Default)]
-struct Inertia {
-    /// The mass times the centre of mass.
-    first: [f64; 3],
-    /// The tensor about the origin.
-    second: [[f64; 3]; 3],
+    place: Placed,
 }
 
 /// The form of a body with all that is attached to it.
 struct Form {
     shapes: Vec<Shape>,
-    inertia: Inertia,
+    /// Point masses (kg, and m in the frame of the body) with the same moments as all its parts.
+    masses: Vec<(f64, [f64; 3])>,
     /// Whether parts of it move.
     moves: bool,
 }
@@ -56,22 +47,31 @@ impl Scene {
     fn form(&self, Body(top): Body) -> Form {
         let model = &self.model;
         let frames = frames_within(model, top);
-        let mut inertia = Inertia::default();
+        let mut masses = Vec::new();
         let mut moves = false;
         for (body, frame) in frames.iter().enumerate() {
-            if let Some(frame) = *frame {
-                inertia.add(model, body, frame);
-                moves |= body > top && model.body_jntnum()[body] > 0;
+            let Some(frame) = *frame else { continue };
+            moves |= body > top && model.body_jntnum()[body] > 0;
+            let mass = model.body_mass()[body];
+            let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
+            let axes = matrix(axes);
+            let inertia = model.body_inertia()[body];
+            let half = inertia.iter().sum::<f64>() / 2.0;
+            // A sixth of the mass at each end of the principal axes.
+            for axis in (0..3).filter(|_| mass > 0.0) {
+                let reach = (3.0 * (half - inertia[axis]).max(0.0) / mass).sqrt();
+                for reach in [reach, -reach] {
+                    masses.push((mass / 6.0, [0, 1, 2].map(|i| centre[i] + reach * axes[i][axis])));
+                }
             }
         }
         let touching = geoms_within(model, &frames).into_iter().filter(|&(geom, _)| touches(model, geom));
-        let shapes = touching.map(|(geom, (position, orientation))| Shape {
+        let shapes = touching.map(|(geom, place)| Shape {
             kind: (model.geom_type()[geom], model.geom_dataid()[geom]),
             size: model.geom_size()[geom],
-            position,
-            orientation,
+            place,
         });
-        Form { shapes: shapes.collect(), inertia, moves }
+        Form { shapes: shapes.collect(), masses, moves }
     }
 }
 
@@ -79,7 +79,28 @@ impl Form {
     /// Whether a rotation maps it onto itself.
     fn holds(&self, turn: Quat) -> bool {
         let onto = |shape: &Shape| self.shapes.iter().any(|other| shape.turned(turn).fills(other));
-        !self.moves && self.inertia.is_kept(turn) && self.shapes.iter().all(onto)
+        !self.moves && self.keeps_masses(turn) && self.shapes.iter().all(onto)
+    }
+
+    fn keeps_masses(&self, turn: Quat) -> bool {
+        let own = self.moments([1.0, 0.0, 0.0, 0.0]);
+        let turned = self.moments(turn);
+        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+        // A centre of mass that is off by a rounding error does not count.
+        alike(&turned[..3], &own[..3], largest(&own[..3]).max(1e-9))
+            && alike(&turned[3..], &own[3..], largest(&own[3..]))
+    }
+
+    /// The first three moments of the turned masses, kg m, and their nine second ones, kg m².
+    fn moments(&self, turn: Quat) -> [f64; 12] {
+        let mut moments = [0.0; 12];
+        for &(mass, place) in &self.masses {
+            let place = quat::rotate(turn, place);
+            for (i, moment) in moments.iter_mut().enumerate() {
+                *moment += mass * if i < 3 { place[i] } else { place[i / 3 - 1] * place[i % 3] };
+            }
+        }
+        moments
     }
 }
 
@@ -90,23 +111,24 @@ fn matrix(turn: Quat) -> [[f64; 3]; 3] {
 }
 
 /// Whether values are equal but for rounding.
-fn alike<'a>(a: impl IntoIterator<Item = &'a f64>, b: impl IntoIterator<Item = &'a f64>, scale: f64) -> bool {
-    a.into_iter().zip(b).all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
+fn alike(a: &[f64], b: &[f64], scale: f64) -> bool {
+    a.iter().zip(b).all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
 }
 
 impl Shape {
     fn turned(&self, turn: Quat) -> Self {
-        let (position, orientation) = inside(([0.0; 3], turn), self.position, self.orientation);
-        Self { position, orientation, ..*self }
+        let (position, orientation) = self.place;
+        Self { place: inside(([0.0; 3], turn), position, orientation), ..*self }
     }
 
     /// Whether this shape is in the place of another and fills the same space.
     fn fills(&self, other: &Self) -> bool {
-        let scale = self.size.iter().chain(&self.position).fold(0.0, |most: f64, x| most.max(x.abs()));
-        if self.kind != other.kind || !alike(&self.position, &other.position, scale) {
+        let (position, orientation) = self.place;
+        let scale = self.size.iter().chain(&position).fold(0.0, |most: f64, x| most.max(x.abs()));
+        if self.kind != other.kind || !alike(&position, &other.place.0, scale) {
             return false;
         }
-        let between = matrix(quat::mul(quat::conj(other.orientation), self.orientation));
+        let between = matrix(quat::mul(quat::conj(other.place.1), orientation));
         let size = match self.kind.0 {
             mjGEOM_SPHERE => self.size,
             // Their axis is z.
@@ -120,40 +142,6 @@ impl Shape {
             _ => return false,
         };
         alike(&size, &other.size, scale)
-    }
-}
-
-impl Inertia {
-    fn add(&mut self, model: &MjModel, body: usize, frame: Placed) {
-        let mass = model.body_mass()[body];
-        let principal = model.body_inertia()[body];
-        let (centre, axes) = inside(frame, model.body_ipos()[body], model.body_iquat()[body]);
-        let axes = matrix(axes);
-        let square: f64 = centre.iter().map(|x| x * x).sum();
-        for i in 0..3 {
-            self.first[i] += mass * centre[i];
-            for j in 0..3 {
-                let own: f64 = (0..3).map(|k| axes[i][k] * principal[k] * axes[j][k]).sum();
-                let all = if i == j { square } else { 0.0 };
-                self.second[i][j] += own + mass * (all - centre[i] * centre[j]);
-            }
-        }
-    }
-
-    /// Whether the rotation leaves it as it is.
-    fn is_kept(&self, turn: Quat) -> bool {
-        let rotation = matrix(turn);
-        let second = &self.second;
-        let entry = |i: usize, j: usize| -> f64 {
-            (0..9).map(|at| rotation[i][at / 3] * second[at / 3][at % 3] * rotation[j][at % 3]).sum()
-        };
-        let turned = [0, 1, 2].map(|i| [0, 1, 2].map(|j| entry(i, j)));
-        let second = second.as_flattened();
-        let largest = |values: &[f64]| values.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
-        // A centre of mass that is off by a rounding error does not count.
-        let mass_times_length = largest(&self.first).max(1e-9);
-        alike(&quat::rotate(turn, self.first), &self.first, mass_times_length)
-            && alike(turned.as_flattened(), second, largest(second))
     }
 }
 

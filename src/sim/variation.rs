@@ -3,16 +3,14 @@
 //! This is the only place where the physics of a scene is varied, for a whole task and for single episodes. Every variation is
 //! applied to the scene's own values, so that variations do not add up.
 
-#![expect(unsafe_code, reason = "two calls of MuJoCo that the wrapper cannot check; each says why it is sound")]
+#![expect(unsafe_code, reason = "a value that the wrapper does not let change; the comment says why it is sound")]
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
-use anyhow::{Result, ensure};
-use mujoco_rs::mujoco_c::mj_copyModel;
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::placing::frames_within;
-use super::{Actuator, Body, Hinge, Scene, Simulation};
+use super::{Actuator, Body, Hinge, Scene};
 
 /// A change of the physics of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -74,66 +72,21 @@ impl Change {
 }
 
 impl Scene {
-    /// This scene with these changes.
+    /// This scene with these changes, and with what MuJoCo derives from masses at compile time.
     pub fn varied(&self, changes: &[Change]) -> Self {
-        Self { model: Arc::new(changed((*self.model).clone(), changes, &Workspaces::default())), ..*self }
-    }
-}
-
-/// Workspaces for updating the constants of a model, one for each thread that has needed one at the same time.
-type Workspaces = Mutex<Vec<MjData<Box<MjModel>>>>;
-
-/// A model with these changes, and with what MuJoCo derives from masses at compile time.
-fn changed(mut model: MjModel, changes: &[Change], workspaces: &Workspaces) -> MjModel {
-    changes.iter().for_each(|change| change.apply(&mut model));
-    if !changes.iter().any(Change::is_structural) {
-        return model;
-    }
-    let mut own = Box::new(model);
-    let free = || workspaces.lock().unwrap_or_else(PoisonError::into_inner);
-    let workspace = free().pop();
-    let mut workspace = workspace.unwrap_or_else(|| MjData::new(own.clone()));
-    own = workspace.swap_model(own);
-    workspace.set_const();
-    own = workspace.swap_model(own);
-    free().push(workspace);
-    *own
-}
-
-/// Scenes that simulations can switch between, each time with other changes.
-pub struct Variants {
-    scenes: Vec<Scene>,
-    workspaces: Workspaces,
-}
-
-impl Variants {
-    /// Creates the variants from scenes that differ only in sizes.
-    ///
-    /// # Errors
-    /// Fails if they differ in their structure.
-    pub fn new(scenes: Vec<Scene>) -> Result<Self> {
-        let alike = scenes.windows(2).all(|pair| pair[0].model.is_compatible_with_model(&pair[1].model));
-        ensure!(alike, "its structure changes with the size of the object");
-        Ok(Self { scenes, workspaces: Workspaces::default() })
+        let mut model = (*self.model).clone();
+        changes.iter().for_each(|change| change.apply(&mut model));
+        if changes.iter().any(Change::is_structural) {
+            let mut workspace = MjData::new(Box::new(model));
+            workspace.set_const();
+            model = workspace.model().clone();
+        }
+        Self { model: Arc::new(model), ..*self }
     }
 
-    /// A scene (by number) with these changes.
-    pub fn scene(&self, scene: usize, changes: &[Change]) -> Scene {
-        self.scenes[scene].varied(changes)
-    }
-
-    /// Gives `simulation` a model of its own: a scene (by number) with these changes. Its state must be reset after it.
-    ///
-    /// # Panics
-    /// Panics if the simulation belongs to another scene.
-    pub fn vary(&self, simulation: &mut Simulation, scene: usize, changes: &[Change]) {
-        let scene = &self.scenes[scene].model;
-        let mut model = simulation.take_own_model().unwrap_or_else(|| (**scene).clone());
-        assert!(model.is_compatible_with_model(scene), "scenes that differ only in sizes");
-        // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
-        // process if they differ. Both come from the same scene, so they do not.
-        unsafe { mj_copyModel(model.ffi_mut(), scene.ffi()) };
-        simulation.set_own_model(changed(model, changes, &self.workspaces));
+    /// Whether it differs from another scene only in its numbers, so that a simulation can change from one to the other.
+    pub fn has_structure_of(&self, other: &Self) -> bool {
+        self.model.is_compatible_with_model(&other.model)
     }
 }
 

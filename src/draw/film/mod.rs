@@ -8,7 +8,7 @@ mod gif;
 mod mp4;
 
 use std::path::PathBuf;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -24,7 +24,7 @@ const WAITING: usize = 4;
 const MOST_FRAMES: usize = 2_000_000;
 
 /// A frame `[height, width, 3]`, and the lines of text in its corner.
-pub type CaptionedFrame = (Vec<u8>, Vec<String>);
+type CaptionedFrame = (Vec<u8>, Vec<String>);
 
 /// A film being written. The file appears once the film is finished.
 pub struct FilmWriter {
@@ -56,9 +56,12 @@ impl FilmWriter {
             format.longest
         );
         let file = OutputFile::create(&to.path)?;
-        let (frames, incoming) = sync_channel(WAITING);
+        let (frames, incoming) = sync_channel::<CaptionedFrame>(WAITING);
         let encode = move || {
-            let frames = &mut captioned(incoming, format);
+            let frames = &mut incoming.into_iter().map(|(mut rgb, lines)| {
+                caption::draw(&mut rgb, format.size, &lines);
+                rgb
+            });
             let encoded =
                 if is_gif { gif::encode(&file.file, format, frames) } else { mp4::encode(&file.file, format, frames) };
             encoded.map(|()| file)
@@ -67,15 +70,12 @@ impl FilmWriter {
         Ok(Self { path: to.path.clone(), frames, encoder })
     }
 
-    /// Adds a frame. Does nothing if the encoder has failed: [`FilmWriter::failed`] reports that, and [`FilmWriter::finish`]
-    /// returns the reason.
-    pub fn push(&mut self, frame: CaptionedFrame) {
-        let _ = self.frames.send(frame);
-    }
-
-    /// Whether the encoder has stopped early.
-    pub fn failed(&self) -> bool {
-        self.encoder.is_finished()
+    /// Adds a frame.
+    ///
+    /// # Errors
+    /// Fails if the encoder has stopped early. [`FilmWriter::finish`] returns the reason.
+    pub fn push(&mut self, frame: CaptionedFrame) -> Result<()> {
+        self.frames.send(frame).ok().context("the film cannot be continued")
     }
 
     /// Completes the file. Without `keep`, abandons the film and leaves an existing file as it was.
@@ -88,13 +88,6 @@ impl FilmWriter {
         let finished = encoded.and_then(|file| if keep { file.complete() } else { Ok(()) });
         finished.with_context(|| format!("cannot write the film {}", self.path.display()))
     }
-}
-
-fn captioned(frames: Receiver<CaptionedFrame>, format: FilmFormat) -> impl Iterator<Item = Vec<u8>> {
-    frames.into_iter().map(move |(mut rgb, lines)| {
-        caption::draw(&mut rgb, format.size, &lines);
-        rgb
-    })
 }
 
 /// Writes a picture `[height, width, 3]` as PNG.
