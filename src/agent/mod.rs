@@ -147,7 +147,7 @@ impl<E: Env> Agent<E> {
         self.ppo.follow_ramps(self.env_steps, &mut self.rollout);
         let ppo = &self.ppo;
         let iteration = self.iteration + 1;
-        let horizon = self.rollout.horizon();
+        let horizon = self.rollout.horizon;
         let acting = ppo.acting();
         let parts = self.pool.blocks.iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.work);
         let blocks =

@@ -155,8 +155,8 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let size = config.samples_per_minibatch();
     let flops = flops_per_sample(&ppo.policy);
     time_gradient_steps(ppo, rollout, 2)?;
-    let times = time_gradient_steps(ppo, rollout, REPEATS)?;
-    let samples = size as f64 / median(times.seconds);
+    let (seconds, waiting) = time_gradient_steps(ppo, rollout, REPEATS)?;
+    let samples = size as f64 / median(seconds);
     let gflops = 1e-9 * flops * samples;
     let matmul = median(matmul_gflops(ppo, size, REPEATS));
     let mut lines = format!(
@@ -164,7 +164,7 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
          its matrix products alone                      {matmul:.1} GFLOP/s\n"
     );
     let mut figures = vec![("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)];
-    if let Some(waiting) = times.waiting {
+    if let Some(waiting) = waiting {
         lines += &format!("its threads wait          {:>10.1} % of the time\n", 100.0 * waiting);
         figures.push(("learner_waits", waiting));
     }

@@ -26,7 +26,6 @@ struct Start {
 /// training run.
 pub(super) struct RecordingEnv {
     env: Repose,
-    task: Arc<Task>,
     randomization: Option<Arc<Randomization>>,
     starts: Vec<Start>,
     /// The controls of each step, and the random force on the object, if there are such forces.
@@ -45,7 +44,6 @@ impl RecordingEnv {
         let nominal = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             env: Repose::randomized(task, randomization),
-            task: task.clone(),
             randomization: randomization.cloned(),
             starts: Vec::new(),
             steps: Vec::new(),
@@ -75,8 +73,8 @@ impl RecordingEnv {
         self.scenes.clear();
         for Start { draw, .. } in &self.starts {
             if *draw != self.drawn.0 {
-                let scene = self.randomization.as_ref().map(|all| all.scene_of(draw.as_ref(), &self.task.hand));
-                self.drawn = (draw.clone(), scene.unwrap_or_else(|| self.task.scene.clone()));
+                let scene = self.randomization.as_ref().map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand));
+                self.drawn = (draw.clone(), scene.unwrap_or_else(|| self.env.task.scene.clone()));
             }
             self.scenes.push(self.drawn.1.clone());
         }
@@ -86,10 +84,10 @@ impl RecordingEnv {
     fn replay(&mut self, step: usize) {
         let (ctrl, push) = &self.steps[step];
         if let Some(force) = *push {
-            self.bare.push(self.task.hand.object.body, force);
+            self.bare.push(self.env.task.hand.object.body, force);
         }
         self.bare.ctrl_mut().copy_from_slice(ctrl);
-        self.bare.step_whole(self.task.config.substeps());
+        self.bare.step_whole(self.env.task.config.substeps());
         self.go_on(step + 1);
     }
 

@@ -82,7 +82,7 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
 fn of_training(checkpoint: &Checkpoint) -> Vec<(&'static str, String)> {
     let progress = &checkpoint.progress;
     let steps = (progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string()));
-    let goals = progress.best.map(|best| ("goals_per_episode", best.goals.to_string()));
+    let goals = progress.best.map(|best| ("goals_per_episode", best[0].to_string()));
     let provenance = checkpoint.provenance.clone().map(|text| ("provenance", text));
     [steps, goals, provenance].into_iter().flatten().collect()
 }

@@ -8,7 +8,7 @@ mod tests {
     use super::super::fused::Fused;
     use super::super::kernels::Arithmetic;
     use super::super::{Policy, Ppo, Rollout};
-    use crate::config::{self, Activation, Config, Precision};
+    use crate::config::{self, Activation, Config, Geometric, Precision, Ramp};
     use crate::ranks::{Exchange, tree_sum};
     use crate::rng;
     use crate::spaces::{ObjectAndGoal, Spaces};
@@ -60,11 +60,12 @@ mod tests {
 
     /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
-        let minibatch = ppo.exchange.minibatch(samples);
-        let sums = ppo.backend.gradients(&ppo.policy, rollout, &minibatch, &mut ppo.of_groups).unwrap();
+        let groups = ppo.exchange.groups(samples);
+        let count = samples.len();
+        let sums = ppo.backend.gradients(&ppo.policy, rollout, &groups, count, &mut ppo.of_groups).unwrap();
         let add_up = |parameters, out: &mut [f32]| tree_sum(out, &ppo.of_groups, parameters);
         ppo.slices.reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
-        ppo.losses(&sums, minibatch.count)
+        ppo.losses(&sums, count)
     }
 
     /// Splits these values by parameter tensor.
@@ -158,7 +159,8 @@ mod tests {
         // 1e-8.
         for (norm, most, least) in [(1e-12, 1e-6, 0.0), (1e3, 1.01e-3, 0.99e-3)] {
             let (mut ppo, mut rollout) = learner(config::Backend::Fused, Activation::Elu);
-            (ppo.config.epochs, ppo.config.minibatches, ppo.desired_kl) = (1, 1, 0.0);
+            (ppo.config.epochs, ppo.config.minibatches) = (1, 1);
+            ppo.config.desired_kl = Geometric(Ramp::constant(0.0));
             (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
             let before = ppo.policy.parameters.clone();
             ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();

@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use super::policy::Policy;
 use super::rollout::Rollout;
 use crate::config::PpoConfig;
-use crate::ranks::Minibatch;
 
 /// The losses of samples, and measures of how far the policy has moved. They are sums over the samples, or means.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -59,8 +58,9 @@ pub(super) trait GradientBackend: Send + Sync {
     /// Prepares for the minibatches of a rollout, before any step on it. `policy` is the policy that collected it.
     fn begin(&mut self, _policy: &Policy, _rollout: &Rollout) {}
 
-    /// Computes the gradients of the losses of each group of this minibatch with respect to the parameters of the policy. Writes
-    /// them to `gradients`, whose memory is used again. The result is the sums of each group.
+    /// Computes the gradients of the losses of each of these groups of samples with respect to the parameters of the policy. The
+    /// losses are means over the `count` samples of the minibatch on all ranks. Writes the gradients to `gradients`, whose memory
+    /// is used again. The result is the sums of each group.
     ///
     /// # Errors
     /// Fails if the underlying library fails.
@@ -68,7 +68,8 @@ pub(super) trait GradientBackend: Send + Sync {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        of: &Minibatch,
+        groups: &[&[u32]],
+        count: usize,
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>>;
 }

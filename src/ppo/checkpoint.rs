@@ -267,8 +267,8 @@ impl Ppo {
 mod tests {
     use super::*;
     use crate::config::{Backend, Config};
+    use crate::ppo::Rollout;
     use crate::ppo::update::Stage;
-    use crate::ppo::{Evaluation, Rollout};
     use crate::ranks::Exchange;
 
     const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
@@ -284,13 +284,7 @@ mod tests {
     }
 
     fn progress() -> Progress {
-        Progress {
-            iteration: 7,
-            env_steps: 99,
-            best: Some(Evaluation { goals: 1.5, rot_dist: 0.25 }),
-            fork: None,
-            rise: None,
-        }
+        Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]), fork: None, rise: None }
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {

@@ -14,12 +14,11 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::backend::{GradientBackend, Losses};
-use super::kernels::{Arithmetic, Purpose, ROWS, Workspace};
+use super::kernels::{Arithmetic, ROWS, Workspace};
 use super::loss::Loss;
 use super::policy::Policy;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
-use crate::ranks::Minibatch;
 
 /// The gradient backend with our own kernels.
 pub(super) struct Fused {
@@ -62,16 +61,17 @@ impl GradientBackend for Fused {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        of: &Minibatch,
+        groups: &[&[u32]],
+        count: usize,
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>> {
         let workspace = || Mutex::new(Workspace::new(&policy.layout.actor, ROWS, self.arithmetic));
         self.workspaces.resize_with(rayon::current_num_threads(), workspace);
         // The rows that pass through a net together: blocks of equal size as far as possible.
-        let samples = of.groups.iter().map(|group| group.len()).max().unwrap_or(0);
+        let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        let nets = policy.nets(self.arithmetic, Purpose::Learning);
-        let loss = Loss::new(policy, rollout, of.count, &self.config);
+        let nets = policy.nets(self.arithmetic, true);
+        let loss = Loss::new(policy, rollout, count, &self.config);
         // Passes the samples of a group forward and backward through a net.
         let job = |(group, role, gradient): (&[u32], Role, &mut [f32])| {
             let net = &nets[role as usize];
@@ -93,9 +93,9 @@ impl GradientBackend for Fused {
             loss.of_group(&sums)
         };
         let [actor, _] = policy.layout.nets();
-        gradients.resize_with(of.groups.len(), || vec![0.0; policy.layout.count()]);
+        gradients.resize_with(groups.len(), || vec![0.0; policy.layout.count()]);
         let mut jobs = Vec::new();
-        for (&group, gradient) in of.groups.iter().zip(gradients) {
+        for (&group, gradient) in groups.iter().zip(gradients) {
             let (actor, critic) = gradient.split_at_mut(actor.end);
             jobs.push((group, Role::Actor, actor));
             jobs.push((group, Role::Critic, critic));

@@ -15,25 +15,18 @@ use crate::os;
 /// Seconds after which no further gradient step is timed, once three have been.
 const LIMIT: f64 = 5.0;
 
-/// How long gradient steps took.
-pub struct StepTimes {
-    /// The time of each, s.
-    pub seconds: Vec<f64>,
-    /// The share of the time of all threads in which they neither compute nor look for work, if the system reports it.
-    pub waiting: Option<f64>,
-}
-
 /// Times up to `repeats` gradient steps (gathering, forward, backward and Adam, both nets) on a minibatch of a
-/// collected rollout.
+/// collected rollout. The results are the time of each, s, and the share of the time of all threads in which they neither compute nor
+/// look for work, if the system reports it.
 ///
 /// # Errors
 /// Fails if a loss or gradient is not finite.
-pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<StepTimes> {
+pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<(Vec<f64>, Option<f64>)> {
     ppo.prepare(rollout);
     ppo.backend.begin(&ppo.policy, rollout);
     // Samples from the whole rollout, as in a shuffled minibatch.
     let samples = rollout.samples();
-    let step = samples / ppo.config.minibatch_of(samples, rollout.horizon());
+    let step = samples / ppo.config.minibatch_of(samples, rollout.horizon);
     let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
     let mut seconds = Vec::new();
     let mut all = 0.0;
@@ -49,7 +42,7 @@ pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize)
     }
     let worked = os::processor_seconds().zip(before).map(|(after, before)| after - before);
     let of_threads = all * rayon::current_num_threads() as f64;
-    Ok(StepTimes { seconds, waiting: worked.map(|worked| (1.0 - worked / of_threads).max(0.0)) })
+    Ok((seconds, worked.map(|worked| (1.0 - worked / of_threads).max(0.0))))
 }
 
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the

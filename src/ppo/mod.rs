@@ -36,7 +36,7 @@ pub use normalizer::Normalizer;
 pub use parameters::{Layer, ParameterLayout, View};
 pub use perception::{CLIP, InputTransform, Perception};
 pub use policy::{FrozenPolicy, GROUP, Policy};
-pub use progress::{Evaluation, Fork, Progress, Rise};
+pub use progress::{Fork, Progress, Rise, beats};
 pub use rollout::{Rollout, RolloutBlock};
 pub use update::UpdateStats;
 
@@ -65,12 +65,10 @@ pub struct Ppo {
     adam: Adam,
     /// The learning rate of the next step.
     learning_rate: f64,
-    /// The standard deviation of the actions far from the goal, if larger.
-    away_std: f32,
+    /// The control steps of the run, which the ramps of the settings follow.
+    env_steps: u64,
     /// The iteration in which the actor begins to learn.
     actor_from: u64,
-    /// The desired KL divergence of an iteration, nats. At 0, the learning rate is fixed.
-    desired_kl: f64,
     exchange: Exchange,
     /// The parameters that this rank moves.
     slices: Slices,
@@ -101,9 +99,8 @@ impl Ppo {
             of_groups: Vec::new(),
             adam: Adam::new(count),
             learning_rate: config.learning_rate,
-            away_std: config.away_std.at(0) as f32,
+            env_steps: 0,
             actor_from: config.critic_first + 1,
-            desired_kl: config.desired_kl.at(0),
             exchange,
             slices,
         })
@@ -125,11 +122,10 @@ impl Ppo {
     /// their ramps after `env_steps` control steps of the run.
     pub fn follow_ramps(&mut self, env_steps: u64, rollout: &mut Rollout) {
         let horizon = self.config.horizon_at(env_steps);
-        if horizon != rollout.horizon() {
+        if horizon != rollout.horizon {
             rollout.resize(horizon, &self.policy.spaces);
         }
-        self.desired_kl = self.config.desired_kl.at(env_steps);
-        self.away_std = self.config.away_std.at(env_steps) as f32;
+        self.env_steps = env_steps;
         self.policy.log_std = self.config.std.at(env_steps).ln() as f32;
     }
 
@@ -150,7 +146,8 @@ impl Ppo {
 
     /// The policy of this iteration, for collecting a rollout.
     pub fn acting(&self) -> Acting<'_> {
-        let away_scale = (self.away_std / self.policy.std()).max(1.0);
+        let away_std = self.config.away_std.at(self.env_steps) as f32;
+        let away_scale = (away_std / self.policy.std()).max(1.0);
         Acting { frozen: self.policy.freeze_for(self.arithmetic), config: &self.config, away_scale }
     }
 

@@ -17,7 +17,6 @@ pub const CLIP: f32 = 5.0;
 const EPSILON: f64 = 1e-5;
 
 /// What a policy treats as the same in raw observations.
-#[derive(Clone, Copy)]
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
     pub object_and_goal: Option<ObjectAndGoal>,

@@ -4,7 +4,7 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::Normalizer;
-use super::kernels::{Arithmetic, Net, Purpose, Workspace};
+use super::kernels::{Arithmetic, Net, Workspace};
 use super::parameters::ParameterLayout;
 use super::perception::{InputTransform, Perception};
 use crate::config::{Activation, PpoConfig};
@@ -90,10 +90,10 @@ impl Policy {
         [&layout.actor, &layout.critic].map(|layers| Net::new(layers, &self.parameters, self.activation))
     }
 
-    /// Actor and critic, prepared for workspaces of this arithmetic.
-    pub(super) fn nets(&self, arithmetic: Arithmetic, purpose: Purpose) -> [Net<'_>; 2] {
+    /// Actor and critic, prepared for workspaces of this arithmetic, to learn or to act.
+    pub(super) fn nets(&self, arithmetic: Arithmetic, learns: bool) -> [Net<'_>; 2] {
         let mut nets = self.plain_nets();
-        Net::prepare(&mut nets, arithmetic, purpose);
+        Net::prepare(&mut nets, arithmetic, learns);
         nets
     }
 
@@ -109,7 +109,7 @@ impl Policy {
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        FrozenPolicy { nets: self.nets(arithmetic, Purpose::Acting), ..self.freeze_briefly() }
+        FrozenPolicy { nets: self.nets(arithmetic, false), ..self.freeze_briefly() }
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`. The results for a row are bit for bit the same whatever the other

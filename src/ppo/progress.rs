@@ -10,8 +10,8 @@ pub struct Progress {
     pub iteration: u64,
     /// Control steps over all environments.
     pub env_steps: u64,
-    /// The best evaluation so far.
-    pub best: Option<Evaluation>,
+    /// Goals per episode and rotation error, rad, of the best evaluation so far.
+    pub best: Option<[f64; 2]>,
     /// The checkpoint that it was forked from, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fork: Option<Fork>,
@@ -40,44 +40,21 @@ impl Rise {
 
     /// Records another evaluation.
     pub fn add(&mut self, figures: [f64; 3]) {
-        let of = |[goals, rot_dist, _]: [f64; 3]| Evaluation { goals, rot_dist };
+        let of = |[goals, rot_dist, _]: [f64; 3]| [goals, rot_dist];
         self.since = self.since.saturating_add(1);
-        if of(figures).beats(Some(of(self.best))) {
+        if beats(of(figures), Some(of(self.best))) {
             self.best = figures;
             self.since = 0;
         }
     }
 }
 
-/// The scores that evaluations are compared by. In a file, they are an array of both.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(from = "[f64; 2]", into = "[f64; 2]")]
-pub struct Evaluation {
-    /// Goals per episode.
-    pub goals: f64,
-    /// Rotation error, rad.
-    pub rot_dist: f64,
-}
-
-impl Evaluation {
-    /// Whether it is better than the best so far: more goals, or the same number with a smaller error.
-    pub fn beats(self, best: Option<Self>) -> bool {
-        let order = |it: Self| (it.goals, -it.rot_dist);
-        // If every episode diverged at once, there is no rotation error to compare.
-        self.goals.is_finite() && self.rot_dist.is_finite() && best.is_none_or(|best| order(self) > order(best))
-    }
-}
-
-impl From<[f64; 2]> for Evaluation {
-    fn from([goals, rot_dist]: [f64; 2]) -> Self {
-        Self { goals, rot_dist }
-    }
-}
-
-impl From<Evaluation> for [f64; 2] {
-    fn from(Evaluation { goals, rot_dist }: Evaluation) -> Self {
-        [goals, rot_dist]
-    }
+/// Whether an evaluation is better than the best so far: more goals, or the same number with a smaller error. Both are given by their
+/// goals per episode and their rotation error, rad.
+pub fn beats(found: [f64; 2], best: Option<[f64; 2]>) -> bool {
+    let order = |[goals, rot_dist]: [f64; 2]| (goals, -rot_dist);
+    // If every episode diverged at once, there is no rotation error to compare.
+    found.iter().all(|figure| figure.is_finite()) && best.is_none_or(|best| order(found) > order(best))
 }
 
 /// The checkpoint of another run that a run was forked from.
@@ -98,7 +75,6 @@ mod tests {
 
     #[test]
     fn the_best_evaluation_has_most_goals_and_then_the_least_rotation_error() {
-        let beats = |one: [f64; 2], best: Option<[f64; 2]>| Evaluation::from(one).beats(best.map(Evaluation::from));
         assert!(beats([0.0, 2.0], None));
         assert!(beats([1.0, 2.0], Some([0.5, 0.1])));
         assert!(!beats([0.5, 0.1], Some([1.0, 2.0])));

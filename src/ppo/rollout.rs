@@ -9,6 +9,8 @@ use crate::spaces::Spaces;
 
 /// T steps of N environments, with O values in an observation and A in an action.
 pub struct Rollout {
+    /// The number of steps T.
+    pub horizon: usize,
     /// Blocks, in the order of the environments.
     pub blocks: Vec<RolloutBlock>,
     /// For each sample, in block order: the index of its block.
@@ -39,7 +41,6 @@ pub struct RolloutBlock {
     pub advantages: Vec<f32>,
     /// `[T, n]`: set by the update
     pub returns: Vec<f32>,
-    horizon: usize,
     envs: usize,
     observation_size: usize,
 }
@@ -47,7 +48,24 @@ pub struct RolloutBlock {
 impl Rollout {
     /// Creates an empty rollout of `horizon` steps for blocks with these numbers of environments.
     pub fn new(horizon: usize, block_sizes: &[usize], spaces: &Spaces) -> Self {
-        let block = |&envs: &usize| RolloutBlock::new(horizon, envs, spaces);
+        let Spaces { observation_size, action_size, .. } = *spaces;
+        let block = |&envs: &usize| {
+            let steps = horizon * envs;
+            RolloutBlock {
+                observations: vec![0.0; (steps + envs) * observation_size],
+                actions: vec![0.0; steps * action_size],
+                means: vec![0.0; steps * action_size],
+                log_probs: vec![0.0; steps],
+                noise_scales: vec![1.0; steps],
+                values: vec![0.0; steps + envs],
+                rewards: vec![0.0; steps],
+                dones: vec![false; steps],
+                advantages: vec![0.0; steps],
+                returns: vec![0.0; steps],
+                envs,
+                observation_size,
+            }
+        };
         let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
         let mut block_of = Vec::new();
         let mut firsts = Vec::new();
@@ -55,12 +73,7 @@ impl Rollout {
             firsts.push(block_of.len() as u32);
             block_of.resize(block_of.len() + block.samples(), i as u32);
         }
-        Self { blocks, block_of, firsts }
-    }
-
-    /// The number of steps T.
-    pub fn horizon(&self) -> usize {
-        self.blocks[0].horizon
+        Self { horizon, blocks, block_of, firsts }
     }
 
     /// The number of samples, T × N.
@@ -99,26 +112,6 @@ impl Rollout {
 }
 
 impl RolloutBlock {
-    fn new(horizon: usize, envs: usize, spaces: &Spaces) -> Self {
-        let Spaces { observation_size, action_size, .. } = *spaces;
-        let steps = horizon * envs;
-        Self {
-            observations: vec![0.0; (steps + envs) * observation_size],
-            actions: vec![0.0; steps * action_size],
-            means: vec![0.0; steps * action_size],
-            log_probs: vec![0.0; steps],
-            noise_scales: vec![1.0; steps],
-            values: vec![0.0; steps + envs],
-            rewards: vec![0.0; steps],
-            dones: vec![false; steps],
-            advantages: vec![0.0; steps],
-            returns: vec![0.0; steps],
-            horizon,
-            envs,
-            observation_size,
-        }
-    }
-
     /// The number of samples, T × n.
     pub fn samples(&self) -> usize {
         self.rewards.len()

@@ -84,7 +84,7 @@ impl Ppo {
                 self.adam = Adam::new(self.policy.layout.count());
             }
             let samples = rollout.samples();
-            let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon());
+            let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon);
             let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
             let shuffles = self.exchange.own_shards().map(stream).collect();
             let mut minibatches = self.exchange.epochs(samples, size, shuffles);
@@ -146,21 +146,23 @@ impl Ppo {
     /// Fails if one of them is not finite. Nothing has moved then.
     pub(super) fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], stage: Stage) -> Result<(Losses, f64)> {
         let nets = self.policy.layout.nets();
-        let minibatch = self.exchange.minibatch(samples);
-        let sums = self.backend.gradients(&self.policy, rollout, &minibatch, &mut self.of_groups)?;
+        let groups = self.exchange.groups(samples);
+        let count = self.exchange.of_all(samples.len());
+        let sums = self.backend.gradients(&self.policy, rollout, &groups, count, &mut self.of_groups)?;
         let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
             Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
             _ => tree_sum(out, &self.of_groups, parameters),
         };
         let squares = self.slices.reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
         let grad_norm = norm(&squares, &nets);
-        let losses = self.losses(&sums, minibatch.count);
+        let losses = self.losses(&sums, count);
         for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
             ensure!(value.is_finite(), "{what} is {value}: the training run has failed and stops here");
         }
         if let Stage::Later = stage {
             let range = self.config.learning_rate_range;
-            self.learning_rate = learning_rate::adapted(self.learning_rate, losses.kl, self.desired_kl, range);
+            let desired_kl = self.config.desired_kl.at(self.env_steps);
+            self.learning_rate = learning_rate::adapted(self.learning_rate, losses.kl, desired_kl, range);
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);

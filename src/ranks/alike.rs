@@ -18,8 +18,7 @@ impl Exchange {
         if self.is_alone() && !launched_by_mpirun() {
             return Ok(None);
         }
-        let program = if self.is_alone() { 0 } else { os::program_checksum() };
-        let all = self.all_gather((program, scene.to_owned(), Machine::this()));
+        let all = self.all_gather((os::program_checksum(), scene.to_owned(), Machine::this()));
         for (rank, (program, scene, _)) in all.iter().enumerate() {
             ensure!(*program == all[0].0, "rank {rank} runs another program than rank 0");
             ensure!(*scene == all[0].1, "rank {rank} has another scene than rank 0");

@@ -12,17 +12,9 @@ const GROUPS: usize = 16;
 /// The fewest samples of a shard that are worth their own group.
 const SMALLEST_GROUP: usize = 32;
 
-/// The samples of this rank that one gradient step learns from.
-pub struct Minibatch<'a> {
-    /// Groups whose gradients are added up as a binary tree. Their number is a power of two.
-    pub groups: Vec<&'a [u32]>,
-    /// The number of samples of all ranks.
-    pub count: usize,
-}
-
 impl Exchange {
     /// Deals the `samples` samples of this rank, shard after shard, into minibatches of `size` samples of all ranks. Each call of
-    /// the result gives those of another epoch, as [`Exchange::minibatch`] takes them. `shuffles` has a generator for each shard
+    /// the result gives those of another epoch, as [`Exchange::groups`] takes them. `shuffles` has a generator for each shard
     /// of this rank.
     pub fn epochs(&self, samples: usize, size: usize, mut shuffles: Vec<Rng>) -> impl FnMut() -> Vec<Vec<u32>> + use<> {
         let mut order: Vec<u32> = (0..samples as u32).collect();
@@ -36,8 +28,9 @@ impl Exchange {
         }
     }
 
-    /// The minibatch of these samples of this rank, shard after shard, equally many of each.
-    pub fn minibatch<'a>(&self, samples: &'a [u32]) -> Minibatch<'a> {
+    /// The groups of these samples of this rank, shard after shard, equally many of each. Their gradients are added up as a
+    /// binary tree.
+    pub fn groups<'a>(&self, samples: &'a [u32]) -> Vec<&'a [u32]> {
         let in_shard = samples.len() / self.own_shards().len();
         // A power of two, so that all groups can be added as a tree. It depends on nothing but the samples and the shards.
         let mut groups = (GROUPS / self.shards).max(1);
@@ -45,7 +38,7 @@ impl Exchange {
             groups /= 2;
         }
         let split = |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
-        Minibatch { groups: samples.chunks(in_shard).flat_map(split).collect(), count: in_shard * self.shards }
+        samples.chunks(in_shard).flat_map(split).collect()
     }
 }
 
@@ -61,12 +54,12 @@ mod tests {
         for _ in 0..2 {
             let mut seen = Vec::new();
             for samples in epoch() {
-                let minibatch = exchange.minibatch(&samples);
-                assert_eq!((minibatch.count, minibatch.groups.len()), (128, 4));
-                for (shard, group) in minibatch.groups.iter().enumerate() {
+                let groups = exchange.groups(&samples);
+                assert_eq!((samples.len(), groups.len()), (128, 4));
+                for (shard, group) in groups.iter().enumerate() {
                     assert!(group.len() == 32 && group.iter().all(|&sample| sample as usize / 96 == shard));
                 }
-                seen.extend(minibatch.groups.concat());
+                seen.extend(groups.concat());
             }
             seen.sort_unstable();
             assert!(seen.into_iter().eq(0..4 * 96));
@@ -77,8 +70,7 @@ mod tests {
     fn the_samples_of_few_shards_are_split_into_groups_of_similar_size() {
         let samples: Vec<u32> = (0..1301).collect();
         let sizes = |shards: usize, samples: &[u32]| {
-            let minibatch = Exchange::alone(shards).minibatch(samples);
-            minibatch.groups.iter().map(|group| group.len()).collect::<Vec<_>>()
+            Exchange::alone(shards).groups(samples).iter().map(|group| group.len()).collect::<Vec<_>>()
         };
         assert_eq!(sizes(1, &samples[..20]), [20]);
         assert_eq!(sizes(1, &samples[..64]), [32; 2]);

@@ -24,7 +24,6 @@ use pulp::Arch;
 
 pub use exchange::Exchange;
 pub use launch::{expect_one, is_spokesman, launched_by_mpirun, together};
-pub use minibatches::Minibatch;
 pub use slices::Slices;
 
 /// The ranks of a training run, as one of them sees them. All ranks make the same calls in the same order.

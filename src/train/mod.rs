@@ -19,7 +19,7 @@ use crate::cli::TrainArgs;
 use crate::config::Config;
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Requests, say};
-use crate::ppo::{Evaluation, Rise};
+use crate::ppo::{Rise, beats};
 use crate::ranks::{self, Exchange};
 use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums, Task};
 use crate::run::Histogram;
@@ -202,8 +202,8 @@ impl Session {
 
     /// Records an evaluation, if the score is one, and returns whether it is the best so far.
     fn take_down(&mut self, evaluation: &Score) -> bool {
-        let found = Evaluation { goals: evaluation["goals"], rot_dist: evaluation["rot_dist"] };
-        let improved = found.beats(self.best);
+        let found = [evaluation["goals"], evaluation["rot_dist"]];
+        let improved = beats(found, self.best);
         self.best = if improved { Some(found) } else { self.best };
         // While the critic learns alone, an evaluation cannot rise.
         if evaluation.episodes > 0 && !self.agent.ppo.is_critic_alone(self.agent.iteration) {

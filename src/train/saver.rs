@@ -9,7 +9,7 @@ use crate::cli::TrainArgs;
 use crate::config::{Config, scene_option};
 use crate::load;
 use crate::os::{self, Locked, say};
-use crate::ppo::{Checkpoint, Evaluation, Fork, Progress};
+use crate::ppo::{Checkpoint, Fork, Progress};
 use crate::run::{Report, RunFolder};
 use crate::sim;
 
@@ -239,7 +239,7 @@ impl Held {
 /// The score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run. It is the score
 /// of the best checkpoint in the folder. If that is lost, the score of the policy that was made from it counts, else the score
 /// in the resumed checkpoint.
-pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<Evaluation>) -> Option<Evaluation> {
+pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<[f64; 2]>) -> Option<[f64; 2]> {
     let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
     score(&folder.checkpoints.best()).or_else(|| score(&folder.policy())).or(resumed)
 }

@@ -11,7 +11,7 @@ use crate::cli::TrainArgs;
 use crate::config::{Config, Settings, Source};
 use crate::evaluate::{expect_finite_actions, expect_finite_values};
 use crate::os::{self, say};
-use crate::ppo::{Checkpoint, Evaluation, Rise};
+use crate::ppo::{Checkpoint, Rise};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Repose, Task};
 use crate::run::{self, RunFolder};
@@ -26,7 +26,7 @@ pub(super) struct Session {
     /// The environments and the learner.
     pub agent: Agent<Repose>,
     /// The best evaluation so far.
-    pub best: Option<Evaluation>,
+    pub best: Option<[f64; 2]>,
     /// How far evaluations have risen, if the run ends when they no longer do.
     pub rise: Option<Rise>,
     /// Whether the steps that led to them are written.

@@ -13,7 +13,7 @@ use crate::cli::TrainArgs;
 use crate::config::{Config, MODEL, Override, PpoConfig, Reader, Settings, Source, short};
 use crate::load::{self, PolicySource};
 use crate::os::{self, Locked};
-use crate::ppo::{Checkpoint, Evaluation, Fork};
+use crate::ppo::{Checkpoint, Fork};
 use crate::ranks::Exchange;
 use crate::repose::{Record, Task};
 use crate::run::{self, RunFolder};
@@ -25,7 +25,7 @@ pub(super) struct Plan {
     /// The checkpoint that it starts from, and what it takes from it. Without one, it starts from random weights.
     pub from: Option<(Takes, Checkpoint)>,
     /// The best evaluation so far.
-    pub best: Option<Evaluation>,
+    pub best: Option<[f64; 2]>,
     /// The context of the error if it cannot start from that.
     pub context: Option<String>,
     /// Whether to write the steps that led to diverged states.
@@ -47,7 +47,7 @@ pub(super) enum Takes {
 pub(super) type Existing = ((RunFolder, Locked), bool);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
-type PlanParts = (String, Option<(Takes, Vec<u8>)>, Option<Evaluation>, Option<String>, bool);
+type PlanParts = (String, Option<(Takes, Vec<u8>)>, Option<[f64; 2]>, Option<String>, bool);
 
 impl Plan {
     /// Plans what the command line asks for, in the folder of a run if it exists.

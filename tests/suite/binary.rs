@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use shadow_repose::ppo::{Checkpoint, Evaluation};
+use shadow_repose::ppo::Checkpoint;
 
 use crate::support::{OBSERVATION_SIZE, metrics, must_be_possible, names, program, stderr, succeeded, train, weights};
 
@@ -335,7 +335,7 @@ fn the_best_policy_of_a_run_is_not_given_up_when_an_older_checkpoint_is_resumed(
     // A best checkpoint that nothing can beat.
     let best = run.join("checkpoints/best.safetensors");
     let mut unbeatable = Checkpoint::parse(&fs::read(&best).unwrap()).unwrap();
-    unbeatable.progress.best = Some(Evaluation { goals: 9.0, rot_dist: 0.0 });
+    unbeatable.progress.best = Some([9.0, 0.0]);
     let unbeatable = unbeatable.to_bytes().unwrap();
     fs::write(&best, &unbeatable).unwrap();
     succeeded(program(folder.path(), &["train", "--resume", "run", "--total-steps", "512"]));

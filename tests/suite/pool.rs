@@ -289,7 +289,7 @@ fn a_pool_that_is_stepped_at_once_with_the_actions_of_a_rollout_sees_what_the_ro
         rollout.blocks.iter().flat_map(|block| &of(block)[block.step(t, width)]).copied().collect()
     };
     let (mut ends, mut redirected) = (0, 0);
-    for t in 0..rollout.horizon() {
+    for t in 0..rollout.horizon {
         assert!(observations == all(|block| &block.observations, t, OBSERVATION_SIZE), "step {t}");
         let actions = all(|block| &block.actions, t, 20);
         let scaled = all(|block| &block.rewards, t, 1);

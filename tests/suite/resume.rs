@@ -7,7 +7,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::Stdio;
 
-use shadow_repose::ppo::{Checkpoint, Evaluation};
+use shadow_repose::ppo::Checkpoint;
 
 use crate::support::{SCENE, command, metrics, names, program, stderr, succeeded, train};
 use crate::survival::{iterations, result, resume};
@@ -160,7 +160,7 @@ fn a_policy_that_was_moved_away_is_made_anew_from_the_best_checkpoint() {
     let policy = folder.join("run/policy.safetensors");
     // A best checkpoint that nothing can beat.
     let mut unbeatable = Checkpoint::parse(&fs::read(&best).unwrap()).unwrap();
-    unbeatable.progress.best = Some(Evaluation { goals: 9.0, rot_dist: 0.0 });
+    unbeatable.progress.best = Some([9.0, 0.0]);
     fs::write(&best, unbeatable.to_bytes().unwrap()).unwrap();
     for lose in [true, false] {
         if lose {
@@ -186,7 +186,7 @@ fn a_damaged_best_checkpoint_is_named_and_put_aside_and_its_score_stays_the_bar(
     let best = folder.join("run/checkpoints/best.safetensors");
     let policy = folder.join("run/policy.safetensors");
     let mut unbeatable = Checkpoint::parse(&fs::read(&policy).unwrap()).unwrap();
-    unbeatable.progress.best = Some(Evaluation { goals: 9.0, rot_dist: 0.0 });
+    unbeatable.progress.best = Some([9.0, 0.0]);
     let unbeatable = unbeatable.to_bytes().unwrap();
     fs::write(&policy, &unbeatable).unwrap();
     let mut bytes = fs::read(&best).unwrap();

@@ -343,7 +343,7 @@ fn a_training_can_end_when_evaluations_no_longer_rise_and_tells_how_far_they_ros
     let best = folder.path().join("whole/checkpoints/best.safetensors");
     let best = Checkpoint::parse(&fs::read(best).unwrap()).unwrap().progress;
     let rise = best.rise.expect("the best checkpoint tells it");
-    assert_eq!((rise.since, Some(rise.best[0])), (0, best.best.map(|best| best.goals)));
+    assert_eq!((rise.since, Some(rise.best[0])), (0, best.best.map(|[goals, _]| goals)));
     assert_eq!(iterations(end).parse::<u64>().unwrap(), best.iteration + 2);
     let again = program(folder.path(), &["train", "--resume", "whole", "--total-steps", "128000"]);
     assert!(stderr(&succeeded(again)).contains("is finished: "), "nothing is trained");

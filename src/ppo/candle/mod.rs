@@ -15,7 +15,6 @@ use super::backend::{GradientBackend, Losses};
 use super::parameters::Layer;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::{Activation, PpoConfig};
-use crate::ranks::Minibatch;
 use crate::spaces::Spaces;
 use loss::Batch;
 
@@ -55,19 +54,20 @@ impl GradientBackend for Reference {
         &mut self,
         policy: &Policy,
         rollout: &Rollout,
-        of: &Minibatch,
+        groups: &[&[u32]],
+        count: usize,
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>> {
         let mut sums = Vec::new();
         gradients.clear();
-        for group in &of.groups {
+        for group in groups {
             let batch = gathered(policy, rollout, group)?;
             let mut variables = Vec::new();
             let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
             let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?;
             let (total, losses) = loss::losses(&self.config, &batch, &means, &values)?;
             sums.push(losses);
-            let grads = (total * (group.len() as f64 / of.count as f64))?.backward()?;
+            let grads = (total * (group.len() as f64 / count as f64))?.backward()?;
             let mut gradient = vec![0.0; policy.layout.count()];
             for (range, variable) in variables {
                 if let Some(grad) = grads.get(&variable) {

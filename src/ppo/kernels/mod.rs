@@ -15,8 +15,8 @@ mod units;
 mod widest;
 
 pub(super) use multiplier::{Arithmetic, Multiplier};
+pub(super) use net::Net;
 pub use net::Workspace;
-pub(super) use net::{Net, Purpose};
 pub(super) use product::Matrix;
 pub(super) use widest::widest;
 

@@ -12,15 +12,6 @@ use crate::config::Activation;
 /// The most elements of a product that gemm takes as a small one.
 const LARGEST_SMALL: usize = 16 * 16;
 
-/// What nets are prepared for.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Purpose {
-    /// Many forward passes of few rows: to rearrange the weights for each would take longer than its products.
-    Acting,
-    /// Forward and backward passes of many rows.
-    Learning,
-}
-
 /// One network with the current parameters.
 pub(crate) struct Net<'a> {
     layers: Vec<Dense<'a>>,
@@ -91,10 +82,10 @@ impl<'a> Net<'a> {
     }
 
     /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. The results are the same, bit
-    /// for bit.
-    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, purpose: Purpose) {
+    /// for bit. To learn means forward and backward passes of many rows. To act means many forward passes of few rows: to rearrange
+    /// the weights for each would take longer than its products.
+    pub(crate) fn prepare(nets: &mut [Self], arithmetic: Arithmetic, learns: bool) {
         let mut jobs = Vec::new();
-        let learns = purpose == Purpose::Learning;
         for layer in nets.iter_mut().flat_map(|net| &mut net.layers) {
             if !learns {
                 layer.weight_t = Some(layer.transposed());
@@ -205,7 +196,7 @@ mod tests {
             let [plain, packed] = [false, true].map(|packed| {
                 let mut nets = [Net::new(&layout.actor, &parameters, Activation::Elu)];
                 if packed {
-                    Net::prepare(&mut nets, arithmetic, Purpose::Learning);
+                    Net::prepare(&mut nets, arithmetic, true);
                 }
                 let [net] = nets;
                 let mut work = Workspace::new(&layout.actor, rows, arithmetic);
@@ -232,7 +223,7 @@ mod tests {
             for rows in [1, 2, 5, 13, 32, 64] {
                 let expected = net().forward(rows, &mut work).to_vec();
                 let mut nets = [net()];
-                Net::prepare(&mut nets, Arithmetic::F32, Purpose::Acting);
+                Net::prepare(&mut nets, Arithmetic::F32, false);
                 assert_eq!(nets[0].forward(rows, &mut work), expected, "{rows} rows");
             }
         }
