@@ -3,7 +3,7 @@
 use super::onnx::Attribute::{Float, Int};
 use super::onnx::Graph;
 use crate::config::Activation;
-use crate::ppo::{CLIP, InputTransform, Policy};
+use crate::ppo::{CLIP, Perception, Policy};
 use crate::spaces::{ObjectAndGoal, Spaces};
 
 /// The graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
@@ -11,7 +11,7 @@ use crate::spaces::{ObjectAndGoal, Spaces};
 /// Before anything else, observations are multiplied from the right by a `mirror` `[O, O]`, if there is one.
 pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     let Spaces { observation_size: size, action_size, .. } = policy.spaces;
-    let InputTransform { perception, mean, factor } = policy.input_transform();
+    let Perception { object_and_goal, rotations, mean, factor } = policy.perception();
     let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));
     let seen = match mirror {
         Some(matrix) => {
@@ -20,8 +20,8 @@ pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
         }
         None => "obs".into(),
     };
-    let seen = match perception.object_and_goal {
-        Some(places) => canonicalize(&mut graph, size, &seen, (places, &perception.rotations)),
+    let seen = match object_and_goal {
+        Some(places) => canonicalize(&mut graph, size, &seen, (places, &rotations)),
         None => seen,
     };
     graph.floats("mean", &[size], &mean);

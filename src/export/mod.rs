@@ -12,7 +12,6 @@ use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os::{self, say};
-use crate::ppo::Checkpoint;
 use crate::repose::{Hand, Task};
 use crate::run;
 use graph::policy_graph;
@@ -74,17 +73,12 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
-    facts.extend(of_training(&loaded.checkpoint));
+    // What is known of the training run that made the policy.
+    let progress = &loaded.checkpoint.progress;
+    facts.extend((progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string())));
+    facts.extend(progress.best.map(|[goals, _]| ("goals_per_episode", goals.to_string())));
+    facts.extend(loaded.checkpoint.provenance.clone().map(|text| ("provenance", text)));
     facts
-}
-
-/// What is known of the training run that made the policy.
-fn of_training(checkpoint: &Checkpoint) -> Vec<(&'static str, String)> {
-    let progress = &checkpoint.progress;
-    let steps = (progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string()));
-    let goals = progress.best.map(|best| ("goals_per_episode", best[0].to_string()));
-    let provenance = checkpoint.provenance.clone().map(|text| ("provenance", text));
-    [steps, goals, provenance].into_iter().flatten().collect()
 }
 
 fn described(hand: &Hand) -> String {

@@ -70,12 +70,11 @@ impl Adam {
 
 /// The chunks of these ranges of parameters, whose squares are added up separately.
 pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
-    let chunks = |group: &Range<usize>| {
-        let firsts = group.clone().step_by(NORM_CHUNK);
-        let end = group.end;
-        firsts.map(move |first| first..end.min(first + NORM_CHUNK))
-    };
-    groups.iter().flat_map(chunks).collect()
+    let mut chunks = Vec::new();
+    for group in groups {
+        chunks.extend(group.clone().step_by(NORM_CHUNK).map(|first| first..group.end.min(first + NORM_CHUNK)));
+    }
+    chunks
 }
 
 /// The Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by

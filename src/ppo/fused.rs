@@ -14,8 +14,8 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use super::backend::{GradientBackend, Losses};
-use super::kernels::{Arithmetic, ROWS, Workspace};
-use super::loss::Loss;
+use super::kernels::{Arithmetic, Net, ROWS, Workspace};
+use super::loss::{Loss, Sums};
 use super::policy::Policy;
 use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
@@ -30,23 +30,37 @@ pub(super) struct Fused {
     seen: Vec<f32>,
 }
 
-/// The net that a job works on.
-#[derive(Clone, Copy)]
-enum Role {
-    Actor,
-    Critic,
-}
+/// A job: the samples of a group, a net, what computes the gradient of its outputs, and the place for the gradient of its parameters.
+type Job<'a> = (&'a [u32], &'a Net<'a>, fn(&Loss<'a>, &[u32], &[f32], &mut [f32], &mut Sums), &'a mut [f32]);
 
 impl Fused {
     /// Creates the backend with these settings.
     pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
         Self { config: config.clone(), arithmetic, workspaces: Vec::new(), seen: Vec::new() }
     }
+
+    /// Passes the samples of a job forward and backward through its net, `rows` of them at a time.
+    fn pass<'a>(&self, loss: &Loss<'a>, rows: usize, (group, net, of_outputs, gradient): Job<'a>) -> Losses {
+        let mut sums = loss.of_none();
+        let thread = rayon::current_thread_index().expect("runs on a rayon thread");
+        let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
+        let size = work.inputs.len() / ROWS;
+        for (i, block) in group.chunks(rows).enumerate() {
+            for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(size)) {
+                row.copy_from_slice(&self.seen[RolloutBlock::row(size, sample as usize)]);
+            }
+            net.forward(block.len(), work);
+            let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
+            of_outputs(loss, block, outputs, grad, &mut sums);
+            net.backward(block.len(), work, gradient, i > 0);
+        }
+        loss.of_group(&sums)
+    }
 }
 
 impl GradientBackend for Fused {
     fn begin(&mut self, policy: &Policy, rollout: &Rollout) {
-        let transform = policy.input_transform();
+        let perception = policy.perception();
         let size = policy.spaces.observation_size;
         self.seen.resize(rollout.samples() * size, 0.0);
         let mut rest = &mut self.seen[..];
@@ -54,7 +68,7 @@ impl GradientBackend for Fused {
         for raw in rollout.blocks.iter().map(RolloutBlock::acted_on) {
             parts.push((raw, rest.split_off_mut(..raw.len()).expect("room for all")));
         }
-        parts.into_par_iter().for_each(|(raw, seen)| transform.apply(raw, seen));
+        parts.into_par_iter().for_each(|(raw, seen)| perception.apply(raw, seen));
     }
 
     fn gradients(
@@ -70,37 +84,17 @@ impl GradientBackend for Fused {
         // The rows that pass through a net together: blocks of equal size as far as possible.
         let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
-        let nets = policy.nets(self.arithmetic, true);
+        let [actor, critic] = &policy.nets(self.arithmetic, true);
         let loss = Loss::new(policy, rollout, count, &self.config);
-        // Passes the samples of a group forward and backward through a net.
-        let job = |(group, role, gradient): (&[u32], Role, &mut [f32])| {
-            let net = &nets[role as usize];
-            let mut sums = loss.of_none();
-            let thread = rayon::current_thread_index().expect("runs on a rayon thread");
-            let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
-            for (i, block) in group.chunks(rows).enumerate() {
-                for (&sample, row) in block.iter().zip(work.inputs.chunks_exact_mut(policy.spaces.observation_size)) {
-                    row.copy_from_slice(&self.seen[RolloutBlock::row(row.len(), sample as usize)]);
-                }
-                net.forward(block.len(), work);
-                let (outputs, grad) = work.outputs_and_grad(block.len(), net.outputs());
-                match role {
-                    Role::Actor => loss.actor(block, outputs, grad, &mut sums),
-                    Role::Critic => loss.critic(block, outputs, grad, &mut sums),
-                }
-                net.backward(block.len(), work, gradient, i > 0);
-            }
-            loss.of_group(&sums)
-        };
-        let [actor, _] = policy.layout.nets();
+        let [of_actor, _] = policy.layout.nets();
         gradients.resize_with(groups.len(), || vec![0.0; policy.layout.count()]);
-        let mut jobs = Vec::new();
+        let mut jobs: Vec<Job> = Vec::new();
         for (&group, gradient) in groups.iter().zip(gradients) {
-            let (actor, critic) = gradient.split_at_mut(actor.end);
-            jobs.push((group, Role::Actor, actor));
-            jobs.push((group, Role::Critic, critic));
+            let (for_actor, for_critic) = gradient.split_at_mut(of_actor.end);
+            jobs.push((group, actor, Loss::actor, for_actor));
+            jobs.push((group, critic, Loss::critic, for_critic));
         }
-        let losses: Vec<Losses> = jobs.into_par_iter().with_max_len(1).map(job).collect();
+        let losses: Vec<Losses> = jobs.into_par_iter().with_max_len(1).map(|job| self.pass(&loss, rows, job)).collect();
         Ok(losses.chunks(2).map(|nets| nets[0] + nets[1]).collect())
     }
 }

@@ -34,7 +34,7 @@ pub use kernels::Workspace;
 pub use measure::{flops_per_sample, matmul_gflops, time_gradient_steps};
 pub use normalizer::Normalizer;
 pub use parameters::{Layer, ParameterLayout, View};
-pub use perception::{CLIP, InputTransform, Perception};
+pub use perception::{CLIP, Perception};
 pub use policy::{FrozenPolicy, GROUP, Policy};
 pub use progress::{Fork, Progress, Rise, beats};
 pub use rollout::{Rollout, RolloutBlock};

@@ -16,23 +16,30 @@ pub const CLIP: f32 = 5.0;
 /// Added to the variance, so that a constant input does not cause a division by zero.
 const EPSILON: f64 = 1e-5;
 
-/// What a policy treats as the same in raw observations.
+/// The way a policy reads raw observations: turned, then normalised as `(x - mean) · factor`, clipped.
 pub struct Perception {
     /// The offsets of the orientations of cube and goal, if they are to be rotated.
     pub object_and_goal: Option<ObjectAndGoal>,
     /// The rotations that map the object onto itself. If there are fewer, the first one fills the rest.
     pub rotations: [[f32; 4]; CUBE_ROTATIONS.len()],
+    /// `[O]`
+    pub mean: Vec<f32>,
+    /// `[O]`
+    pub factor: Vec<f32>,
 }
 
 impl Perception {
-    /// Creates the perception of the observations that `spaces` describes.
-    pub fn new(spaces: &Spaces) -> Self {
+    /// Creates the perception of the observations that `spaces` describes, by a policy that has seen these statistics.
+    pub fn new(spaces: &Spaces, Normalizer { mean, variance, .. }: &Normalizer) -> Self {
         let object_and_goal = spaces.object_and_goal.filter(|places| places.rotations != 1);
         let mask = object_and_goal.map_or(1, |places| places.rotations);
-        let mut rotations = [CUBE_ROTATIONS[0]; CUBE_ROTATIONS.len()];
-        let own = CUBE_ROTATIONS.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, rotation)| rotation);
-        rotations.iter_mut().zip(own).for_each(|(place, rotation)| *place = *rotation);
-        Self { object_and_goal, rotations }
+        let mut own = CUBE_ROTATIONS.into_iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1);
+        Self {
+            object_and_goal,
+            rotations: std::array::from_fn(|_| own.next().map_or(CUBE_ROTATIONS[0], |(_, rotation)| rotation)),
+            mean: mean.iter().map(|&m| m as f32).collect(),
+            factor: variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect(),
+        }
     }
 
     /// Maps one raw observation `[O]`, in place, to the observation that represents all equivalent ones.
@@ -49,31 +56,13 @@ impl Perception {
             observation[place..place + 4].copy_from_slice(&turned);
         }
     }
-}
-
-/// The way a policy reads raw observations: perception, then the normalisation `(x - mean) · factor`, clipped.
-pub struct InputTransform {
-    /// What it treats as the same.
-    pub perception: Perception,
-    /// `[O]`
-    pub mean: Vec<f32>,
-    /// `[O]`
-    pub factor: Vec<f32>,
-}
-
-impl InputTransform {
-    /// Creates the transform of a policy that has seen these statistics.
-    pub(super) fn new(perception: Perception, Normalizer { mean, variance, .. }: &Normalizer) -> Self {
-        let factor = variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect();
-        Self { perception, mean: mean.iter().map(|&m| m as f32).collect(), factor }
-    }
 
     /// Writes what the nets see of the `raw` observations `[B, O]` into `out` `[B, O]`.
     pub(super) fn apply(&self, raw: &[f32], out: &mut [f32]) {
         out.copy_from_slice(raw);
         widest!({
             for row in out.chunks_exact_mut(self.mean.len()) {
-                self.perception.canonicalize(row);
+                self.canonicalize(row);
                 for ((x, mean), factor) in row.iter_mut().zip(&self.mean).zip(&self.factor) {
                     *x = ((*x - mean) * factor).clamp(-CLIP, CLIP);
                 }
@@ -102,7 +91,7 @@ mod tests {
     const UNTURNED: Spaces = Spaces { object_and_goal: None, ..SPACES };
 
     fn perceive(row: &mut [f32]) {
-        Perception::new(&SPACES).canonicalize(row);
+        Perception::new(&SPACES, &Normalizer::new(20)).canonicalize(row);
     }
 
     fn observation(object: Quat, goal: Quat) -> Vec<f32> {
@@ -168,7 +157,7 @@ mod tests {
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));
             let before = seen.clone();
-            Perception::new(&UNTURNED).canonicalize(&mut seen);
+            Perception::new(&UNTURNED, &Normalizer::new(20)).canonicalize(&mut seen);
             assert_eq!(seen, before);
         }
     }
@@ -176,10 +165,10 @@ mod tests {
     #[test]
     fn what_is_read_is_perceived_and_then_normalised() {
         let normalizer = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 };
-        let transform = InputTransform::new(Perception::new(&SPACES), &normalizer);
+        let perception = Perception::new(&SPACES, &normalizer);
         let raw = [observation(random(0), random(1)), observation(random(2), random(3))].concat();
         let mut found = vec![0.0; 40];
-        transform.apply(&raw, &mut found);
+        perception.apply(&raw, &mut found);
         for (found, raw) in found.chunks_exact(20).zip(raw.chunks_exact(20)) {
             let mut expected = raw.to_vec();
             perceive(&mut expected);
@@ -193,8 +182,8 @@ mod tests {
     fn normalised_values_are_in_standard_deviations_and_clipped() {
         let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
         let mut normalised = [0.0; 3];
-        let transform = InputTransform::new(Perception::new(&UNTURNED), &normalizer);
-        transform.apply(&[4.0, 2.0, 400.0], &mut normalised);
+        let perception = Perception::new(&UNTURNED, &normalizer);
+        perception.apply(&[4.0, 2.0, 400.0], &mut normalised);
         assert!((normalised[0] - 1.0).abs() < 1e-5, "{normalised:?}");
         assert_eq!(normalised[1..], [0.0, CLIP]);
     }

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::Normalizer;
 use super::kernels::{Arithmetic, Net, Workspace};
 use super::parameters::ParameterLayout;
-use super::perception::{InputTransform, Perception};
+use super::perception::Perception;
 use crate::config::{Activation, PpoConfig};
 use crate::ranks::Exchange;
 use crate::rng;
@@ -39,7 +39,7 @@ pub struct FrozenPolicy<'a> {
     /// The policy.
     pub policy: &'a Policy,
     nets: [Net<'a>; 2],
-    transform: InputTransform,
+    perception: Perception,
 }
 
 impl Policy {
@@ -75,13 +75,13 @@ impl Policy {
 
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
-        let perception = Perception::new(&self.spaces);
+        let perception = self.perception();
         self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
     }
 
     /// The way it currently reads observations.
-    pub fn input_transform(&self) -> InputTransform {
-        InputTransform::new(Perception::new(&self.spaces), &self.normalizer)
+    pub fn perception(&self) -> Perception {
+        Perception::new(&self.spaces, &self.normalizer)
     }
 
     /// Actor and critic.
@@ -104,7 +104,7 @@ impl Policy {
 
     /// The policy in its current state, for a few calls. It costs nothing, but each product rearranges the weights anew.
     fn freeze_briefly(&self) -> FrozenPolicy<'_> {
-        FrozenPolicy { policy: self, nets: self.plain_nets(), transform: self.input_transform() }
+        FrozenPolicy { policy: self, nets: self.plain_nets(), perception: self.perception() }
     }
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
@@ -160,7 +160,7 @@ impl FrozenPolicy<'_> {
         let mut done = 0;
         for raw in observations.chunks(work.rows * size) {
             let rows = raw.len() / size;
-            self.transform.apply(raw, &mut work.inputs[..raw.len()]);
+            self.perception.apply(raw, &mut work.inputs[..raw.len()]);
             for (net, out) in self.nets.iter().zip(&mut outputs).filter(|(_, out)| !out.is_empty()) {
                 let width = net.outputs();
                 out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));

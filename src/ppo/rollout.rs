@@ -13,10 +13,8 @@ pub struct Rollout {
     pub horizon: usize,
     /// Blocks, in the order of the environments.
     pub blocks: Vec<RolloutBlock>,
-    /// For each sample, in block order: the index of its block.
-    block_of: Vec<u32>,
-    /// For each block: the index of its first sample.
-    firsts: Vec<u32>,
+    /// For each sample, in block order: the index of its block, and its row there.
+    places: Vec<(u32, u32)>,
 }
 
 /// T steps of the n environments of a block. All arrays are time-major.
@@ -67,24 +65,22 @@ impl Rollout {
             }
         };
         let blocks: Vec<RolloutBlock> = block_sizes.iter().map(block).collect();
-        let mut block_of = Vec::new();
-        let mut firsts = Vec::new();
+        let mut places = Vec::new();
         for (i, block) in blocks.iter().enumerate() {
-            firsts.push(block_of.len() as u32);
-            block_of.resize(block_of.len() + block.samples(), i as u32);
+            places.extend((0..block.samples() as u32).map(|row| (i as u32, row)));
         }
-        Self { horizon, blocks, block_of, firsts }
+        Self { horizon, blocks, places }
     }
 
     /// The number of samples, T × N.
     pub fn samples(&self) -> usize {
-        self.block_of.len()
+        self.places.len()
     }
 
     /// The block that holds a sample, and the sample's row in the block's arrays.
     pub fn locate(&self, sample: u32) -> (&RolloutBlock, usize) {
-        let block = self.block_of[sample as usize] as usize;
-        (&self.blocks[block], (sample - self.firsts[block]) as usize)
+        let (block, row) = self.places[sample as usize];
+        (&self.blocks[block as usize], row as usize)
     }
 
     /// Changes it to `horizon` steps. It then begins with the same observations and is otherwise empty.

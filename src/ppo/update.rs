@@ -105,7 +105,10 @@ impl Ppo {
                     steps.push(step.with_context(|| format!("epoch {epoch}, minibatch {part}"))?);
                 }
             }
-            self.check_weights()?;
+            for View { name, range, .. } in self.policy.layout.views() {
+                let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
+                ensure!(finite, "the update made `{name}` infinite or NaN: the training run has failed and stops here");
+            }
             // The normaliser is part of the policy, which does not change while the critic learns alone.
             if !self.is_critic_alone(iteration) {
                 let seen: Vec<&[f32]> = rollout.blocks.iter().map(RolloutBlock::acted_on).collect();
@@ -181,14 +184,6 @@ impl Ppo {
         let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();
         self.exchange.in_order(own, Losses::add).means(count)
-    }
-
-    fn check_weights(&self) -> Result<()> {
-        for View { name, range, .. } in self.policy.layout.views() {
-            let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
-            ensure!(finite, "the update made `{name}` infinite or NaN: the training run has failed and stops here");
-        }
-        Ok(())
     }
 
     /// The statistics of an update with these steps: the mean losses and the norm of the gradient of each.

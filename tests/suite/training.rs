@@ -7,7 +7,7 @@ use shadow_repose::agent::Agent;
 use shadow_repose::config::{Override, Ramp};
 use shadow_repose::env::{End, Env, EnvPool};
 use shadow_repose::load::Loaded;
-use shadow_repose::ppo::{Checkpoint, Perception};
+use shadow_repose::ppo::{Checkpoint, Normalizer, Perception};
 use shadow_repose::quat::{self, Quat};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{Lesson, Repose};
@@ -62,7 +62,7 @@ fn a_cube_turned_onto_itself_moves_the_same_way_and_looks_the_same_to_the_policy
         let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart(&seen[51..55], &other_seen[51..55]) > 0.1, "their orientations differ");
         for row in [&mut seen, &mut other_seen] {
-            Perception::new(&task.spaces()).canonicalize(row);
+            Perception::new(&task.spaces(), &Normalizer::new(OBSERVATION_SIZE)).canonicalize(row);
         }
         // All but the goals: both environments drew the same one, for cubes of different orientation.
         for same in [0..64, 72..OBSERVATION_SIZE] {

@@ -60,8 +60,12 @@ impl Batch {
 /// Fails if the shapes do not match.
 pub(super) fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: &Tensor) -> Result<(Tensor, Losses)> {
     let ratios = (batch.log_prob(means)? - &batch.old_log_probs)?.exp()?;
-    let policy = surrogate(config, batch, &ratios)?.neg()?;
-    let value = value_error(config, batch, values)?;
+    let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
+    let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
+    let policy = surrogate.mean_all()?.neg()?;
+    let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
+    let clipped = (&batch.old_values + step)?;
+    let value = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?.mean_all()?;
     let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
 
@@ -77,19 +81,6 @@ pub(super) fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: 
         ratio_error: errors().fold(0.0, f64::max),
     };
     Ok((total, sums))
-}
-
-/// The mean clipped surrogate for these ratios `[M, 1]`.
-fn surrogate(config: &PpoConfig, batch: &Batch, ratios: &Tensor) -> Result<Tensor> {
-    let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
-    (ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?.mean_all()
-}
-
-/// The mean clipped squared error of these values `[M, 1]`.
-fn value_error(config: &PpoConfig, batch: &Batch, values: &Tensor) -> Result<Tensor> {
-    let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
-    let clipped = (&batch.old_values + step)?;
-    (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?.mean_all()
 }
 
 #[cfg(test)]

@@ -35,7 +35,7 @@ fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch
     let column = |of| tensor(1, array(1, of));
     let raw = array(observation_size, |block| &block.observations);
     let mut observations = vec![0.0; raw.len()];
-    policy.input_transform().apply(&raw, &mut observations);
+    policy.perception().apply(&raw, &mut observations);
     Ok(Batch {
         observations: tensor(observation_size, observations)?,
         actions: tensor(action_size, array(action_size, |block| &block.actions))?,
