@@ -20,7 +20,7 @@ const ITERATIONS: usize = 2;
 
 /// Measures training runs with different numbers of environments and tells which learns most in the same time. A number that the
 /// settings do not allow is left out, for instance because a long `ppo.horizon` would give too many samples.
-pub(super) fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
+pub fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let given = Source::new("the settings", config.to_text());
     // The training runs, each with the control steps per second of its iterations.
     let mut measured = Vec::new();

@@ -24,7 +24,7 @@ struct Start {
 
 /// An environment that records the input of its physics and can replay it. This is the only difference from the environment of a
 /// training run.
-pub(super) struct RecordingEnv {
+pub struct RecordingEnv {
     env: Repose,
     randomization: Option<Arc<Randomization>>,
     starts: Vec<Start>,
@@ -40,7 +40,7 @@ pub(super) struct RecordingEnv {
 
 impl RecordingEnv {
     /// Creates an environment of `task`.
-    pub(super) fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
+    pub fn new(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
         let nominal = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             env: Repose::randomized(task, randomization),
@@ -54,7 +54,7 @@ impl RecordingEnv {
     }
 
     /// Forgets what was recorded and begins at the present state.
-    pub(super) fn begin(&mut self) {
+    pub fn begin(&mut self) {
         self.steps.clear();
         self.starts.clear();
         self.start();
@@ -140,7 +140,7 @@ impl Env for RecordingEnv {
 ///
 /// # Errors
 /// Fails if the replay does not end in the states of the environments: then it did not compute the same physics.
-pub(super) fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
+pub fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
     let mut envs: Vec<&mut RecordingEnv> = pool.envs_mut().collect();
     envs.par_iter_mut().for_each(|env| env.prepare());
     let steps = envs[0].steps.len();

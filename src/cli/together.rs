@@ -95,7 +95,7 @@ pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
 }
 
 /// The options of the command that stand on the command line, without those that have their defaults.
-pub(super) fn given(matches: &ArgMatches) -> Vec<String> {
+pub fn given(matches: &ArgMatches) -> Vec<String> {
     let Some((_, of_command)) = matches.subcommand() else { return Vec::new() };
     let ids = of_command.ids().map(clap::Id::as_str);
     let given = ids.filter(|id| of_command.value_source(id) == Some(ValueSource::CommandLine));

@@ -10,20 +10,20 @@ use crate::sim::{Camera, Quality};
 /// The largest integer in a TOML file.
 const LARGEST: u64 = i64::MAX as u64;
 
-pub(super) fn seed() -> RangedU64ValueParser {
+pub fn seed() -> RangedU64ValueParser {
     RangedU64ValueParser::new().range(..=LARGEST)
 }
 
-pub(super) fn count() -> RangedU64ValueParser<usize> {
+pub fn count() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(1..=1_000_000)
 }
 
 /// A number of threads, within the limits of `run.threads`.
-pub(super) fn threads() -> RangedU64ValueParser<usize> {
+pub fn threads() -> RangedU64ValueParser<usize> {
     RangedU64ValueParser::new().range(0..=4096)
 }
 
-pub(super) fn size(text: &str) -> Result<[u32; 2], String> {
+pub fn size(text: &str) -> Result<[u32; 2], String> {
     let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
     let pixels = |text: &str, largest: u32| match text.parse() {
         Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
@@ -32,7 +32,7 @@ pub(super) fn size(text: &str) -> Result<[u32; 2], String> {
     Ok([pixels(width, 3840)?, pixels(height, 2160)?])
 }
 
-pub(super) fn camera(text: &str) -> Result<Camera, String> {
+pub fn camera(text: &str) -> Result<Camera, String> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
     match numbers.as_deref() {
         Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
@@ -45,28 +45,28 @@ pub(super) fn camera(text: &str) -> Result<Camera, String> {
     }
 }
 
-pub(super) fn steps(text: &str) -> Result<u64, String> {
+pub fn steps(text: &str) -> Result<u64, String> {
     // Users write large numbers of steps as 1e8.
     let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
     let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
     steps.ok_or_else(|| "must be a whole number of at least 1, e.g. 30000000 or 3e7".into())
 }
 
-pub(super) fn time(text: &str) -> Result<Duration, String> {
+pub fn time(text: &str) -> Result<Duration, String> {
     let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
     time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
 }
 
-pub(super) fn quality() -> impl TypedValueParser<Value = Quality> {
+pub fn quality() -> impl TypedValueParser<Value = Quality> {
     // Shells complete them.
     PossibleValuesParser::new(["fast", "high"]).map(|text| if text == "fast" { Quality::Fast } else { Quality::High })
 }
 
-pub(super) fn destination(endings: &'static [&'static str]) -> impl TypedValueParser<Value = Destination> {
+pub fn destination(endings: &'static [&'static str]) -> impl TypedValueParser<Value = Destination> {
     OsStringValueParser::new().try_map(|name| Destination::parse(name, endings))
 }
 
-pub(super) fn seconds(text: &str) -> Result<f64, String> {
+pub fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse().ok().filter(|seconds| (0.0..=3600.0).contains(seconds));
     seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
 }

@@ -10,40 +10,39 @@ use super::BASE;
 use crate::os::{shortened, similar};
 
 /// The base as tables.
-pub(super) static DEFAULTS: LazyLock<Table> =
-    LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
+pub static DEFAULTS: LazyLock<Table> = LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
 
 /// The settings of all sections of a table, each with its dotted key.
-pub(super) fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
+pub fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
     let sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
     sections.flat_map(|(section, keys)| keys.iter().map(move |(key, value)| (format!("{section}.{key}"), value)))
 }
 
 /// The value with this dotted key.
-pub(super) fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
+pub fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     let (section, rest) = key.split_once('.').unwrap_or((key, ""));
     rest.split_terminator('.').try_fold(table.get(section)?, |value, part| value.get(part))
 }
 
 /// A number, whole or not.
-pub(super) fn number(value: &Value) -> Option<f64> {
+pub fn number(value: &Value) -> Option<f64> {
     value.as_float().or(value.as_integer().map(|x| x as f64))
 }
 
 /// A number as text: `1e300` rather than 301 digits.
-pub(super) fn brief(x: f64) -> String {
+pub fn brief(x: f64) -> String {
     let text = x.to_string();
     if text.len() > 20 { format!("{x:e}") } else { text }
 }
 
 /// Whether a table of the base is a ramp, rather than a section or values by group.
-pub(super) fn is_ramp(table: &Table) -> bool {
+pub fn is_ramp(table: &Table) -> bool {
     table.contains_key("from")
 }
 
 /// The table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
 /// for a string key. Numbers may lack the zero before their point, which TOML requires.
-pub(super) fn table_of(key: &str, text: &str, merged: &Table) -> Table {
+pub fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     let parse = |text: &str| format!("value = {text}").parse::<Table>().ok().filter(|t| t.len() == 1);
     let parsed = parse(text).or_else(|| parse(&with_zeros(text))).and_then(|mut t| t.remove("value"));
     let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
@@ -76,7 +75,7 @@ fn with_zeros(text: &str) -> String {
 }
 
 /// Whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
-pub(super) fn names_scene(text: &str, stored: &str) -> bool {
+pub fn names_scene(text: &str, stored: &str) -> bool {
     let asked = table_of("env.model", text, &DEFAULTS);
     let file = lookup(&asked, "env.model").and_then(Value::as_str).map(|asked| Path::new(asked).canonicalize());
     file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
@@ -86,7 +85,7 @@ pub(super) fn names_scene(text: &str, stored: &str) -> bool {
 const MOST_PROBLEMS: usize = 30;
 
 /// Applies `table` over `merged`, which has the keys and types of `base`. What does not fit is skipped and reported.
-pub(super) fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
+pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
     for (key, value) in table {
         if problems.len() >= MOST_PROBLEMS {
             return;

@@ -68,7 +68,7 @@ const LONGEST_NAME: usize = 255;
 const IN_F32: [f64; 2] = [1e-37, 1e38];
 
 /// Every rule that the values break, as "key = value: must …".
-pub(super) fn violations(config: &Config) -> Vec<String> {
+pub fn violations(config: &Config) -> Vec<String> {
     let mut rules = Rules::default();
     let table = Table::try_from(config).expect("a configuration is a tree of tables");
     for (keys, holds, rule) in RANGES {

@@ -43,10 +43,10 @@ pub struct Chart {
 }
 
 /// The colour of the grid. Opaque, since not every SVG viewer supports opacity.
-pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
+pub const GRID: RGBColor = RGBColor(225, 225, 225);
 
 /// Colours of the curves, distinguishable with red-green colour blindness: M. Okabe, K. Ito, "Color universal design" (2008).
-pub(super) const COLOURS: [RGBColor; 7] = [
+pub const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -132,7 +132,7 @@ impl PictureFile {
 }
 
 /// Draws text in the middle of a line at this height.
-pub(super) fn draw_text(
+pub fn draw_text(
     area: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
     text: &str,
     at: (i32, i32),

@@ -9,7 +9,7 @@ use crate::spaces::{ObjectAndGoal, Spaces};
 /// The graph from `obs` `[batch, O]` to `actions` `[batch, A]`, clipped to ± 1.
 ///
 /// Before anything else, observations are multiplied from the right by a `mirror` `[O, O]`, if there is one.
-pub(super) fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
+pub fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
     let Spaces { observation_size: size, action_size, .. } = policy.spaces;
     let Perception { object_and_goal, rotations, mean, factor } = policy.perception();
     let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));

@@ -11,28 +11,22 @@ const FLOAT: i64 = 1;
 const INT64: i64 = 7;
 
 /// A number that belongs to an operation.
-pub(super) enum Attribute {
+pub enum Attribute {
     Int(i64),
     Float(f32),
 }
 
 /// Operations on named values, in the order in which they are computed.
-pub(super) struct Graph(Message);
+pub struct Graph(Message);
 
 impl Graph {
     /// Begins a graph that computes `output` `[batch, out]` from `input` `[batch, in]`.
-    pub(super) fn new(name: &str, input: (&str, usize), output: (&str, usize)) -> Self {
+    pub fn new(name: &str, input: (&str, usize), output: (&str, usize)) -> Self {
         Self(Message::default().text(2, name).message(11, &rows_of(input)).message(12, &rows_of(output)))
     }
 
     /// Adds an operation and returns the name of its result.
-    pub(super) fn node(
-        &mut self,
-        operation: &str,
-        inputs: &[&str],
-        output: &str,
-        attributes: &[(&str, Attribute)],
-    ) -> String {
+    pub fn node(&mut self, operation: &str, inputs: &[&str], output: &str, attributes: &[(&str, Attribute)]) -> String {
         let node = inputs.iter().fold(Message::default(), |node, input| node.text(1, input));
         let node = node.text(2, output).text(3, output).text(4, operation);
         let node = attributes.iter().fold(node, |node, (name, value)| {
@@ -48,13 +42,13 @@ impl Graph {
     }
 
     /// Adds a constant of floats with these dimensions. There are none for a single number.
-    pub(super) fn floats(&mut self, name: &str, dimensions: &[usize], values: &[f32]) {
+    pub fn floats(&mut self, name: &str, dimensions: &[usize], values: &[f32]) {
         assert_eq!(dimensions.iter().product::<usize>(), values.len(), "{name}");
         self.constant(name, dimensions, FLOAT, values.iter().flat_map(|value| value.to_le_bytes()).collect());
     }
 
     /// Adds a constant list of one integer.
-    pub(super) fn index(&mut self, name: &str, value: usize) {
+    pub fn index(&mut self, name: &str, value: usize) {
         self.constant(name, &[1], INT64, (value as i64).to_le_bytes().to_vec());
     }
 
@@ -68,7 +62,7 @@ impl Graph {
     }
 
     /// The bytes of a file with this graph and texts about it, which are sorted by key.
-    pub(super) fn file(&self, mut metadata: Vec<(&str, String)>) -> Vec<u8> {
+    pub fn file(&self, mut metadata: Vec<(&str, String)>) -> Vec<u8> {
         metadata.sort();
         let model = Message::default()
             .int(1, IR_VERSION)

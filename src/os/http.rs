@@ -9,23 +9,23 @@ const LONGEST_HEAD: usize = 8192;
 const LONGEST_BODY: usize = 4096;
 
 /// How long a request may take, and how long an answer may make no progress.
-pub(super) const PATIENCE: Duration = Duration::from_secs(5);
+pub const PATIENCE: Duration = Duration::from_secs(5);
 
 /// How long and how much is read of a request that is refused, so that the answer is not lost.
 const LINGER: Duration = Duration::from_millis(500);
 const MOST_LINGERED: usize = 1 << 16;
 
 /// A request whose head and body have arrived whole.
-pub(super) struct Request {
-    pub(super) method: String,
+pub struct Request {
+    pub method: String,
     /// Without the part from a question mark on.
-    pub(super) path: String,
+    pub path: String,
     headers: Vec<(String, String)>,
-    pub(super) body: Vec<u8>,
+    pub body: Vec<u8>,
 }
 
 /// A status, without the protocol and with the header lines that belong to it, and a sentence.
-pub(super) type Refusal = (&'static str, &'static str);
+pub type Refusal = (&'static str, &'static str);
 
 const MALFORMED: Refusal = ("400 Bad Request", "This is not a request by HTTP/1.1.");
 
@@ -34,7 +34,7 @@ impl Request {
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub(super) fn read(stream: &mut TcpStream) -> Result<Self, Refusal> {
+    pub fn read(stream: &mut TcpStream) -> Result<Self, Refusal> {
         let deadline = Instant::now() + PATIENCE;
         let mut bytes = Vec::new();
         let end = loop {
@@ -94,7 +94,7 @@ impl Request {
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub(super) fn expect_local(&self) -> Result<(), Refusal> {
+    pub fn expect_local(&self) -> Result<(), Refusal> {
         let host = self.header("host").unwrap_or_default();
         let name = match host.rsplit_once(':') {
             Some((name, port)) if port.bytes().all(|c| c.is_ascii_digit()) => name,
@@ -109,7 +109,7 @@ impl Request {
     ///
     /// # Errors
     /// Fails with the answer to send.
-    pub(super) fn expect_own(&self) -> Result<(), Refusal> {
+    pub fn expect_own(&self) -> Result<(), Refusal> {
         // This content type makes a browser ask before it sends the request from another origin. Such a question is not answered.
         let is_json =
             self.header("content-type").is_some_and(|kind| kind.split(';').next() == Some("application/json"));
@@ -144,7 +144,7 @@ fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline:
 }
 
 /// The head of an answer that is not cached, and is not shown inside another page.
-pub(super) fn head(status: &str, more: &[&str]) -> String {
+pub fn head(status: &str, more: &[&str]) -> String {
     let always = [
         "Cache-Control: no-store",
         "X-Content-Type-Options: nosniff",
@@ -160,13 +160,13 @@ pub(super) fn head(status: &str, more: &[&str]) -> String {
 ///
 /// # Errors
 /// Fails if the other side does not read it.
-pub(super) fn answer(stream: &mut TcpStream, status: &str, kind: &str, text: &str) -> io::Result<()> {
+pub fn answer(stream: &mut TcpStream, status: &str, kind: &str, text: &str) -> io::Result<()> {
     let about = [format!("Content-Length: {}", text.len()), format!("Content-Type: {kind}; charset=utf-8")];
     stream.write_all((head(status, &about.each_ref().map(String::as_str)) + text).as_bytes())
 }
 
 /// Answers with a refusal. What the other side still sends is read, up to a limit, since a closed connection would lose the answer.
-pub(super) fn refuse(stream: &mut TcpStream, (status, sentence): Refusal) {
+pub fn refuse(stream: &mut TcpStream, (status, sentence): Refusal) {
     let sent = answer(stream, status, "text/plain", &format!("{sentence}\n"));
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
         let deadline = Instant::now() + LINGER;

@@ -30,7 +30,7 @@ impl Machine {
 }
 
 /// What the system says of this process in the line that begins with `name`, or nothing if there is none.
-pub(super) fn process_status(name: &str) -> String {
+pub fn process_status(name: &str) -> String {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
 }

@@ -32,13 +32,13 @@ static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
 /// A file or folder that is removed when this is dropped or when a signal ends the program, unless it has been renamed by then.
 #[derive(Debug)]
-pub(super) struct Unfinished {
-    pub(super) path: PathBuf,
+pub struct Unfinished {
+    pub path: PathBuf,
 }
 
 impl Unfinished {
     /// Registers a unique name in the same folder as the final `path`, where something is about to be created.
-    pub(super) fn beside(path: &Path) -> Self {
+    pub fn beside(path: &Path) -> Self {
         // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
         let path = folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.partial", std::process::id()));
@@ -66,7 +66,7 @@ impl Drop for Unfinished {
 }
 
 /// Removes everything that this process has not finished, just before it exits. Nothing can be started afterwards.
-pub(super) fn remove_unfinished() {
+pub fn remove_unfinished() {
     let unfinished = unfinished();
     unfinished.iter().for_each(|path| remove(path));
     std::mem::forget(unfinished);

@@ -172,7 +172,7 @@ pub fn clock(time: Duration) -> String {
 }
 
 /// Whether nothing can be redrawn on the terminal.
-pub(super) fn is_dumb() -> bool {
+pub fn is_dumb() -> bool {
     std::env::var("TERM").map_or(true, |kind| kind.is_empty() || kind == "dumb")
 }
 

@@ -18,7 +18,7 @@ pub fn print(text: &str) -> Result<()> {
 ///
 /// # Errors
 /// Fails as [`print()`] does.
-pub(super) fn is_read(text: &str) -> Result<bool> {
+pub fn is_read(text: &str) -> Result<bool> {
     let mut stdout = std::io::stdout();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),

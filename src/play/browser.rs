@@ -21,7 +21,7 @@ use crate::sim::Look;
 const BUILT_IN: &str = "built into the program";
 
 /// What a page says about who acts in episodes that are drawn from this seed.
-pub(super) fn about(stage: &Stage, seed: u64) -> About {
+pub fn about(stage: &Stage, seed: u64) -> About {
     let policy = stage.loaded().map(|loaded| (loaded.origin.to_string(), &*loaded.name));
     described(stage.actor().name(), policy, Some(seed))
 }
@@ -41,10 +41,10 @@ fn described(actor: &str, policy: Option<(String, &str)>, seed: Option<u64>) -> 
 }
 
 /// The newest policy of a run.
-pub(super) struct Followed {
+pub struct Followed {
     run: RunFolder,
     /// Its file, and the stamp of that file before it was last read.
-    pub(super) path: PathBuf,
+    pub path: PathBuf,
     stamp: Option<Stamp>,
 }
 
@@ -53,7 +53,7 @@ impl Followed {
     ///
     /// # Errors
     /// Fails if there is no run.
-    pub(super) fn find(place: Option<&Path>) -> Result<Self> {
+    pub fn find(place: Option<&Path>) -> Result<Self> {
         let place = place.map(Path::to_owned).or_else(run::newest_run);
         let place = place.context("--follow needs a run, and there is none here")?;
         let needs = "--follow needs a run";
@@ -75,7 +75,7 @@ impl Followed {
 ///
 /// # Errors
 /// Fails if the port cannot be opened.
-pub(super) fn live(
+pub fn live(
     (port, hands): (u16, u64),
     shot: &Look,
     stage: Stage,
@@ -120,7 +120,7 @@ pub(super) fn live(
 /// # Errors
 /// Fails if the file is no trace, or if the HTML file cannot be written. Fails if the user does not name a scene that is not built
 /// in.
-pub(super) fn from_trace(path: &Path, to: &Destination, shot: &Look, set: &[Override]) -> Result<ExitCode> {
+pub fn from_trace(path: &Path, to: &Destination, shot: &Look, set: &[Override]) -> Result<ExitCode> {
     let cannot = || format!("cannot use the trace {}", path.display());
     let bytes = os::read_bytes(path)?;
     ensure!(bytes.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());

@@ -18,7 +18,7 @@ pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str
 }
 
 /// A table with a row for each measure and a column for each named score. Two columns fit into 60 characters.
-pub(super) fn table(columns: &[(&str, Score)]) -> String {
+pub fn table(columns: &[(&str, Score)]) -> String {
     let mut text = format!("{:<21}", "");
     columns.iter().for_each(|(name, _)| text += &format!(" {name:>18}"));
     let columns: Vec<_> = columns.iter().map(|(_, score)| lines(score)).collect();

@@ -10,7 +10,7 @@ use crate::see::{About, Replay};
 use crate::trace::Trace;
 
 /// The files that the user wants. They are opened before playing, so that an unwritable path is found before the score is computed.
-pub(super) struct Files {
+pub struct Files {
     trace: Option<(OutputFile, Trace)>,
     page: Option<Replay>,
 }
@@ -20,7 +20,7 @@ impl Files {
     ///
     /// # Errors
     /// Fails if one of them cannot be written.
-    pub(super) fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
+    pub fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
         let task = &stage.task;
         let trace = outputs.trace.as_ref().map(|to| {
             let trace = Trace::new(task, stage.actor().name(), stage.origin().as_deref(), episodes.seed);
@@ -30,7 +30,7 @@ impl Files {
         Ok(Self { trace: trace.transpose()?, page: page.transpose()? })
     }
 
-    pub(super) fn observe(&mut self, moment: &Moment) {
+    pub fn observe(&mut self, moment: &Moment) {
         if let Some((_, trace)) = &mut self.trace {
             trace.record(moment);
         }
@@ -43,7 +43,7 @@ impl Files {
     ///
     /// # Errors
     /// Fails if one of them cannot be written.
-    pub(super) fn finish(self, about: &About) -> Result<()> {
+    pub fn finish(self, about: &About) -> Result<()> {
         if let Some((output, trace)) = self.trace {
             output.finish(trace.finish().as_bytes())?;
         }
@@ -51,7 +51,7 @@ impl Files {
     }
 
     /// Says that the files are not written, since playing was interrupted.
-    pub(super) fn give_up(self) {
+    pub fn give_up(self) {
         let trace = self.trace.map(|(output, _)| output);
         for output in trace.into_iter().chain(self.page.map(|page| page.output)) {
             say!("{}: interrupted, not written", output.path.display());

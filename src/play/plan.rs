@@ -10,7 +10,7 @@ use crate::robustness::TableOutput;
 use crate::sim::{Look, Quality};
 
 /// What to do.
-pub(super) enum Plan {
+pub enum Plan {
     /// Play in a window.
     #[cfg_attr(not(feature = "viewer"), expect(dead_code, reason = "a build without windows refuses them"))]
     Window(Look),
@@ -25,7 +25,7 @@ pub(super) enum Plan {
 }
 
 /// What comes out of playing for a score.
-pub(super) struct Outputs {
+pub struct Outputs {
     pub film: Option<Destination>,
     pub page: Option<Destination>,
     pub trace: Option<Destination>,
@@ -43,7 +43,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails with a usage error if the options do not go together.
-    pub(super) fn of(args: &PlayArgs, opens_windows: bool) -> Result<Self, Error> {
+    pub fn of(args: &PlayArgs, opens_windows: bool) -> Result<Self, Error> {
         let picture = only(&args.out, "pictures of a table", &["svg", "png"])?;
         let outputs = Outputs::of(args)?;
         let (plan, made) = match (&args.from_trace, &outputs.page, args.web) {
@@ -74,7 +74,7 @@ impl Outputs {
     ///
     /// # Errors
     /// Fails with a usage error if two are of one kind.
-    pub(super) fn of(args: &PlayArgs) -> Result<Self, Error> {
+    pub fn of(args: &PlayArgs) -> Result<Self, Error> {
         Ok(Self {
             film: only(&args.out, "films", &["mp4", "gif"])?,
             page: only(&args.out, "HTML files", &["html"])?,

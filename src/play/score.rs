@@ -23,7 +23,7 @@ use crate::see;
 ///
 /// # Errors
 /// Fails if an output cannot be written, if an action is not finite, or if an episode panics.
-pub(super) fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Requests) -> Result<ExitCode> {
+pub fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Requests) -> Result<ExitCode> {
     let task = &stage.task;
     let actor = &stage.actor();
     let place = stage.origin();

@@ -16,7 +16,7 @@ use crate::run;
 use crate::see::LiveActor;
 
 /// Who acts, and the task.
-pub(super) struct Stage {
+pub struct Stage {
     /// The policy, unless the actor needs none.
     pub policy: Option<Loaded>,
     /// The number of the actor among [`Stage::actors`].
@@ -29,7 +29,7 @@ impl Stage {
     ///
     /// # Errors
     /// Fails as [`Stage::find`] does, or if an output replaces something.
-    pub(super) fn set(place: Option<&Path>, args: &PlayArgs) -> Result<Self> {
+    pub fn set(place: Option<&Path>, args: &PlayArgs) -> Result<Self> {
         let mut stage = Self::find(place, &args.set)?;
         if args.stochastic {
             ensure!(stage.policy.is_some(), "--stochastic samples from a policy: --ckpt names none");
@@ -52,7 +52,7 @@ impl Stage {
     ///
     /// # Errors
     /// Fails as [`Loaded::find`] and [`Loaded::task`] do.
-    pub(super) fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
+    pub fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
         if let Some(choice) = place.and_then(Actor::without_policy) {
             return Ok(Self { policy: None, choice, task: task(None, set)? });
         }
@@ -62,7 +62,7 @@ impl Stage {
     }
 
     /// The kinds of actions between which a user may choose, by name.
-    pub(super) fn actors(&self) -> Vec<(&'static str, Actor<'_>)> {
+    pub fn actors(&self) -> Vec<(&'static str, Actor<'_>)> {
         match &self.policy {
             Some(Loaded { policy, .. }) => {
                 vec![
@@ -74,27 +74,27 @@ impl Stage {
         }
     }
 
-    pub(super) fn actor(&self) -> Actor<'_> {
+    pub fn actor(&self) -> Actor<'_> {
         self.actors().swap_remove(self.choice).1
     }
 
     /// The policy in its file.
-    pub(super) fn loaded(&self) -> Option<&Loaded> {
+    pub fn loaded(&self) -> Option<&Loaded> {
         self.policy.as_ref()
     }
 
     /// Where the policy comes from.
-    pub(super) fn origin(&self) -> Option<String> {
+    pub fn origin(&self) -> Option<String> {
         self.loaded().map(|loaded| loaded.origin.to_string())
     }
 
     /// Where the policy comes from, or the name of the actor.
-    pub(super) fn place(&self) -> String {
+    pub fn place(&self) -> String {
         self.origin().unwrap_or_else(|| self.actor().name().to_owned())
     }
 
     /// The actor of a page that shows this task.
-    pub(super) fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
+    pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
         let policy = self.loaded().map(|loaded| loaded.name.clone());
         LiveActor { step: Rc::new(move |player| player.step(&self.actor())), policy, task }
     }
@@ -104,7 +104,7 @@ impl Stage {
 ///
 /// # Errors
 /// Fails as [`Loaded::task`] does.
-pub(super) fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
+pub fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
     match loaded {
         Some(loaded) => loaded.task(set),
         None => Settings::new().sets(set).resolve().and_then(|config| Task::new(&config)),

@@ -23,7 +23,7 @@ const NORM_CHUNK: usize = 4096;
 
 /// The Adam optimizer: D. P. Kingma, J. Ba, "Adam: a method for stochastic optimization" (2015), algorithm 1.
 #[derive(PartialEq)]
-pub(super) struct Adam {
+pub struct Adam {
     /// The running mean of the gradient.
     pub mean: Vec<f32>,
     /// The running mean of the squared gradient.
@@ -34,19 +34,13 @@ pub(super) struct Adam {
 
 impl Adam {
     /// Creates an optimizer of `count` parameters that has not taken a step.
-    pub(super) fn new(count: usize) -> Self {
+    pub fn new(count: usize) -> Self {
         Self { mean: vec![0.0; count], square: vec![0.0; count], steps: 0 }
     }
 
     /// Moves the parameters in the range `own` one step against the gradient, which is first multiplied by `scale`, with this
     /// learning `rate`.
-    pub(super) fn step(
-        &mut self,
-        parameters: &mut [f32],
-        gradient: &[f32],
-        own: Range<usize>,
-        (rate, scale): (f64, f64),
-    ) {
+    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], own: Range<usize>, (rate, scale): (f64, f64)) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
         let scale = scale as f32;
@@ -69,7 +63,7 @@ impl Adam {
 }
 
 /// The chunks of these ranges of parameters, whose squares are added up separately.
-pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
+pub fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let mut chunks = Vec::new();
     for group in groups {
         chunks.extend(group.clone().step_by(NORM_CHUNK).map(|first| first..group.end.min(first + NORM_CHUNK)));
@@ -79,14 +73,14 @@ pub(super) fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
 
 /// The Euclidean norm of a gradient with these `squares` in the chunks of its groups. They are added group by
 /// group.
-pub(super) fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
+pub fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
     let of_group = |group: &Range<usize>| squares.by_ref().take(group.len().div_ceil(NORM_CHUNK)).sum::<f64>();
     groups.iter().map(of_group).sum::<f64>().sqrt()
 }
 
 /// The sum of squares, added in lanes: in f32 within a lane, then in f64 over the lanes.
-pub(super) fn sum_of_squares(x: &[f32]) -> f64 {
+pub fn sum_of_squares(x: &[f32]) -> f64 {
     let mut lanes = [0.0f32; 32];
     widest!({
         let (whole, rest) = x.as_chunks::<32>();

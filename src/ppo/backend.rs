@@ -54,7 +54,7 @@ impl Losses {
 }
 
 /// A way to compute gradients.
-pub(super) trait GradientBackend: Send + Sync {
+pub trait GradientBackend: Send + Sync {
     /// Prepares for the minibatches of a rollout, before any step on it. `policy` is the policy that collected it.
     fn begin(&mut self, _policy: &Policy, _rollout: &Rollout) {}
 

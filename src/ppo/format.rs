@@ -41,16 +41,16 @@ impl fmt::Display for Damaged {
 impl std::error::Error for Damaged {}
 
 /// Texts by name.
-pub(super) type Texts = BTreeMap<String, String>;
+pub type Texts = BTreeMap<String, String>;
 
 /// Arrays by name.
-pub(super) type Arrays = BTreeMap<String, Array>;
+pub type Arrays = BTreeMap<String, Array>;
 
 /// The bytes of a file with this content.
 ///
 /// # Errors
 /// Fails if an array has a value that is not finite, or a shape that does not match its length.
-pub(super) fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
+pub fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
     let mut parts = Vec::new();
     for (name, array) in arrays {
         ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
@@ -67,7 +67,7 @@ pub(super) fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// Fails if the bytes were not written by [`to_bytes`], or with [`Damaged`] if they were changed since.
-pub(super) fn parse(bytes: &[u8]) -> Result<(Texts, Arrays)> {
+pub fn parse(bytes: &[u8]) -> Result<(Texts, Arrays)> {
     let (mut texts, views) = read(bytes)?;
     let stored = texts.remove(CHECKSUM).context("no checksum: not a file of this program")?;
     let found = checksum(&texts, &views);

@@ -21,7 +21,7 @@ use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 
 /// The gradient backend with our own kernels.
-pub(super) struct Fused {
+pub struct Fused {
     config: PpoConfig,
     arithmetic: Arithmetic,
     /// Workspaces, one per thread of the pool.
@@ -35,7 +35,7 @@ type Job<'a> = (&'a [u32], &'a Net<'a>, fn(&Loss<'a>, &[u32], &[f32], &mut [f32]
 
 impl Fused {
     /// Creates the backend with these settings.
-    pub(super) fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
+    pub fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
         Self { config: config.clone(), arithmetic, workspaces: Vec::new(), seen: Vec::new() }
     }
 

@@ -10,7 +10,7 @@ use super::rollout::RolloutBlock;
 /// noisy). At 0, the next value replaces them.
 ///
 /// J. Schulman et al., "High-dimensional continuous control using generalized advantage estimation" (2016), eq. 16.
-pub(super) fn gae(block: &mut RolloutBlock, gamma: f32, lambda: f32) {
+pub fn gae(block: &mut RolloutBlock, gamma: f32, lambda: f32) {
     let RolloutBlock { rewards, values, dones, advantages, returns, .. } = block;
     let envs = values.len() - rewards.len();
     for env in 0..envs {

@@ -5,7 +5,7 @@ use crate::config::PpoConfig;
 
 /// The learning rate after a minibatch, given the KL divergence of the current policy from the policy that collected, as
 /// in the reference implementation. It is fixed if the desired divergence is 0.
-pub(super) fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f64; 2]) -> f64 {
+pub fn adapted(rate: f64, kl: f64, desired_kl: f64, [lowest, highest]: [f64; 2]) -> f64 {
     if desired_kl == 0.0 {
         rate
     } else if kl > 2.0 * desired_kl {

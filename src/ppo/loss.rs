@@ -11,7 +11,7 @@ use super::rollout::{Rollout, RolloutBlock};
 use crate::config::PpoConfig;
 
 /// The losses of a minibatch. An action has A values.
-pub(super) struct Loss<'a> {
+pub struct Loss<'a> {
     rollout: &'a Rollout,
     /// How far ratios may be from 1, and values from those at collection.
     clip: f32,
@@ -31,7 +31,7 @@ pub(super) struct Loss<'a> {
 }
 
 /// Sums over the samples of a group.
-pub(super) struct Sums {
+pub struct Sums {
     /// All but the KL divergence.
     losses: Losses,
     /// `[A]`: squared differences of the means from the means that acted, divided by the squared noise scales.
@@ -40,7 +40,7 @@ pub(super) struct Sums {
 
 impl<'a> Loss<'a> {
     /// Creates the losses of a minibatch of `samples` samples of `rollout` under `policy`.
-    pub(super) fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &PpoConfig) -> Self {
+    pub fn new(policy: &Policy, rollout: &'a Rollout, samples: usize, config: &PpoConfig) -> Self {
         let log_std = policy.log_std;
         let action_size = policy.spaces.action_size;
         Self {
@@ -58,12 +58,12 @@ impl<'a> Loss<'a> {
     }
 
     /// The sums over no samples.
-    pub(super) fn of_none(&self) -> Sums {
+    pub fn of_none(&self) -> Sums {
         Sums { losses: Losses::default(), squared_shifts: vec![0.0; self.action_size] }
     }
 
     /// The losses of a group, given the sums of [`Loss::actor`] or [`Loss::critic`].
-    pub(super) fn of_group(&self, sums: &Sums) -> Losses {
+    pub fn of_group(&self, sums: &Sums) -> Losses {
         // The divergence of Gaussians with the same standard deviation.
         let variance = (2.0 * f64::from(self.log_std)).exp();
         let kl = sums.squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum();
@@ -71,7 +71,7 @@ impl<'a> Loss<'a> {
     }
 
     /// Writes the gradient `[m, A]` with respect to the `means` `[m, A]` of these samples.
-    pub(super) fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
+    pub fn actor(&self, samples: &[u32], means: &[f32], grad: &mut [f32], sums: &mut Sums) {
         let width = self.action_size;
         widest!({
             let rows = means.chunks_exact(width).zip(grad.chunks_exact_mut(width));
@@ -121,7 +121,7 @@ impl<'a> Loss<'a> {
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
-    pub(super) fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
+    pub fn critic(&self, samples: &[u32], values: &[f32], grad: &mut [f32], sums: &mut Sums) {
         for ((&sample, &value), grad) in samples.iter().zip(values).zip(grad) {
             let (block, i) = self.rollout.locate(sample);
             let old = block.values[i];

@@ -19,7 +19,7 @@ use crate::ranks::tree_sum;
 use crate::rng;
 
 /// The position of a gradient step among the steps that move the policy. The learning rate follows how far they have moved it.
-pub(super) enum Stage {
+pub enum Stage {
     /// Before all of them: only the critic learns.
     CriticAlone,
     /// The first step of an update: the policy is still unchanged since it acted.
@@ -120,7 +120,7 @@ impl Ppo {
 
     /// Computes the returns and advantages, and normalises the advantages to mean 0 and standard deviation 1. The result is the
     /// explained variance.
-    pub(super) fn prepare(&self, rollout: &mut Rollout) -> f64 {
+    pub fn prepare(&self, rollout: &mut Rollout) -> f64 {
         let [gamma, lambda] = [self.config.gamma, self.config.lambda].map(|factor| factor as f32);
         rollout.blocks.par_iter_mut().for_each(|block| gae(block, gamma, lambda));
         let (_, spread) = self.mean_and_variance(rollout, |block| &block.returns);
@@ -147,7 +147,7 @@ impl Ppo {
     ///
     /// # Errors
     /// Fails if one of them is not finite. Nothing has moved then.
-    pub(super) fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], stage: Stage) -> Result<(Losses, f64)> {
+    pub fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], stage: Stage) -> Result<(Losses, f64)> {
         let nets = self.policy.layout.nets();
         let groups = self.exchange.groups(samples);
         let count = self.exchange.of_all(samples.len());
@@ -180,7 +180,7 @@ impl Ppo {
     }
 
     /// The mean losses of a minibatch of `count` samples, given the sums of each group on this rank.
-    pub(super) fn losses(&self, sums: &[Losses], count: usize) -> Losses {
+    pub fn losses(&self, sums: &[Losses], count: usize) -> Losses {
         let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
         let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();
         self.exchange.in_order(own, Losses::add).means(count)

@@ -142,7 +142,7 @@ impl Exchange {
     }
 }
 
-pub(super) fn part(count: usize, rank: usize, ranks: usize) -> Range<usize> {
+pub fn part(count: usize, rank: usize, ranks: usize) -> Range<usize> {
     count * rank / ranks..count * (rank + 1) / ranks
 }
 

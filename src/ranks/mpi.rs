@@ -15,7 +15,7 @@ use super::Ranks;
 pub(super) use mpi::environment::Universe;
 
 /// This process among all that were started together.
-pub(super) struct Mpi {
+pub struct Mpi {
     pub rank: usize,
     pub size: usize,
 }
@@ -24,7 +24,7 @@ pub(super) struct Mpi {
 ///
 /// # Errors
 /// Fails if this MPI does not allow calls from more than one thread.
-pub(super) fn join() -> Result<(Universe, Mpi)> {
+pub fn join() -> Result<(Universe, Mpi)> {
     // The learner runs on a worker thread, everything else on the main thread, one at a time.
     let (universe, granted) = mpi::initialize_with_threading(Threading::Serialized).context("MPI was started twice")?;
     ensure!(granted >= Threading::Serialized, "this MPI allows calls from one thread only ({granted:?})");

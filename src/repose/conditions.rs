@@ -11,10 +11,10 @@ use crate::rng::{self, Rng};
 use crate::sim::Simulation;
 
 /// The conditions of the current episode of one environment.
-pub(super) struct Conditions {
+pub struct Conditions {
     randomization: Option<Arc<Randomization>>,
     /// What the episode has drawn, if it is randomised.
-    pub(super) draw: Option<EpisodePhysics>,
+    pub draw: Option<EpisodePhysics>,
     /// The fraction of the largest assistance that the episode gets. It is 0 in half of the episodes.
     assisted: f64,
     /// Whether the last torque was not zero.
@@ -24,13 +24,13 @@ pub(super) struct Conditions {
 }
 
 impl Conditions {
-    pub(super) fn new(randomization: Option<&Arc<Randomization>>) -> Self {
+    pub fn new(randomization: Option<&Arc<Randomization>>) -> Self {
         Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, twisted: false, bias: Vec::new() }
     }
 
     /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`. Gives the simulation its
     /// physics, after which the state must be reset.
-    pub(super) fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
+    pub fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
         self.draw =
             self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
         self.assisted = (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
@@ -45,18 +45,18 @@ impl Conditions {
     }
 
     /// The control steps between an action and its effect.
-    pub(super) fn delay(&self, task: &Task) -> usize {
+    pub fn delay(&self, task: &Task) -> usize {
         (task.config.action_delay + self.draw.as_ref().map_or(0, EpisodePhysics::delay)) as usize
     }
 
     /// The largest delay of any episode.
-    pub(super) fn most_delay(&self, task: &Task) -> usize {
+    pub fn most_delay(&self, task: &Task) -> usize {
         let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.config.delay[1]);
         (task.config.action_delay + drawn) as usize
     }
 
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
-    pub(super) fn push(&self, rng: &Rng, step: u32, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+    pub fn push(&self, rng: &Rng, step: u32, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let force = self.randomization.as_ref()?.push(self.draw.as_ref()?, rng, step)?;
         sim.push(task.hand.object.body, force);
         Some(force)
@@ -64,7 +64,7 @@ impl Conditions {
 
     /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. With full
     /// assistance, the task's object gets an angular acceleration of `most` for each rad.
-    pub(super) fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+    pub fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
         let factor = self.assisted * most * task.hand.object.inertia;
         if factor == 0.0 && !self.twisted {
             return None;
@@ -76,7 +76,7 @@ impl Conditions {
     }
 
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
-    pub(super) fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
+    pub fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
         let spreads = [Some(&task.noise), drawn.and_then(|(randomization, draw)| randomization.noise(draw))];
         let noises = spreads.into_iter().flatten().filter(|spread| !spread.is_empty());

@@ -79,20 +79,14 @@ pub struct Tail {
 
 /// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
 #[derive(Debug, Default)]
-pub(super) struct Recorder {
+pub struct Recorder {
     before: Option<Tail>,
     now: Option<Tail>,
 }
 
 impl Recorder {
     /// Records a step that is about to be taken, after its controls have been set.
-    pub(super) fn record(
-        &mut self,
-        sim: &Simulation,
-        action: &[f32],
-        push: Option<[f64; 3]>,
-        torque: Option<[f64; 3]>,
-    ) {
+    pub fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>, torque: Option<[f64; 3]>) {
         let width = action.len();
         if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
             self.before = self.now.replace(Tail { start: sim.state(), width, ..Tail::default() });
@@ -105,7 +99,7 @@ impl Recorder {
     }
 
     /// The recorded steps, or `None` before the first step.
-    pub(super) fn tail(&self) -> Option<Tail> {
+    pub fn tail(&self) -> Option<Tail> {
         let mut parts = [&self.before, &self.now].into_iter().flatten().cloned();
         let mut tail = parts.next()?;
         for part in parts {

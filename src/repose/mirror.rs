@@ -13,7 +13,7 @@ const TOLERANCE: f64 = 1e-4;
 
 /// Turns observations of a hand into observations of its mirror image.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Mirror {
+pub struct Mirror {
     /// The values that change their sign, by index.
     signs: Vec<usize>,
     /// For each fingertip the index of its orientation, and the rotation between the mirrored frame and the frame of the other
@@ -31,7 +31,7 @@ impl Mirror {
     ///
     /// # Errors
     /// Fails if, in any recorded pose, the fingertips of one hand are not where the mirrored fingertips of the other are.
-    pub(super) fn new(here: &Record, policy: &Record, layout: &Layout) -> Result<Self> {
+    pub fn new(here: &Record, policy: &Record, layout: &Layout) -> Result<Self> {
         // Returns how far a fingertip is from its counterpart on the other hand in a recorded pose, and the rotation
         // between the two.
         let compare = |at: usize| {
@@ -60,14 +60,14 @@ impl Mirror {
 
     /// The mirror between hands whose names do not tell that they are on different sides, if the fingertips are in the same places only in
     /// the mirror.
-    pub(super) fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
+    pub fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
         let is_near = |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
         let is_same = here.tips.iter().zip(&policy.tips).all(is_near);
         if is_same { None } else { Self::new(here, policy, layout).ok() }
     }
 
     /// Mirrors an observation in place.
-    pub(super) fn apply(&self, observation: &mut [f32]) {
+    pub fn apply(&self, observation: &mut [f32]) {
         self.signs.iter().for_each(|&i| observation[i] = -observation[i]);
         for &(at, turn) in &self.tips {
             let own: [f32; 4] = *observation[at..].first_chunk().expect("an orientation");
@@ -77,7 +77,7 @@ impl Mirror {
     }
 
     /// The matrix `[O, O]` that mirrors an observation, which is a row on its left.
-    pub(super) fn matrix(&self, size: usize) -> Vec<f32> {
+    pub fn matrix(&self, size: usize) -> Vec<f32> {
         let mut matrix = vec![0.0; size * size];
         for (i, row) in matrix.chunks_exact_mut(size).enumerate() {
             row[i] = 1.0;

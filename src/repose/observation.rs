@@ -22,7 +22,7 @@ pub struct Group {
 
 /// Where the values of a group come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Sensing {
+pub enum Sensing {
     /// Sensors, which may have noise and offsets.
     Measured,
     /// They are known exactly, or follow from measured groups.
@@ -30,16 +30,16 @@ pub(super) enum Sensing {
 }
 
 /// The number of values of a fingertip.
-pub(super) const TIP_SIZE: usize = 13;
+pub const TIP_SIZE: usize = 13;
 /// The index of its quaternion among them.
-pub(super) const TIP_QUAT: usize = 3;
+pub const TIP_QUAT: usize = 3;
 const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
 
 // The places of groups in the table.
-pub(super) const OBJECT_QUAT: usize = 3;
-pub(super) const GOAL_QUAT: usize = 7;
-pub(super) const RELATIVE_QUAT: usize = 8;
-pub(super) const TIPS: usize = 9;
+pub const OBJECT_QUAT: usize = 3;
+pub const GOAL_QUAT: usize = 7;
+pub const RELATIVE_QUAT: usize = 8;
+pub const TIPS: usize = 9;
 
 /// The layout of the observations of a hand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -128,7 +128,7 @@ fn rotation_error(spaces: &Spaces, observation: &[f32]) -> f32 {
 }
 
 /// An observation that is being written, group by group.
-pub(super) struct Writer<'a> {
+pub struct Writer<'a> {
     layout: &'a Layout,
     cells: &'a mut [f32],
     written: usize,
@@ -136,14 +136,14 @@ pub(super) struct Writer<'a> {
 }
 
 impl<'a> Writer<'a> {
-    pub(super) fn new(layout: &'a Layout, observation: &'a mut [f32]) -> Self {
+    pub fn new(layout: &'a Layout, observation: &'a mut [f32]) -> Self {
         assert_eq!(observation.len(), layout.size, "observation length");
         Self { layout, cells: observation, written: 0, part: 0 }
     }
 
     /// Writes the next values, which must belong to the group `name`. This is the only place where the doubles of the physics
     /// become the floats of the learner.
-    pub(super) fn put(&mut self, name: &str, values: impl IntoIterator<Item = f64>) {
+    pub fn put(&mut self, name: &str, values: impl IntoIterator<Item = f64>) {
         let Group { name: expected, start, length, .. } = self.layout.groups[self.part];
         let end = start + length;
         assert!(name == expected, "{name}: {expected} comes first");
@@ -156,7 +156,7 @@ impl<'a> Writer<'a> {
     }
 
     /// Checks that every value has been overwritten.
-    pub(super) fn finish(self) {
+    pub fn finish(self) {
         assert_eq!(self.written, self.layout.size, "values written to an observation");
     }
 }

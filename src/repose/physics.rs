@@ -50,7 +50,7 @@ const SIZES: usize = 5;
 
 /// The quantities that one generator draws, one after another. Each later one has its own, so that a new quantity does not
 /// change what is drawn for the others.
-pub(super) const SHARED: usize = 10;
+pub const SHARED: usize = 10;
 
 /// The changes of each of these parts, given one value for all of them or one for each.
 fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
@@ -143,12 +143,12 @@ impl Quantity {
 }
 
 /// The factors on the lengths of the object that are drawn.
-pub(super) fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
+pub fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
     let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
     if low == high { vec![low] } else { (0..SIZES).map(place).collect() }
 }
 
-pub(super) fn normal(rng: &mut Rng, std: f64) -> f64 {
+pub fn normal(rng: &mut Rng, std: f64) -> f64 {
     std * Distribution::<f64>::sample(&StandardNormal, rng)
 }
 

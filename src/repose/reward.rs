@@ -127,14 +127,14 @@ pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
 }
 
 /// The reward that training adds to a step, given the weights of its terms.
-pub(super) fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
+pub fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
     let mut values = *weights;
     values.iter_mut().zip(&TRAINING).for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
     values
 }
 
 /// The weights of the terms that training adds, after `env_steps` control steps of the whole run.
-pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
+pub fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
     TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
         Weight::Constant(weight) => weight(training),
         Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
@@ -142,7 +142,7 @@ pub(super) fn training_weights(training: &TrainingConfig, env_steps: u64) -> Tra
 }
 
 /// The weights that change in the course of a training run, with their descriptions.
-pub(super) fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
+pub fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
     TRAINING.iter().zip(*weights).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
         Weight::Constant(_) => None,
         Weight::Ramp(setting, _) => Some((*setting, value)),

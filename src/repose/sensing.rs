@@ -11,14 +11,14 @@ use crate::rng::Rng;
 
 /// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct NoiseStd(Vec<(usize, f32)>);
+pub struct NoiseStd(Vec<(usize, f32)>);
 
 impl NoiseStd {
     /// Spreads the values of groups over the values of an observation.
     ///
     /// # Errors
     /// Fails on the name of a group that does not exist or is not measured.
-    pub(super) fn new(groups: &ByGroup, layout: &Layout) -> Result<Self> {
+    pub fn new(groups: &ByGroup, layout: &Layout) -> Result<Self> {
         let measured: Vec<&str> = layout.measured().map(|group| group.name).collect();
         for name in groups.keys() {
             if !measured.contains(&name.as_str()) {
@@ -35,18 +35,18 @@ impl NoiseStd {
     }
 
     /// Whether nothing is added to any value.
-    pub(super) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
     /// Draws what is added: independent normal numbers.
-    pub(super) fn draw<'a>(&'a self, rng: &'a mut Rng) -> impl Iterator<Item = (usize, f32)> + 'a {
+    pub fn draw<'a>(&'a self, rng: &'a mut Rng) -> impl Iterator<Item = (usize, f32)> + 'a {
         self.0.iter().map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
     }
 }
 
 /// Adds offsets to others. Both are in the order of the values of an observation.
-pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
+pub fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, f32)>) {
     for (i, added) in more {
         match bias.binary_search_by_key(&i, |&(i, _)| i) {
             Ok(at) => bias[at].1 += added,
@@ -57,7 +57,7 @@ pub(super) fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (
 
 /// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
 /// numbers. It stays the same however the body turns.
-pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
+pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
     let orientations = || std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
     let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
     let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
@@ -71,7 +71,7 @@ pub(super) fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &La
 
 /// Makes an observation consistent after something was added to its values. Quaternions get length 1 and their usual sign. The
 /// orientation relative to the goal follows from the orientation of the object.
-pub(super) fn make_consistent(observation: &mut [f32], layout: &Layout) {
+pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();

@@ -6,22 +6,22 @@ use super::Lesson;
 use crate::sim::Actuator;
 
 /// The targets of the servos of one hand: for each actuator in action order, in the unit of its control range.
-pub(super) struct Servos {
+pub struct Servos {
     /// The last targets.
-    pub(super) targets: Vec<f64>,
+    pub targets: Vec<f64>,
     /// The targets that take effect now.
-    pub(super) due: Vec<f64>,
+    pub due: Vec<f64>,
     /// The targets that have not taken effect yet, the oldest first: as many sets as there are control steps of delay.
     under_way: VecDeque<f64>,
 }
 
 impl Servos {
-    pub(super) fn new(actuators: usize) -> Self {
+    pub fn new(actuators: usize) -> Self {
         Self { targets: vec![0.0; actuators], due: vec![0.0; actuators], under_way: VecDeque::new() }
     }
 
     /// Starts with `targets`, which stay in effect during the delay.
-    pub(super) fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
+    pub fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
         self.targets.iter_mut().zip(targets).for_each(|(own, target)| *own = target);
         self.under_way.clear();
         for _ in 0..delay {
@@ -31,7 +31,7 @@ impl Servos {
     }
 
     /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect.
-    pub(super) fn apply(&mut self, action: &[f32], actuators: &[Actuator], lesson: &Lesson) {
+    pub fn apply(&mut self, action: &[f32], actuators: &[Actuator], lesson: &Lesson) {
         let alpha = lesson.act_moving_average;
         for ((target, action), actuator) in self.targets.iter_mut().zip(action).zip(actuators) {
             let [low, high] = actuator.range;
@@ -43,7 +43,7 @@ impl Servos {
     }
 
     /// `count` sets of targets: those under way and, in front of them, the oldest one again.
-    pub(super) fn under_way(&self, count: usize) -> impl Iterator<Item = f64> {
+    pub fn under_way(&self, count: usize) -> impl Iterator<Item = f64> {
         let actuators = self.targets.len();
         let missing = (count * actuators).saturating_sub(self.under_way.len());
         let oldest = (0..missing).map(move |i| i % actuators);
@@ -53,7 +53,7 @@ impl Servos {
 
     /// Resumes with these last targets and the newest `delay` sets that [`Self::under_way`] returned. If there are fewer, because
     /// a fork has a longer delay than its parent, the oldest one is repeated.
-    pub(super) fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
+    pub fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
         let oldest = if under_way.is_empty() { last } else { &under_way[..last.len()] };
         self.reset(last.iter().copied(), 0);
         let wanted = delay * last.len();

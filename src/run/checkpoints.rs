@@ -10,7 +10,7 @@ use anyhow::{Result, ensure};
 use crate::os::{Cannot, name_also, put_aside, same_file, sync_folder, write_whole};
 
 /// The folder of the checkpoints in the folder of a run.
-pub(super) const CHECKPOINTS: &str = "checkpoints";
+pub const CHECKPOINTS: &str = "checkpoints";
 
 /// The folder `checkpoints` of a run.
 #[derive(Clone, Debug)]
@@ -118,13 +118,13 @@ impl Checkpoints {
 ///
 /// # Errors
 /// Fails if it is.
-pub(super) fn expect_no_link(folder: &Path) -> Result<()> {
+pub fn expect_no_link(folder: &Path) -> Result<()> {
     ensure!(!folder.is_symlink(), "cannot write {}: links in a run folder are not followed", folder.display());
     Ok(())
 }
 
 /// The time when a file was written, if it is there.
-pub(super) fn modified(path: &Path) -> Option<SystemTime> {
+pub fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|facts| facts.modified()).ok()
 }
 

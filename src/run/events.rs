@@ -20,7 +20,7 @@ use crate::os::{Cannot, expect_named, make_own, sync_folder};
 const NAME: [&str; 2] = ["events.out.tfevents.", ".shadow-repose"];
 
 /// An event file being written.
-pub(super) struct EventFile {
+pub struct EventFile {
     path: PathBuf,
     file: File,
     /// The descriptions of the tags that have no value in the file yet.
@@ -37,7 +37,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
+    pub fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
         let seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
@@ -63,7 +63,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn iteration(
+    pub fn iteration(
         &mut self,
         step: u64,
         values: &[(impl AsRef<str>, f64)],
@@ -84,7 +84,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn values(&self, values: Vec<Summary_Value>, step: u64) -> Result<()> {
+    pub fn values(&self, values: Vec<Summary_Value>, step: u64) -> Result<()> {
         self.write(What::summary(Summary { value: values.into(), ..Summary::default() }), step)
     }
 
@@ -99,7 +99,7 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written, or was deleted.
-    pub(super) fn sync(&mut self) -> Result<()> {
+    pub fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         self.file.sync_data().cannot("write", &self.path)
     }
@@ -110,7 +110,7 @@ impl EventFile {
 ///
 /// # Errors
 /// Fails if a file cannot be read or written.
-pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
+pub fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
     for (_, path) in event_files(folder)? {
         let cut = || {
             let file = File::open(&path)?;
@@ -127,7 +127,7 @@ pub(super) fn cut_off_after(folder: &Path, last_step: u64) -> Result<()> {
 }
 
 /// This program's event files in `folder`, each with the seconds in its name.
-pub(super) fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
+pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let [begin, end] = NAME;
     let entries = fs::read_dir(folder).cannot("read", folder)?;
     let ours = entries.flatten().filter_map(|entry| {
@@ -141,7 +141,7 @@ pub(super) fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
 }
 
 /// The seconds since 1970.
-pub(super) fn now() -> f64 {
+pub fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
 

@@ -13,20 +13,20 @@ use super::hparams::HPARAMS;
 use crate::os::{Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, unused_name, write_whole};
 
 /// The default folder of runs.
-pub(super) const RUNS: &str = "runs/shadow-hand-repose";
+pub const RUNS: &str = "runs/shadow-hand-repose";
 
-pub(super) const CONFIG: &str = "config.toml";
-pub(super) const VERSION: &str = "version.txt";
-pub(super) const POLICY: &str = "policy.safetensors";
-pub(super) const DIVERGED: &str = "diverged";
+pub const CONFIG: &str = "config.toml";
+pub const VERSION: &str = "version.txt";
+pub const POLICY: &str = "policy.safetensors";
+pub const DIVERGED: &str = "diverged";
 /// A file with this name asks the training run to stop.
 const STOP: &str = "stop";
 /// A file with this name says that the training run is not to be continued.
-pub(super) const FINISHED: &str = "finished";
+pub const FINISHED: &str = "finished";
 /// A file or folder that is not complete yet.
 const PARTIAL: &str = ".shadow-repose-*";
 /// The names of a run's files and folders. A star stands for anything.
-pub(super) const OURS: [&str; 11] = [
+pub const OURS: [&str; 11] = [
     CONFIG,
     VERSION,
     POLICY,
@@ -42,10 +42,10 @@ pub(super) const OURS: [&str; 11] = [
 
 /// The most files in the folder `diverged`. More would not help to find the cause, but would fill the disk.
 const MOST_DUMPS: usize = 1000;
-pub(super) const METRICS: &str = "metrics.csv";
+pub const METRICS: &str = "metrics.csv";
 
 /// Whether a name is one of these, in which a star stands for anything.
-pub(super) fn is_one_of(name: &OsStr, patterns: &[&str]) -> bool {
+pub fn is_one_of(name: &OsStr, patterns: &[&str]) -> bool {
     let name = name.to_string_lossy();
     patterns.iter().any(|pattern| match pattern.split_once('*') {
         Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),

@@ -20,7 +20,7 @@ use super::summary::{Descriptions, with_metadata};
 use crate::os::Cannot;
 
 /// The name of the folder.
-pub(super) const HPARAMS: &str = "hparams";
+pub const HPARAMS: &str = "hparams";
 
 /// The class of data of a tensor (`DataClass` in TensorBoard's summary.proto).
 const TENSOR: u32 = 2;
@@ -29,7 +29,7 @@ const TENSOR: u32 = 2;
 ///
 /// # Errors
 /// Fails if its file cannot be written.
-pub(super) fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
+pub fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
     let folder = folder.join(HPARAMS);
     if !folder.exists() {
         fs::create_dir(&folder).cannot("create", &folder)?;
@@ -44,7 +44,7 @@ pub(super) fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventF
 }
 
 /// The end of the row: whether the training run has made all its steps, or failed.
-pub(super) fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
+pub fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
     let status = if succeeded { 1 } else { 2 };
     let info = message(|out| {
         out.write_enum(1, status)?;

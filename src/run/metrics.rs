@@ -16,7 +16,7 @@ use crate::os::{Cannot, expect_named, make_own, put_aside, sync_folder};
 const LONGEST_ROW: u64 = 1 << 20;
 
 /// The table being written.
-pub(super) struct Metrics {
+pub struct Metrics {
     path: PathBuf,
     file: File,
     /// Bytes of the header and of whole rows.
@@ -29,7 +29,7 @@ impl Metrics {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub(super) fn open(path: &Path, header: &str, iterations: Range<u64>, mut tell: impl FnMut(&str)) -> Result<Self> {
+    pub fn open(path: &Path, header: &str, iterations: Range<u64>, mut tell: impl FnMut(&str)) -> Result<Self> {
         let found = match File::open(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
             file => file.and_then(|file| rows(file, header, iterations.end)).cannot("write", path)?,
@@ -66,7 +66,7 @@ impl Metrics {
     ///
     /// # Errors
     /// Fails if the file cannot be written. [`Metrics::repair`] must succeed before the next row.
-    pub(super) fn row(&mut self, row: &str) -> Result<()> {
+    pub fn row(&mut self, row: &str) -> Result<()> {
         self.file.write_all(row.as_bytes()).cannot("write", &self.path)?;
         self.length += row.len() as u64;
         Ok(())
@@ -84,7 +84,7 @@ impl Metrics {
     ///
     /// # Errors
     /// Fails if the file cannot be written, or was deleted.
-    pub(super) fn sync(&mut self) -> Result<()> {
+    pub fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
         self.repair().and_then(|()| self.file.sync_data()).cannot("write", &self.path)
     }
@@ -135,7 +135,7 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
 
 /// Reads the next row into `row`, with its line feed, and returns its length, or 0 at the end. The rest of a row that is too
 /// long is read as another one.
-pub(super) fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io::Result<u64> {
+pub fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io::Result<u64> {
     row.clear();
     reader.take(LONGEST_ROW).read_until(b'\n', row).map(|length| length as u64)
 }

@@ -18,7 +18,7 @@ const LARGEST: u64 = 64 << 20;
 ///
 /// # Errors
 /// Fails if the file cannot be read.
-pub(super) fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u64> {
+pub fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u64> {
     let mut length = 0;
     while let Some(event) = next_event(&mut reader)? {
         if step_of(&event).is_none_or(|step| step > last_step as i64) {

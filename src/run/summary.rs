@@ -17,7 +17,7 @@ pub type Descriptions = HashMap<String, String>;
 const DATA_CLASS: u32 = 4;
 
 /// A value of a tag. The first one in a file has the tag's description.
-pub(super) fn value(tag: &str, content: Content, description: Option<String>) -> Summary_Value {
+pub fn value(tag: &str, content: Content, description: Option<String>) -> Summary_Value {
     // The plugin that shows the value, and the class of its data (`DataClass` in TensorBoard's summary.proto).
     let (plugin, data_class) = match content {
         Content::simple_value(_) => ("scalars", 1),
@@ -33,7 +33,7 @@ pub(super) fn value(tag: &str, content: Content, description: Option<String>) ->
 }
 
 /// A value of a tag that says which plugin shows it, and of which class its data are.
-pub(super) fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32) -> Summary_Value {
+pub fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32) -> Summary_Value {
     let mut value = Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
     let metadata = value.mut_metadata();
     metadata.mut_plugin_data().set_plugin_name(plugin.to_owned());
@@ -42,7 +42,7 @@ pub(super) fn with_metadata(tag: &str, content: Content, plugin: &str, data_clas
 }
 
 /// A text in Markdown.
-pub(super) fn markdown(text: &str) -> TensorProto {
+pub fn markdown(text: &str) -> TensorProto {
     let mut tensor = TensorProto { dtype: DataType::DT_STRING, ..TensorProto::default() };
     // A shape without dimensions: a single string.
     tensor.mut_tensor_shape();

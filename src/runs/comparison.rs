@@ -16,7 +16,7 @@ const COMPARED: [(&str, &str); 4] =
     [("eval", "goals"), ("eval", "drop_rate"), ("eval", "rot_dist"), ("training", "turned")];
 
 /// Two runs, A and B.
-pub(super) struct Comparison {
+pub struct Comparison {
     /// The settings in which they differ, or `None` if the settings of one are not known.
     settings: Option<Vec<Difference>>,
     /// Steps, and the figures of both there.
@@ -31,7 +31,7 @@ impl Comparison {
     ///
     /// # Errors
     /// Fails if the table of one cannot be read.
-    pub(super) fn of(a: &Run, b: &Run) -> Result<Self> {
+    pub fn of(a: &Run, b: &Run) -> Result<Self> {
         let configs = a.config.as_ref().zip(b.config.as_ref());
         let curves = [curves(a)?, curves(b)?];
         let mut begin = f64::NEG_INFINITY;
@@ -51,7 +51,7 @@ impl Comparison {
     }
 
     /// The lines that follow the table of both runs.
-    pub(super) fn lines(&self) -> Vec<String> {
+    pub fn lines(&self) -> Vec<String> {
         let words = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<String>>();
         let settings = match self.settings.as_deref() {
             None => vec![words(&["the settings of one run are not known"])],
@@ -78,7 +78,7 @@ impl Comparison {
     }
 
     /// Its object of JSON, with these objects of both runs.
-    pub(super) fn as_json(&self, runs: &[Value]) -> Value {
+    pub fn as_json(&self, runs: &[Value]) -> Value {
         let settings = self.settings.as_ref().map(|all| {
             let both = all.iter().map(|(key, both)| (key.clone(), json!(both)));
             both.collect::<Map<String, Value>>()

@@ -21,7 +21,7 @@ const LONGEST_NAME: usize = 40;
 
 /// Where a run stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum RunState {
+pub enum RunState {
     /// A training run writes into it.
     Training,
     /// All steps are made.
@@ -34,13 +34,13 @@ pub(super) enum RunState {
 
 /// A run as it is shown.
 #[derive(Clone, Debug)]
-pub(super) struct Run {
-    pub(super) path: PathBuf,
-    pub(super) name: String,
+pub struct Run {
+    pub path: PathBuf,
+    pub name: String,
     state: RunState,
     total_steps: Option<u64>,
-    pub(super) figures: Figures,
-    pub(super) config: Option<Config>,
+    pub figures: Figures,
+    pub config: Option<Config>,
     /// How its settings differ from the default.
     changed: Vec<Difference>,
     /// Why files of it cannot be read.
@@ -49,7 +49,7 @@ pub(super) struct Run {
 
 /// The figures in the table of a run, NaN where it has none.
 #[derive(Clone, Debug)]
-pub(super) struct Figures {
+pub struct Figures {
     /// The stamp of the table that they were read from.
     stamp: Option<Stamp>,
     env_steps: Option<u64>,
@@ -62,13 +62,7 @@ pub(super) struct Figures {
 
 impl Run {
     /// Reads what the files of a run show at the time `now`. Figures that are `known` are read again only if the table has changed.
-    pub(super) fn of(
-        path: &Path,
-        glance: &Glance,
-        default: &Config,
-        known: Option<&&Figures>,
-        now: SystemTime,
-    ) -> Self {
+    pub fn of(path: &Path, glance: &Glance, default: &Config, known: Option<&&Figures>, now: SystemTime) -> Self {
         let config =
             glance.config.as_ref().map(|path| Settings::new().file(Source::new(path, os::read_text(path)?)).resolve());
         let (config, problem) = match config.transpose() {
@@ -97,7 +91,7 @@ impl Run {
     }
 
     /// Whether it has a table of figures.
-    pub(super) fn has_table(&self) -> bool {
+    pub fn has_table(&self) -> bool {
         self.figures.stamp.is_some()
     }
 
@@ -109,7 +103,7 @@ impl Run {
     }
 
     /// The cells of its row.
-    pub(super) fn cells(&self) -> Vec<String> {
+    pub fn cells(&self) -> Vec<String> {
         let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
         let steps = match (env_steps, self.total_steps) {
             (Some(made), Some(all)) => steps_of_all(made, all),
@@ -140,7 +134,7 @@ impl Run {
     }
 
     /// Its object of JSON.
-    pub(super) fn as_json(&self) -> Value {
+    pub fn as_json(&self) -> Value {
         let changed = self.changed.iter().map(|(key, [_, own])| (key.clone(), json!(own)));
         let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
         json!({

@@ -6,7 +6,7 @@ use std::time::Instant;
 const LARGEST_LAG: f64 = 0.25;
 
 /// A clock that converts elapsed time into control steps.
-pub(super) struct Clock {
+pub struct Clock {
     ctrl_dt: f64,
     last: Instant,
     /// Scene time that is still to be played, s.
@@ -14,12 +14,12 @@ pub(super) struct Clock {
 }
 
 impl Clock {
-    pub(super) fn new(ctrl_dt: f64) -> Self {
+    pub fn new(ctrl_dt: f64) -> Self {
         Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
     }
 
     /// The steps since the last call, at this multiple of real time.
-    pub(super) fn steps_due(&mut self, speed: f64) -> u32 {
+    pub fn steps_due(&mut self, speed: f64) -> u32 {
         let passed = self.last.elapsed().as_secs_f64();
         self.last = Instant::now();
         self.owed = (self.owed + passed * speed).min((LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt));
@@ -29,7 +29,7 @@ impl Clock {
     }
 
     /// Lets the time since the last call pass without steps.
-    pub(super) fn pause(&mut self) {
+    pub fn pause(&mut self) {
         *self = Self::new(self.ctrl_dt);
     }
 }

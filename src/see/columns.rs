@@ -18,10 +18,10 @@ const FARTHEST: f64 = 100.0;
 const LARGEST: f64 = 1e9;
 
 /// The largest count: a page counts in 16 bits.
-pub(super) const MOST: u32 = 32_767;
+pub const MOST: u32 = 32_767;
 
 /// The scene of a task, and where the numbers of a row are.
-pub(super) struct Columns {
+pub struct Columns {
     /// The task, which was loaded for display.
     task: Arc<Task>,
     /// Its numbers at the start are the poses in which nothing has moved, with the goal in its place. Mocap bodies other than the
@@ -32,7 +32,7 @@ pub(super) struct Columns {
 }
 
 impl Columns {
-    pub(super) fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
+    pub fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
         let is_builtin = task.config.model_file().is_none();
         let mut drawing = task.scene.drawing(task.hand.side().filter(|_| is_builtin), camera);
         if is_builtin && camera.is_none() {
@@ -62,12 +62,12 @@ impl Columns {
     }
 
     /// The place of the rotation error.
-    pub(super) fn error(&self) -> usize {
+    pub fn error(&self) -> usize {
         self.poses() + 1
     }
 
     /// The row of an environment after a reset or a step, with these terms of the reward.
-    pub(super) fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
+    pub fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
         let last = &env.last;
         let episode = env.episode();
         let (goal, error) = if episode.length == 0 { (env.goal, env.rot_dist()) } else { (last.goal, last.rot_dist) };
@@ -79,7 +79,7 @@ impl Columns {
     ///
     /// # Errors
     /// Fails if it is not a record, or is one of another scene.
-    pub(super) fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
+    pub fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
         let number = |value: &Value| value.as_f64().filter(|x| x.abs() < LARGEST);
         let list = |key: &str, length: usize| {
             let found: Option<Vec<f64>> = record[key].as_array().and_then(|list| list.iter().map(number).collect());
@@ -116,12 +116,12 @@ impl Columns {
     }
 
     /// Gives a row the poses of the row before: poses after a step that diverged mean nothing.
-    pub(super) fn stay(&self, row: &mut [f64], before: &[f64]) {
+    pub fn stay(&self, row: &mut [f64], before: &[f64]) {
         row[..self.poses()].copy_from_slice(&before[..self.poses()]);
     }
 
     /// Chooses the signs of the quaternions of a row to continue the row before: q and -q are the same rotation.
-    pub(super) fn go_on(&self, row: &mut [f64], before: &[f64]) {
+    pub fn go_on(&self, row: &mut [f64], before: &[f64]) {
         for &place in &self.drawing.quaternions {
             let same: f64 = (place..place + 4).map(|i| row[i] * before[i]).sum();
             if same < 0.0 {
@@ -131,7 +131,7 @@ impl Columns {
     }
 
     /// The page of these rows, with more entries for what it says of itself. Only the first one has a scene.
-    pub(super) fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Page {
+    pub fn page(&mut self, about: &About, more: Value, rows: Vec<Vec<f64>>) -> Page {
         let config = &self.task.config;
         let mut meta = json!({
             "format": 1,

@@ -19,10 +19,10 @@ use super::placing::{frames_within, geoms_within};
 use crate::quat;
 
 /// The group of geoms that are drawn and by convention collide with nothing.
-pub(super) const VISUAL: i32 = 2;
+pub const VISUAL: i32 = 2;
 
 /// The scene built into the program.
-pub(super) const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
+pub const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
 /// The shape of friction cones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -155,7 +155,7 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
 }
 
 /// Adds a geom that touches nothing and has no mass.
-pub(super) fn only_seen(body: &mut MjsBody) -> &mut MjsGeom {
+pub fn only_seen(body: &mut MjsBody) -> &mut MjsGeom {
     body.add_geom().with_contype(0).with_conaffinity(0).with_mass(0.0).with_density(0.0)
 }
 

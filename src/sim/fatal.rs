@@ -35,7 +35,7 @@ pub fn before_fatal_error(rescue: impl FnOnce(&str) + Send + 'static) {
 
 /// Discards MuJoCo's messages except for fatal errors: no `MUJOCO_LOG.TXT`, and no line per diverged state, which
 /// [`super::Simulation::step`] returns as a value.
-pub(super) fn quieten_mujoco() {
+pub fn quieten_mujoco() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
         // SAFETY: every use of MuJoCo in this program starts with loading a scene, so no other thread can be inside MuJoCo.

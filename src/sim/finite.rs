@@ -12,7 +12,7 @@ use crate::os::shortened;
 ///
 /// # Errors
 /// Fails if there is no room for a temporary file.
-pub(super) fn not_finite(model: &MjModel) -> Result<Option<String>> {
+pub fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let printed = || {
         let file = NamedTempFile::new()?;
         model.print(file.path()).map_err(|error| anyhow!("{error}"))?;

@@ -23,7 +23,7 @@ const PLATE: f64 = 0.02;
 ///
 /// # Errors
 /// Fails if MuJoCo refuses the scene.
-pub(super) fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
+pub fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&mjTEXTURE_SKYBOX);
     let shown = |body: usize| {

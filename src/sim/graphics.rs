@@ -8,7 +8,7 @@ use crate::schedule::caught;
 
 /// Runs `f` and turns a panic into an error without printing it: the windowing libraries panic e.g. if a shared library is
 /// missing.
-pub(super) fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
+pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Result<T> {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let result = caught(f);
@@ -17,7 +17,7 @@ pub(super) fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -
 }
 
 /// Formats an error and its causes on one line, without consecutive duplicates.
-pub(super) fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
+pub fn described(error: &(dyn Error + 'static)) -> anyhow::Error {
     let mut causes: Vec<String> = Chain::new(error).map(ToString::to_string).collect();
     causes.dedup();
     anyhow!("{}", without_place(&causes.join(": ")))

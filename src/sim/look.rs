@@ -12,7 +12,7 @@ use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
 
 /// The group of geoms that are not drawn.
-pub(super) const HIDDEN: i32 = 3;
+pub const HIDDEN: i32 = 3;
 /// The scale of MuJoCo Menagerie's meshes, which are in millimetres.
 const MILLIMETRE: f64 = 1e-3;
 
@@ -126,7 +126,7 @@ impl Dress {
 }
 
 /// Whether a shape is of one of the bodies whose names begin with `bodies`.
-pub(super) fn is_of(model: &MjModel, geom: usize, bodies: &str) -> bool {
+pub fn is_of(model: &MjModel, geom: usize, bodies: &str) -> bool {
     let body = model.geom_bodyid()[geom] as usize;
     model.id_to_name(mjOBJ_BODY, body).is_some_and(|name| name.starts_with(bodies))
 }

@@ -65,7 +65,7 @@ pub struct Controls {
 }
 
 /// The state of the panel between two frames.
-pub(super) struct Panel {
+pub struct Panel {
     /// The names of the choices.
     pub choices: Vec<&'static str>,
     pub readout: Readout,
@@ -74,7 +74,7 @@ pub(super) struct Panel {
 
 impl Panel {
     /// Draws the panel at the right of the window and handles clicks and key presses.
-    pub(super) fn show(&mut self, ui: &mut Ui) {
+    pub fn show(&mut self, ui: &mut Ui) {
         if !ui.egui_wants_keyboard_input() {
             self.take_keys(ui);
         }
@@ -193,7 +193,7 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
 /// task, and it takes a third of a small window. mujoco-rs has no setting for that, so this drags its edge to the window's
 /// side, as a user could. The key X opens it again.
 #[derive(Default)]
-pub(super) struct CloseLeftPanel {
+pub struct CloseLeftPanel {
     frame: usize,
 }
 

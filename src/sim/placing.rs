@@ -5,10 +5,10 @@ use mujoco_rs::prelude::MjModel;
 use crate::quat::{self, Quat};
 
 /// A position in m, and an orientation.
-pub(super) type Placed = ([f64; 3], Quat);
+pub type Placed = ([f64; 3], Quat);
 
 /// The poses in the frame of the body `top`: of itself and of the bodies that it carries, where no joint has moved.
-pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
+pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
     let mut frames = vec![None; model.nbody() as usize];
     frames[top] = Some(([0.0; 3], [1.0, 0.0, 0.0, 0.0]));
     // Every body has a higher number than its parent.
@@ -20,7 +20,7 @@ pub(super) fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> 
 }
 
 /// The geoms of the bodies that have a pose, each with its own in the same frame.
-pub(super) fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
+pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
     let placed = |geom: usize| {
         let frame = frames[model.geom_bodyid()[geom] as usize]?;
         Some((geom, inside(frame, model.geom_pos()[geom], model.geom_quat()[geom])))
@@ -29,13 +29,13 @@ pub(super) fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(u
 }
 
 /// A pose that is given in a frame as a pose in the surroundings of that frame.
-pub(super) fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> Placed {
+pub fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> Placed {
     let [x, y, z] = quat::rotate(axes, position);
     ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))
 }
 
 /// Whether a geom can be in a contact.
-pub(super) fn touches(model: &MjModel, geom: usize) -> bool {
+pub fn touches(model: &MjModel, geom: usize) -> bool {
     let pairs = [model.pair_geom1(), model.pair_geom2()];
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0

@@ -110,7 +110,7 @@ impl Scene {
     }
 
     /// The number of the first body of the tree that a body belongs to.
-    pub(super) fn root_of(&self, body: usize) -> usize {
+    pub fn root_of(&self, body: usize) -> usize {
         self.model.body_rootid()[body] as usize
     }
 

@@ -22,7 +22,7 @@ const FAR: f64 = 10.0;
 const FAR_FOR: u32 = 20;
 
 /// What a rank does besides computing. By default that is nothing.
-pub(super) trait Duties {
+pub trait Duties {
     /// Whether the user asks by a file to stop.
     fn is_stopped_by_file(&self) -> bool {
         false
@@ -50,12 +50,12 @@ pub(super) trait Duties {
 }
 
 /// A rank that only computes.
-pub(super) struct Follower;
+pub struct Follower;
 
 impl Duties for Follower {}
 
 /// The first rank.
-pub(super) struct Lead {
+pub struct Lead {
     report: Report,
     saver: Saver,
     quiet: bool,
@@ -69,7 +69,7 @@ pub(super) struct Lead {
 
 impl Lead {
     /// Prepares the report of a run. A quiet one shows no progress.
-    pub(super) fn new(session: &Session, saver: Saver, quiet: bool) -> Self {
+    pub fn new(session: &Session, saver: Saver, quiet: bool) -> Self {
         let config = &session.config;
         let tags = tags(config.randomization.happens());
         let progress = StatusLine::new(session.agent.env_steps, config.run.total_steps, quiet);
@@ -85,12 +85,12 @@ impl Lead {
     ///
     /// # Errors
     /// Fails if the folder cannot be written to. It is then cleared.
-    pub(super) fn open_folder(&mut self) -> Result<()> {
+    pub fn open_folder(&mut self) -> Result<()> {
         self.saver.open_folder(&mut self.report).inspect_err(|_| self.give_back())
     }
 
     /// Clears the folder of a run that could not begin.
-    pub(super) fn give_back(&self) {
+    pub fn give_back(&self) {
         self.saver.give_back();
     }
 
@@ -118,7 +118,7 @@ impl Lead {
     ///
     /// # Errors
     /// Fails as the run has, or if the run folder cannot be written to.
-    pub(super) fn end(mut self, session: &Session, ended: Result<Option<Stop>>) -> Result<ExitCode> {
+    pub fn end(mut self, session: &Session, ended: Result<Option<Stop>>) -> Result<ExitCode> {
         if !matches!(ended, Ok(Some(_))) {
             self.report.end(ended.is_ok());
         }

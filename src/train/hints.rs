@@ -27,7 +27,7 @@ const WITHOUT_EFFECT: [(&str, &str, f64); 6] = [
 ];
 
 /// The notes about these settings, compared with the `default`, for a scene of this size in bytes.
-pub(super) fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) -> Vec<String> {
+pub fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) -> Vec<String> {
     let mut hints = Vec::from_iter(of_ramps(config));
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {

@@ -11,7 +11,7 @@ use crate::os::Requests;
 
 /// Why a run ends before all its steps are made.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Stop {
+pub struct Stop {
     /// Whether the user has asked for it by a file.
     pub by_file: bool,
     /// The signal that has asked for it, or 0.
@@ -20,14 +20,14 @@ pub(super) struct Stop {
 
 impl Stop {
     /// The stop that these requests ask for.
-    pub(super) fn by_signal(requests: &Requests) -> Self {
+    pub fn by_signal(requests: &Requests) -> Self {
         Self { by_file: false, signal: requests.signal() }
     }
 }
 
 /// What follows an iteration.
 #[derive(Debug, Default)]
-pub(super) struct Decision {
+pub struct Decision {
     /// Whether to save, although the run goes on.
     pub save: bool,
     /// Whether the state is handed to the saver. If nobody else waits, it always is: the next iteration may be cut short.
@@ -52,7 +52,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails if the weights differ.
-    pub(super) fn decide(&self, requests: &Requests, by_file: bool, improved: bool) -> Result<Decision> {
+    pub fn decide(&self, requests: &Requests, by_file: bool, improved: bool) -> Result<Decision> {
         let exchange = &self.agent.exchange;
         // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
@@ -76,7 +76,7 @@ impl Session {
     }
 
     /// The steps that led to each divergence, as files with these names and texts.
-    pub(super) fn dumps(&mut self) -> Vec<(String, String)> {
+    pub fn dumps(&mut self) -> Vec<(String, String)> {
         if !self.dumps {
             return Vec::new();
         }

@@ -8,7 +8,7 @@ use crate::run::{self, Descriptions, Histogram, histogram};
 use crate::tags::tag;
 
 /// The scores of the episodes that ended in an iteration.
-pub(super) struct Ended {
+pub struct Ended {
     /// The score of the episodes of the task as it is.
     pub nominal: Score,
     /// The score of the randomised episodes, if the training run has such.
@@ -17,13 +17,13 @@ pub(super) struct Ended {
 
 impl Ended {
     /// Computes the scores of `episodes` with control steps of `ctrl_dt` seconds, in a training run with or without randomised ones.
-    pub(super) fn new(episodes: &[EpisodeStats], ctrl_dt: f64, randomizes: bool) -> Self {
+    pub fn new(episodes: &[EpisodeStats], ctrl_dt: f64, randomizes: bool) -> Self {
         let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
         Self { nominal: Score::of(&nominal, ctrl_dt), randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)) }
     }
 
     /// The score to show: the score of the task as it is, if such episodes ended.
-    pub(super) fn shown(&self) -> &Score {
+    pub fn shown(&self) -> &Score {
         self.randomized.as_ref().filter(|_| self.nominal.episodes == 0).unwrap_or(&self.nominal)
     }
 }
@@ -31,7 +31,7 @@ impl Ended {
 /// The values of an iteration by name, always the same names in the same order. They cover the episodes that ended in
 /// it, all its steps, the lesson and the evaluation (a score of no episodes if there was none). Then come the update and the
 /// timings, with the traffic of the exchange.
-pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
+pub fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     let Outcome { iteration, steps, evaluation, traffic, .. } = outcome;
     let mut row = Vec::new();
     let mut put = |group: &str, values: &mut dyn Iterator<Item = (&'static str, f64)>| {
@@ -53,7 +53,7 @@ pub(super) fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
 }
 
 /// The names of the values of any iteration, in a training run with or without randomised episodes.
-pub(super) fn tags(randomizes: bool) -> Vec<String> {
+pub fn tags(randomizes: bool) -> Vec<String> {
     let traffic = Exchange::alone(1).take_traffic();
     let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], 0.0, randomizes));
     empty.into_iter().map(|(name, _)| name).collect()
@@ -64,13 +64,13 @@ const ACTIONS: &str = "histogram/actions";
 const ADVANTAGES: &str = "histogram/advantages";
 
 /// The values with these names and all other things that are logged, with their descriptions.
-pub(super) fn described(names: &[String]) -> Descriptions {
+pub fn described(names: &[String]) -> Descriptions {
     let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
     all.map(|name| (name.to_owned(), tag(name).map(|known| known.description).unwrap_or_default())).collect()
 }
 
 /// The histograms of the rollout that was just learnt from.
-pub(super) fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
+pub fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
     let all = |of: fn(&RolloutBlock) -> &[f32]| histogram(rollout.blocks.iter().flat_map(of));
     vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
 }

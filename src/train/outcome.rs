@@ -7,7 +7,7 @@ use crate::run::Histogram;
 
 /// The results of one iteration, of all ranks unless stated otherwise.
 #[derive(Debug, Default)]
-pub(super) struct Outcome {
+pub struct Outcome {
     /// The record of the iteration on this rank.
     pub iteration: Iteration<Lesson>,
     /// The episodes that ended.

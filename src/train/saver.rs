@@ -18,7 +18,7 @@ use crate::sim;
 ///
 /// Nothing in the folder of a resumed run is changed before the first iteration is done. Until then, a user who named the wrong
 /// run or checkpoint can stop.
-pub(super) struct Saver {
+pub struct Saver {
     /// What is to be saved, and where.
     pub held: Held,
     lock: Option<Locked>,
@@ -30,7 +30,7 @@ pub(super) struct Saver {
 
 /// What is to be saved, and where.
 #[derive(Clone)]
-pub(super) struct Held {
+pub struct Held {
     /// The run folder.
     pub folder: RunFolder,
     keep: usize,
@@ -50,7 +50,7 @@ pub(super) struct Held {
 impl Saver {
     /// Creates the saver of a training run with these options and settings at its `initial` state, which may be the newest checkpoint
     /// in the folder.
-    pub(super) fn new(
+    pub fn new(
         (folder, lock): (RunFolder, Locked),
         args: &TrainArgs,
         config: &Config,
@@ -71,7 +71,7 @@ impl Saver {
     }
 
     /// Keeps the state at the end of another iteration, to save it. If its best evaluation has changed, it is itself the best checkpoint.
-    pub(super) fn keep(&mut self, last: Checkpoint) {
+    pub fn keep(&mut self, last: Checkpoint) {
         let is_best = last.progress.best != self.held.last.progress.best;
         self.held.last = Arc::new(last);
         if is_best {
@@ -87,7 +87,7 @@ impl Saver {
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
-    pub(super) fn open_folder(&mut self, report: &mut Report) -> Result<()> {
+    pub fn open_folder(&mut self, report: &mut Report) -> Result<()> {
         if self.held.wrote {
             return Ok(());
         }
@@ -115,12 +115,12 @@ impl Saver {
     }
 
     /// Releases the folder after a training run that has ended normally. After any other end, the name stays in the lock file.
-    pub(super) fn release(&mut self) {
+    pub fn release(&mut self) {
         self.lock.take().into_iter().for_each(Locked::release);
     }
 
     /// Clears the folder of a run that could not begin, unless it belongs to another training run by now.
-    pub(super) fn give_back(&self) {
+    pub fn give_back(&self) {
         if self.lock.as_ref().is_some_and(Locked::holds) {
             self.held.folder.clear();
         }
@@ -139,7 +139,7 @@ impl Saver {
     ///
     /// # Errors
     /// Fails if the folder cannot be written to.
-    pub(super) fn save(&mut self, report: &mut Report) -> Result<()> {
+    pub fn save(&mut self, report: &mut Report) -> Result<()> {
         if !self.lock.as_ref().is_some_and(Locked::holds) {
             // The folder was deleted: create it again, unless another training run has done so.
             self.lock = Some(self.held.folder.claim(self.held.folder.lock()?)?);
@@ -153,7 +153,7 @@ impl Saver {
     }
 
     /// Saves, and prints a warning if that is not possible now.
-    pub(super) fn save_or_warn(&mut self, report: &mut Report) {
+    pub fn save_or_warn(&mut self, report: &mut Report) {
         if let Err(error) = self.save(report) {
             report.progress.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
         }
@@ -164,7 +164,7 @@ impl Saver {
     ///
     /// # Errors
     /// Fails if the folder cannot be written to. The message states where the state is instead.
-    pub(super) fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
+    pub fn save_at_last(&mut self, report: &mut Report) -> Result<()> {
         let iteration = |state: &Checkpoint| state.progress.iteration;
         let is_new = self.held.wrote || iteration(&self.held.last) > iteration(&self.initial);
         let saved = if is_new { self.save(report) } else { Ok(()) };
@@ -197,7 +197,7 @@ impl Saver {
 
 impl Held {
     /// The progress of the training run as text.
-    pub(super) fn steps_made(&self) -> String {
+    pub fn steps_made(&self) -> String {
         format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
     }
 
@@ -208,7 +208,7 @@ impl Held {
     }
 
     /// Saves the state elsewhere after it could not be saved in its folder for this `reason`. Returns an error for both.
-    pub(super) fn elsewhere(&self, reason: Error) -> Error {
+    pub fn elsewhere(&self, reason: Error) -> Error {
         let saved = RunFolder::for_now().and_then(|run| match self.write(&run, 1) {
             Ok(()) => Ok(run),
             Err(error) => {
@@ -231,7 +231,7 @@ impl Held {
     }
 
     /// The command that resumes the run in this folder with the same options.
-    pub(super) fn how_to_resume(&self, run: &RunFolder) -> String {
+    pub fn how_to_resume(&self, run: &RunFolder) -> String {
         format!("{} train --resume {}{}", os::called_as(), os::quoted_path(&run.path), self.options)
     }
 }
@@ -239,7 +239,7 @@ impl Held {
 /// The score (goals per episode, rotation error in rad) that an evaluation must beat in a resumed run. It is the score
 /// of the best checkpoint in the folder. If that is lost, the score of the policy that was made from it counts, else the score
 /// in the resumed checkpoint.
-pub(super) fn best_so_far(folder: &RunFolder, resumed: Option<[f64; 2]>) -> Option<[f64; 2]> {
+pub fn best_so_far(folder: &RunFolder, resumed: Option<[f64; 2]>) -> Option<[f64; 2]> {
     let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
     score(&folder.checkpoints.best()).or_else(|| score(&folder.policy())).or(resumed)
 }

@@ -18,7 +18,7 @@ use crate::run::{self, RunFolder};
 use crate::sim;
 
 /// Everything that a training run owns, except its saver.
-pub(super) struct Session {
+pub struct Session {
     /// The settings of the run.
     pub config: Config,
     /// The task that is trained.
@@ -42,7 +42,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails as [`Plan::of`] and [`Session::new`] do, or if the run folder cannot be created.
-    pub(super) fn lead(args: &TrainArgs, exchange: &Exchange) -> Result<(Self, Saver)> {
+    pub fn lead(args: &TrainArgs, exchange: &Exchange) -> Result<(Self, Saver)> {
         if let (Some(folder), Some(init)) = (&args.run_dir, &args.init) {
             run::expect_other_policy(folder, init)?;
         }
@@ -61,7 +61,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails as [`Plan::receive`] and [`Session::new`] do.
-    pub(super) fn follow(exchange: &Exchange) -> Result<Self> {
+    pub fn follow(exchange: &Exchange) -> Result<Self> {
         sim::before_fatal_error(|said| say!("error: {said}"));
         let session = Self::set_up(Plan::receive(exchange)?, exchange)?;
         // Together with the state that the saver begins with.
@@ -89,7 +89,7 @@ impl Session {
     ///
     /// # Errors
     /// Fails if the precision cannot be used, or if it cannot start from what is planned.
-    pub(super) fn new(plan: Plan, (task, hand): (Arc<Task>, Record), exchange: Exchange) -> Result<Self> {
+    pub fn new(plan: Plan, (task, hand): (Arc<Task>, Record), exchange: Exchange) -> Result<Self> {
         let Plan { mut config, from, best, context, dumps } = plan;
         let set_up = || {
             // As it is saved.
@@ -126,7 +126,7 @@ impl Session {
     }
 
     /// The complete state at the end of the last iteration.
-    pub(super) fn checkpoint(&self) -> Checkpoint {
+    pub fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = Checkpoint::default();
         self.agent.save(&mut checkpoint);
         checkpoint.progress.best = self.best;
@@ -138,12 +138,12 @@ impl Session {
     }
 
     /// Whether all steps are made, or evaluations no longer rise.
-    pub(super) fn finished(&self) -> bool {
+    pub fn finished(&self) -> bool {
         self.agent.env_steps >= self.config.run.total_steps || self.is_flat()
     }
 
     /// Whether the run ends because evaluations no longer rise.
-    pub(super) fn is_flat(&self) -> bool {
+    pub fn is_flat(&self) -> bool {
         self.rise.is_some_and(|rise| rise.since >= self.config.run.patience)
     }
 }

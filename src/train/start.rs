@@ -19,7 +19,7 @@ use crate::repose::{Record, Task};
 use crate::run::{self, RunFolder};
 
 /// The settings of a training run and what it starts from.
-pub(super) struct Plan {
+pub struct Plan {
     /// The settings of the run.
     pub config: Config,
     /// The checkpoint that it starts from, and what it takes from it. Without one, it starts from random weights.
@@ -34,7 +34,7 @@ pub(super) struct Plan {
 
 /// What a training run takes from the checkpoint that it starts from.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) enum Takes {
+pub enum Takes {
     /// The policy. Everything else is as in any new run.
     Policy,
     /// The whole state.
@@ -44,7 +44,7 @@ pub(super) enum Takes {
 }
 
 /// The folder of a run that is resumed, the lock on it, and whether the checkpoint that is resumed is the newest one.
-pub(super) type Existing = ((RunFolder, Locked), bool);
+pub type Existing = ((RunFolder, Locked), bool);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
 type PlanParts = (String, Option<(Takes, Vec<u8>)>, Option<[f64; 2]>, Option<String>, bool);
@@ -54,7 +54,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails as [`Plan::new_run`], [`Plan::resume`] and [`Plan::fork`] do.
-    pub(super) fn of(args: &TrainArgs) -> Result<(Self, Option<Existing>)> {
+    pub fn of(args: &TrainArgs) -> Result<(Self, Option<Existing>)> {
         match (&args.resume, &args.fork) {
             (Some(place), _) => Self::resume(place.as_deref(), args).map(|(plan, existing)| (plan, Some(existing))),
             (None, Some(place)) => Self::fork(place, args).map(|plan| (plan, None)),
@@ -67,7 +67,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails if the scene does not exist.
-    pub(super) fn new(mut config: Config, args: &TrainArgs) -> Result<Self> {
+    pub fn new(mut config: Config, args: &TrainArgs) -> Result<Self> {
         if let Some(model) = config.env.model_file() {
             let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
             config.env.model = model.display().to_string();
@@ -167,7 +167,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails if the scene cannot be used, or if the policy is for another hand.
-    pub(super) fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
+    pub fn load_task(&mut self) -> Result<(Arc<Task>, Record)> {
         let load = || {
             let config = &self.config;
             let task = Task::new(config)?;
@@ -189,7 +189,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails if a value in the checkpoint is not finite.
-    pub(super) fn send(&self, exchange: &Exchange) -> Result<()> {
+    pub fn send(&self, exchange: &Exchange) -> Result<()> {
         if !exchange.is_alone() {
             let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| checkpoint.to_bytes().map(|bytes| (*takes, bytes));
             let config = self.config.to_text();
@@ -203,7 +203,7 @@ impl Plan {
     ///
     /// # Errors
     /// Fails if the sender runs another version of the program.
-    pub(super) fn receive(exchange: &Exchange) -> Result<Self> {
+    pub fn receive(exchange: &Exchange) -> Result<Self> {
         let (config, from, best, context, dumps) = exchange.broadcast::<PlanParts>(None);
         let config = Settings::new().file(Source::new("the settings that were sent", config)).resolve()?;
         let from = from.map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));

@@ -3,7 +3,7 @@
 use ab_glyph::{Font, FontRef, OutlinedGlyph, PxScale, ScaleFont, point};
 
 /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
-pub(super) fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
+pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     // All letters of this font have the same width.
     let font = FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR).expect("the font is part of the program");
     let [width, height] = size.map(|pixels| pixels as usize);

@@ -12,4 +12,4 @@ pub struct FilmFormat {
 }
 
 /// Frames `[height, width, 3]` for an encoder, which takes them one by one.
-pub(super) type Frames<'a> = &'a mut dyn Iterator<Item = Vec<u8>>;
+pub type Frames<'a> = &'a mut dyn Iterator<Item = Vec<u8>>;

@@ -21,7 +21,7 @@ const PIXELS_FOR_PALETTE: usize = 400_000;
 ///
 /// # Errors
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
-pub(super) fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
+pub fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
     let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
     let mut palette = Palette::new(&waiting);

@@ -26,7 +26,7 @@ const KEY_FRAME_EVERY: u32 = 2;
 /// # Errors
 /// Fails if the encoder cannot be started or skips a frame, if there are more frames than announced, or if the file cannot be
 /// written.
-pub(super) fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Result<()> {
+pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Result<()> {
     let size = (format.size[0] as usize, format.size[1] as usize);
     let mut encoder = encoder(format.fps)?;
     let mut yuv = YUVBuffer::new(size.0, size.1);

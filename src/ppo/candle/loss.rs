@@ -6,7 +6,7 @@ use super::super::backend::Losses;
 use crate::config::PpoConfig;
 
 /// The data of a minibatch.
-pub(super) struct Batch {
+pub struct Batch {
     /// `[M, O]`: as the nets see them
     pub observations: Tensor,
     /// `[M, A]`
@@ -58,7 +58,7 @@ impl Batch {
 ///
 /// # Errors
 /// Fails if the shapes do not match.
-pub(super) fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: &Tensor) -> Result<(Tensor, Losses)> {
+pub fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: &Tensor) -> Result<(Tensor, Losses)> {
     let ratios = (batch.log_prob(means)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;

@@ -19,7 +19,7 @@ use crate::spaces::Spaces;
 use loss::Batch;
 
 /// The gradient backend in candle.
-pub(super) struct Reference {
+pub struct Reference {
     /// Its settings.
     pub config: PpoConfig,
 }

@@ -46,7 +46,7 @@ fn tanh(x: f32) -> f32 {
 }
 
 /// Adds `bias` `[C]` to each row of `x` `[B, C]`, then applies the activation, if any, in place.
-pub(super) fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
+pub fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
     match activation {
         None => each_row(x, bias, |x, b| x + b),
         Some(Activation::Elu) => each_row(x, bias, |x, b| elu(x + b)),
@@ -59,7 +59,7 @@ pub(super) fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activatio
 /// `sums` `[C]`.
 ///
 /// `outputs` `[B, C]` are the outputs of the activation, which determine its derivatives.
-pub(super) fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
+pub fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
     match activation {
         None => each_and_sum(grad, outputs, sums, |g, _| g),
         Some(Activation::Elu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),

@@ -21,7 +21,7 @@ struct Tiles(());
 ///
 /// # Errors
 /// Fails if the tiles are missing or may not be used. The message says which.
-pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
+pub fn request() -> Result<&'static dyn Unit, &'static str> {
     const OSXSAVE: u32 = 1 << 27;
     const BF16_AND_TILE: u32 = 1 << 22 | 1 << 24;
     const TILE_STATE: u64 = 0b11 << 17;

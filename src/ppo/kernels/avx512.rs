@@ -24,7 +24,7 @@ struct Dots(());
 ///
 /// # Errors
 /// Fails if it does not have them.
-pub(super) fn request() -> Result<&'static dyn Unit, &'static str> {
+pub fn request() -> Result<&'static dyn Unit, &'static str> {
     let there = std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512bf16");
     if there { Ok(&Dots(())) } else { Err("it has no bf16 dot products (AVX-512 BF16)") }
 }

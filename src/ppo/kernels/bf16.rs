@@ -4,19 +4,19 @@ use super::product::Matrix;
 use super::widest::widest;
 
 /// Lines in a tile. The lines of an operand are the rows of the left matrix or the columns of the right one.
-pub(super) const LINES: usize = 16;
+pub const LINES: usize = 16;
 
 /// Values of each line in a tile.
-pub(super) const DEPTH: usize = 32;
+pub const DEPTH: usize = 32;
 
 /// A tile, at the start of a cache line.
 #[derive(Clone)]
 #[repr(C, align(64))]
-pub(super) struct Tile(pub [u16; LINES * DEPTH]);
+pub struct Tile(pub [u16; LINES * DEPTH]);
 
 /// Rounds to the nearest bf16, ties to even. NaN stays NaN.
 #[inline(always)]
-pub(super) fn round(x: f32) -> u16 {
+pub fn round(x: f32) -> u16 {
     let bits = x.to_bits();
     let rounded = bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16;
     if x.is_nan() { 0x7fc0 } else { rounded as u16 }
@@ -24,12 +24,12 @@ pub(super) fn round(x: f32) -> u16 {
 
 /// Rounds to the nearest bf16, returned as f32.
 #[inline(always)]
-pub(super) fn rounded(x: f32) -> f32 {
+pub fn rounded(x: f32) -> f32 {
     f32::from_bits(u32::from(round(x)) << 16)
 }
 
 /// Rows and columns of a product that are computed together: two by two tiles.
-pub(super) const BLOCK: usize = 2 * LINES;
+pub const BLOCK: usize = 2 * LINES;
 
 /// A unit of the processor that multiplies bf16 matrices. A value proves that the unit is there and may be used.
 pub trait Unit: Sync {
@@ -51,7 +51,7 @@ pub trait Unit: Sync {
 ///
 /// # Panics
 /// Panics if the sizes do not match.
-pub(super) fn in_blocks<F>(out: &mut [f32], columns: usize, [lhs, rhs]: [&Packed; 2], add: bool, multiply: F)
+pub fn in_blocks<F>(out: &mut [f32], columns: usize, [lhs, rhs]: [&Packed; 2], add: bool, multiply: F)
 where
     F: Fn(&mut [f32], usize, [&[Tile]; 2], bool),
 {
@@ -104,7 +104,7 @@ pub struct Packed {
     /// The number of tiles along a line.
     depth: usize,
     /// The order of the values in a tile.
-    pub(super) order: Order,
+    pub order: Order,
 }
 
 impl Packed {
@@ -114,11 +114,7 @@ impl Packed {
     }
 
     /// Makes room for the same. Each of the jobs packs a part of it.
-    pub(super) fn jobs<'a>(
-        &'a mut self,
-        matrix: Matrix<'a>,
-        order: Order,
-    ) -> impl Iterator<Item = impl FnOnce() + Send + 'a> {
+    pub fn jobs<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = impl FnOnce() + Send + 'a> {
         let [lines, numbers] = matrix.size();
         self.depth = numbers.div_ceil(DEPTH);
         self.order = order;

@@ -21,4 +21,4 @@ pub(super) use product::Matrix;
 pub(super) use widest::widest;
 
 /// Rows that pass through a net together: enough for fast products, few enough for the cache of one core.
-pub(super) const ROWS: usize = 256;
+pub const ROWS: usize = 256;

@@ -58,7 +58,7 @@ impl<'a> Matrix<'a> {
 ///
 /// # Panics
 /// Panics if the sizes do not match.
-pub(super) fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
+pub fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
     let [m, k] = lhs.size;
     let [rhs_rows, n] = rhs.size;
     assert_eq!(k, rhs_rows, "columns of the first and rows of the second matrix");

@@ -28,7 +28,7 @@ fn dots() -> Answer<&'static str> {
 ///
 /// # Errors
 /// Fails if no unit is present, permitted and correct. The message gives the reason for each unit.
-pub(super) fn request() -> Result<&'static dyn Unit> {
+pub fn request() -> Result<&'static dyn Unit> {
     static ANSWER: OnceLock<Answer<String>> = OnceLock::new();
     let answer = ANSWER.get_or_init(|| {
         checked(tiles(), "the tiles (AMX) of this processor multiply wrongly").or_else(|no_tiles| {

@@ -14,7 +14,7 @@ impl Repose {
     }
 
     /// Records what the rewards of a step depend on, after its physics.
-    pub(super) fn measure(&mut self, rot_dist_before: f64) {
+    pub fn measure(&mut self, rot_dist_before: f64) {
         let object = self.object();
         let object_velocity = self.object_velocity();
         let task = &self.task;
@@ -47,7 +47,7 @@ impl Repose {
     }
 
     /// Writes the observation of the current state as the policy sees it: mirrored, if its hand is on the other side.
-    pub(super) fn show(&self, observation: &mut [f32]) {
+    pub fn show(&self, observation: &mut [f32]) {
         self.observe(observation);
         if let Some(mirror) = &self.task.mirror {
             mirror.apply(observation);
