@@ -49,7 +49,7 @@ pub enum Actor<'a> {
 pub type Outside<'a> = dyn Fn(&[f32], &mut [f32]) + Sync + 'a;
 
 /// A set of episodes.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Episodes {
     /// Episode k is drawn from (seed, purpose, k).
     pub seed: u64,

@@ -23,7 +23,7 @@ pub struct GoalTimes {
 }
 
 /// A goal of an episode.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 struct Goal {
     /// Once reached, the control steps that it took. Before that, the step of the episode at which it was given.
     steps: u32,

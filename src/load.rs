@@ -17,7 +17,6 @@ use crate::repose::{Record, Task};
 use crate::run;
 
 /// A policy that is built into the program.
-#[derive(Debug, PartialEq, Eq)]
 pub struct BuiltIn {
     /// The name that is accepted in place of a file or a run.
     name: &'static str,
@@ -45,7 +44,6 @@ static BUILTIN: [BuiltIn; 2] = [
 ];
 
 /// The source of a policy.
-#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PolicySource {
     /// A policy that is built into the program.
     BuiltIn(&'static BuiltIn),

@@ -37,7 +37,7 @@ const FRICTIONS: [&str; 4] = ["0.5", "0.7", "1.0", "1.3"];
 const MASSES: [&str; 3] = ["0.5", "1.0", "2.0"];
 
 /// A row of the table: what is changed.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone)]
 struct Condition {
     name: String,
     sets: Vec<Override>,

@@ -4,7 +4,6 @@
 use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, task_terms, training_terms};
 
 /// A logged quantity.
-#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tag {
     /// What it is, in a few words, with its unit in brackets if it has one.
     pub title: String,

@@ -302,7 +302,7 @@ pub struct ViewArgs {
 }
 
 /// The options for what is seen.
-#[derive(Args, Clone)]
+#[derive(Args)]
 pub struct ShotArgs {
     /// Viewing direction in degrees and distance in m, e.g. 150,-27,0.66
     #[arg(long, value_name = "AZIMUTH,ELEVATION,DISTANCE", value_parser = camera, allow_hyphen_values = true, help_heading = PICTURE)]

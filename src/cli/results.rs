@@ -36,7 +36,7 @@ pub struct PlotArgs {
 }
 
 /// The quantity on the x axis of a learning curve.
-#[derive(Clone, Copy, PartialEq, ValueEnum)]
+#[derive(Clone, Copy, ValueEnum)]
 pub enum Along {
     /// Control steps over all environments
     Steps,

@@ -16,7 +16,7 @@ use crate::os;
 pub const MODEL: &str = "env.model";
 
 /// One `--set key=value`.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone)]
 pub struct Override {
     /// The dotted key, e.g. `ppo.learning_rate`.
     pub key: String,
@@ -110,7 +110,7 @@ pub fn scene_option(env: &EnvConfig) -> String {
 }
 
 /// Where settings come from: the base, over it what a run has written, then the user's file, then single settings.
-#[derive(Clone, Default)]
+#[derive(Default)]
 pub struct Settings {
     stored: Option<(Source, Reader)>,
     file: Option<Source>,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::file::read_bytes;
 
 /// A machine, and what this process may use of it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct Machine {
     /// Its name in the network.
     pub name: String,

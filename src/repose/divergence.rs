@@ -8,7 +8,6 @@ use crate::config::EnvConfig;
 use crate::sim::Simulation;
 
 /// The end of an episode whose physics diverged.
-#[derive(Clone, Debug)]
 pub struct Diverged {
     /// The length of the episode in control steps, including the last one.
     pub length: u32,
@@ -61,7 +60,7 @@ pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
 const STEPS: usize = 16;
 
 /// The data needed to replay the end of an episode in any MuJoCo.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Tail {
     /// The state before the first of these steps.
     pub start: Box<[f64]>,
@@ -78,7 +77,7 @@ pub struct Tail {
 }
 
 /// The steps since the second-to-last kept state: at least the last 16 if the episode has that many.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Recorder {
     before: Option<Tail>,
     now: Option<Tail>,

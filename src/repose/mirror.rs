@@ -12,7 +12,7 @@ use crate::quat::{self, Quat};
 const TOLERANCE: f64 = 1e-4;
 
 /// Turns observations of a hand into observations of its mirror image.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone)]
 pub struct Mirror {
     /// The values that change their sign, by index.
     signs: Vec<usize>,

@@ -5,7 +5,7 @@ use crate::spaces::{ObjectAndGoal, Spaces};
 use Sensing::{Known, Measured};
 
 /// A group of consecutive values in an observation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 pub struct Group {
     /// The name of the group.
     pub name: &'static str,
@@ -21,7 +21,7 @@ pub struct Group {
 }
 
 /// Where the values of a group come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq)]
 pub enum Sensing {
     /// Sensors, which may have noise and offsets.
     Measured,
@@ -42,7 +42,7 @@ pub const RELATIVE_QUAT: usize = 8;
 pub const TIPS: usize = 9;
 
 /// The layout of the observations of a hand.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 pub struct Layout {
     /// All groups in order. Positions and velocities are in the world frame. Quaternions are w,x,y,z. Except for the
     /// fingertips, they have w ≥ 0.

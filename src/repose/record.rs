@@ -18,7 +18,7 @@ const LONGEST: usize = 1 << 16;
 const POSES: [[f64; 3]; 2] = [[0.3, 0.5, 0.6], [0.7, 0.2, 0.4]];
 
 /// A hand and an object, by what a policy depends on. Lists are in the orders of observations and actions.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Serialize, Deserialize)]
 pub struct Record {
     /// The names of the joints.
     pub joints: Vec<String>,

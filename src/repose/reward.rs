@@ -44,7 +44,7 @@ pub struct Step {
 }
 
 /// The description of a quantity for a reader: its name in columns, tags and JSON, and what it is, in a sentence.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 pub struct Description(pub &'static str, pub &'static str);
 
 /// A term of the task's reward, and its value in a step.

@@ -12,7 +12,7 @@ use super::{EpisodeStats, TaskReward, add, named, task_terms};
 use crate::os::number;
 
 /// Which values of a measure are better.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 pub enum Better {
     /// The higher ones.
     Higher,
@@ -175,7 +175,7 @@ impl Played<'_> {
 }
 
 /// The measures of finished episodes, `NaN` where there is nothing to average. It is indexed by their columns.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Score {
     /// The number of episodes.
     pub episodes: usize,

@@ -10,7 +10,7 @@ use crate::quat::{self, Quat};
 use crate::rng::Rng;
 
 /// The standard deviations of what is added to each value of an observation, by index, where they are not 0.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct NoiseStd(Vec<(usize, f32)>);
 
 impl NoiseStd {

@@ -11,7 +11,6 @@ use super::folder::{CONFIG, FINISHED, METRICS, RUNS};
 use crate::os::{Cannot, Hold, LOCK};
 
 /// The files of a run.
-#[derive(Clone)]
 pub struct Glance {
     /// When its settings were written or, without settings, when its folder was last changed.
     pub begun: Option<SystemTime>,

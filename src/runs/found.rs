@@ -20,7 +20,7 @@ const SILENT: Duration = Duration::from_secs(120);
 const LONGEST_NAME: usize = 40;
 
 /// Where a run stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum RunState {
     /// A training run writes into it.
     Training,
@@ -33,7 +33,6 @@ pub enum RunState {
 }
 
 /// A run as it is shown.
-#[derive(Clone, Debug)]
 pub struct Run {
     pub path: PathBuf,
     pub name: String,
@@ -48,7 +47,7 @@ pub struct Run {
 }
 
 /// The figures in the table of a run, NaN where it has none.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Figures {
     /// The stamp of the table that they were read from.
     stamp: Option<Stamp>,

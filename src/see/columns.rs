@@ -162,7 +162,6 @@ impl Columns {
 }
 
 /// What a page says of all that it shows.
-#[derive(Clone, Debug)]
 pub struct About {
     /// What is shown, in a few words.
     pub title: String,

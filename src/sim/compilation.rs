@@ -25,7 +25,7 @@ pub const VISUAL: i32 = 2;
 pub const BUILTIN: &str = include_str!("../../assets/shadow_hand/scene.xml");
 
 /// The shape of friction cones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Cone {
     /// The cones that the scene sets.
@@ -37,7 +37,7 @@ pub enum Cone {
 }
 
 /// How a scene is compiled.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone)]
 pub struct Compilation {
     /// The physics timestep, s.
     pub timestep: f64,

@@ -17,7 +17,7 @@ pub const HIDDEN: i32 = 3;
 const MILLIMETRE: f64 = 1e-3;
 
 /// Meshes that are shown over the primitives of some bodies.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Dress {
     /// The beginning of the names of the bodies whose primitives are hidden.
     pub bodies: String,
@@ -28,7 +28,7 @@ pub struct Dress {
 }
 
 /// A mesh on a body.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Piece {
     /// The name of the body.
     pub body: String,
@@ -41,7 +41,7 @@ pub struct Piece {
 }
 
 /// The rendering quality of pictures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq)]
 pub enum Quality {
     /// No shadows, reflections or anti-aliasing: many pictures per second even without a graphics card.
     Fast,
@@ -50,7 +50,7 @@ pub enum Quality {
 }
 
 /// The position of a camera on a sphere around the scene's centre, which it looks at.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Serialize)]
 pub struct Camera {
     /// Viewing direction around the vertical, degrees (0 is along +x).
     pub azimuth: f64,
@@ -61,7 +61,7 @@ pub struct Camera {
 }
 
 /// The look of a scene.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Look {
     /// Meshes for the built-in scene. Without them its primitives are shown.
     pub dress: Option<Dress>,

@@ -27,7 +27,7 @@ pub struct Scene {
 }
 
 /// A hinge joint with limits.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub struct Hinge {
     /// Index of its angle in `qpos`.
     pub qpos: usize,
@@ -38,7 +38,7 @@ pub struct Hinge {
 }
 
 /// A free joint: position and orientation w,x,y,z from `qpos`, linear (world) and angular (body frame) velocity from `dof`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub struct FreeJoint {
     /// The body that it moves.
     pub body: Body,
@@ -51,11 +51,11 @@ pub struct FreeJoint {
 }
 
 /// A body.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Body(pub(super) usize);
 
 /// A body or a site, whose pose and velocity can be read.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub enum Frame {
     /// A body.
     Body(Body),
@@ -64,11 +64,11 @@ pub enum Frame {
 }
 
 /// A mocap body, whose pose is set directly, by its number among the mocap bodies.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub struct Mocap(pub usize);
 
 /// An actuator with one control.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub struct Actuator {
     /// Its number.
     pub(super) id: usize,

@@ -11,7 +11,7 @@ use super::{Actuator, Scene};
 use crate::os::shortened;
 
 /// The names of what a task uses in a scene. What is empty is found by structure.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Parts {
     /// The hinges of the hand, in the order of observations.
     pub joints: Vec<String>,

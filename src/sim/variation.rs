@@ -13,7 +13,7 @@ use super::placing::frames_within;
 use super::{Actuator, Body, Hinge, Scene};
 
 /// A change of the physics of a scene.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy)]
 pub enum Change {
     /// The factor on the friction coefficients of every geom and every pair of geoms.
     Friction(f64),

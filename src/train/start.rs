@@ -33,7 +33,7 @@ pub struct Plan {
 }
 
 /// What a training run takes from the checkpoint that it starts from.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Serialize, Deserialize)]
 pub enum Takes {
     /// The policy. Everything else is as in any new run.
     Policy,
