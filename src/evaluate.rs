@@ -315,7 +315,7 @@ impl Actor<'_> {
     fn policy(&self) -> Option<&FrozenPolicy<'_>> {
         match self {
             Actor::Mean(policy) | Actor::Stochastic(policy) => Some(policy),
-            Actor::Zero | Actor::Random | Actor::Wave | Actor::Outside(_) => None,
+            _ => None,
         }
     }
 

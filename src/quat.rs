@@ -46,9 +46,14 @@ pub fn conj([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
 }
 
+/// The length of a vector or quaternion.
+pub fn length(values: &[f64]) -> f64 {
+    values.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
 /// `q`, scaled to length 1.
 pub fn normalized(q: Quat) -> Quat {
-    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let length = length(&q);
     q.map(|x| x / length)
 }
 
@@ -72,7 +77,7 @@ pub fn angle_between(a: Quat, b: Quat) -> f64 {
 /// The axis of a rotation times its angle in rad, which is at most π.
 pub fn rotation_vector(q: Quat) -> [f64; 3] {
     let [w, axis @ ..] = canonical(q);
-    let sine = axis.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let sine = length(&axis);
     let factor = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
     axis.map(|x| factor * x)
 }

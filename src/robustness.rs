@@ -7,7 +7,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
-use crate::config::{EnvConfig, Override};
+use crate::config::Override;
 use crate::draw::{self, BarChart, Picture, PictureFile};
 use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Destination, Requests, number, say};
@@ -53,7 +53,7 @@ impl Condition {
 /// A row of the table with its score.
 struct Scored {
     condition: Condition,
-    config: EnvConfig,
+    task: Arc<Task>,
     score: Score,
     /// The goals as a fraction of the goals without any change.
     kept: f64,
@@ -122,12 +122,12 @@ fn played(
     episodes: Episodes,
     requests: &Requests,
 ) -> Result<Vec<Scored>> {
-    let configs: Vec<EnvConfig> = playable.iter().map(|(_, task)| task.config.clone()).collect();
-    let different = configs.iter().enumerate().filter(|(i, config)| !configs[..*i].contains(config)).count();
+    let is_known = |i: usize, task: &Task| playable[..i].iter().any(|(_, other)| other.config == task.config);
+    let different = playable.iter().enumerate().filter(|(i, (_, task))| !is_known(*i, task)).count();
     let bar = os::progress_bar((different * episodes.count) as u64, "episodes", "robustness");
     let mut rows: Vec<Scored> = Vec::new();
-    for ((condition, task), config) in playable.into_iter().zip(configs) {
-        let known = rows.iter().find(|row| row.config == config).map(|row| row.score);
+    for (condition, task) in playable {
+        let known = rows.iter().find(|row| row.task.config == task.config).map(|row| row.score);
         bar.set_message(condition.name.clone());
         let played = match known {
             Some(known) => Some(known),
@@ -140,7 +140,7 @@ fn played(
         let nominal = rows.first().map_or(score["goals"], |nominal| nominal.score["goals"]);
         // Without any goals there is no fraction.
         let kept = if nominal > 0.0 { score["goals"] / nominal } else { f64::NAN };
-        rows.push(Scored { condition, config, score, kept });
+        rows.push(Scored { condition, task, score, kept });
     }
     Ok(rows)
 }
@@ -236,9 +236,10 @@ mod tests {
     use crate::repose::EpisodeStats;
 
     fn row(condition: Condition, goals: u32, kept: f64) -> Scored {
-        let config = Settings::new().sets(&condition.sets).resolve().unwrap().env;
+        let config = Settings::new().sets(&condition.sets).resolve().unwrap();
+        let task = Task::new(&config).unwrap();
         let episode = EpisodeStats { length: 10, goals, ..Default::default() };
-        Scored { condition, config, score: Score::of(&[episode, episode], 0.01), kept }
+        Scored { condition, task, score: Score::of(&[episode, episode], 0.01), kept }
     }
 
     #[test]

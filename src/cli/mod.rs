@@ -265,6 +265,7 @@ pub struct ExportArgs {
 
 /// The options of `view`.
 #[derive(Args)]
+#[command(next_help_heading = PICTURE)]
 pub struct ViewArgs {
     /// The configuration file and single settings.
     #[command(flatten)]
@@ -277,21 +278,20 @@ pub struct ViewArgs {
     #[arg(long, default_value_t = 0, value_parser = seed(), help_heading = SETTINGS)]
     pub seed: u64,
     /// Write one picture (.png) and exit, without opening a window; needs no display
-    #[arg(long, value_name = "FILE", value_parser = destination(&["png"]), help_heading = PICTURE)]
+    #[arg(long, value_name = "FILE", value_parser = destination(&["png"]))]
     pub out: Option<Destination>,
     /// Show the hand in a browser, with a slider for each actuator, at this port of 127.0.0.1 (0: any free port) [default port:
     /// 7070]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070", help_heading = PICTURE)]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "7070")]
     pub web: Option<u16>,
     /// Time of the picture in the episode, in seconds
-    #[arg(long, value_name = "SECONDS", default_value = "0.5", value_parser = seconds, help_heading = PICTURE)]
+    #[arg(long, value_name = "SECONDS", default_value = "0.5", value_parser = seconds)]
     pub at: f64,
     /// Size of the picture in pixels
-    #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size, help_heading = PICTURE)]
+    #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size)]
     pub size: [u32; 2],
     /// Rendering quality; high adds shadows, reflections and smooth edges
-    #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high",
-        help_heading = PICTURE)]
+    #[arg(long, default_value = "high", value_parser = quality(), hide_possible_values = true, value_name = "fast|high")]
     pub quality: Quality,
     /// Camera and meshes.
     #[command(flatten)]

@@ -8,9 +8,10 @@ use anyhow::{Result, ensure};
 
 use crate::cli::PlayArgs;
 use crate::config::{Override, Settings};
-use crate::evaluate::Actor;
+use crate::evaluate::{Actor, Player};
 use crate::load::Loaded;
 use crate::os::{self, Destination, say};
+use crate::ppo::{FrozenPolicy, Policy};
 use crate::repose::Task;
 use crate::run;
 use crate::see::LiveActor;
@@ -63,12 +64,13 @@ impl Stage {
 
     /// The kinds of actions between which a user may choose, by name.
     pub fn actors(&self) -> Vec<(&'static str, Actor<'_>)> {
+        self.actors_of(Policy::freeze)
+    }
+
+    fn actors_of(&self, freeze: for<'a> fn(&'a Policy) -> FrozenPolicy<'a>) -> Vec<(&'static str, Actor<'_>)> {
         match &self.policy {
             Some(Loaded { policy, .. }) => {
-                vec![
-                    ("deterministic", Actor::Mean(policy.freeze())),
-                    ("stochastic", Actor::Stochastic(policy.freeze())),
-                ]
+                vec![("deterministic", Actor::Mean(freeze(policy))), ("stochastic", Actor::Stochastic(freeze(policy)))]
             }
             None => Actor::WITHOUT_POLICY.into(),
         }
@@ -96,7 +98,11 @@ impl Stage {
     /// The actor of a page that shows this task.
     pub fn acting(self: Rc<Self>, task: Arc<Task>) -> LiveActor {
         let policy = self.loaded().map(|loaded| loaded.name.clone());
-        LiveActor { step: Rc::new(move |player| player.step(&self.actor())), policy, task }
+        let step = move |player: &mut Player| {
+            let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
+            player.step(actor)
+        };
+        LiveActor { step: Rc::new(step), policy, task }
     }
 }
 

@@ -103,7 +103,7 @@ impl Policy {
     }
 
     /// The policy in its current state, for a few calls. It costs nothing, but each product rearranges the weights anew.
-    fn freeze_briefly(&self) -> FrozenPolicy<'_> {
+    pub fn freeze_briefly(&self) -> FrozenPolicy<'_> {
         FrozenPolicy { policy: self, nets: self.plain_nets(), perception: self.perception() }
     }
 

@@ -33,11 +33,6 @@ pub struct Rise {
 }
 
 impl Rise {
-    /// Begins with the evaluation before the first iteration.
-    pub fn new(before: [f64; 3]) -> Self {
-        Self { before, best: before, since: 0 }
-    }
-
     /// Records another evaluation.
     pub fn add(&mut self, figures: [f64; 3]) {
         let of = |[goals, rot_dist, _]: [f64; 3]| [goals, rot_dist];

@@ -40,7 +40,10 @@ impl Conditions {
         let Some(randomization) = &self.randomization else { return };
         sim.change_scene(&randomization.scene_of(self.draw.as_ref(), &task.hand));
         if let Some(draw) = &self.draw {
-            sensing::combine(&mut self.bias, randomization.draw_bias(draw, rng).into_iter());
+            if draw.has_bias {
+                let rng = &mut rng::beside(rng, "bias of randomization");
+                sensing::combine(&mut self.bias, randomization.bias.draw(rng));
+            }
         }
     }
 

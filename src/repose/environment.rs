@@ -45,7 +45,8 @@ pub struct Repose {
     /// The sums since they were last taken.
     sums: StepSums,
     recorder: Recorder,
-    diverged: Option<Diverged>,
+    /// The last episode that has diverged, until somebody takes it.
+    pub diverged: Option<Diverged>,
 }
 
 impl Repose {
@@ -94,11 +95,6 @@ impl Repose {
     /// The sums since the last call.
     pub fn take_sums(&mut self) -> StepSums {
         std::mem::take(&mut self.sums)
-    }
-
-    /// The last episode that has diverged since the last call.
-    pub fn take_diverged(&mut self) -> Option<Diverged> {
-        self.diverged.take()
     }
 
     fn draw_rotation(&mut self) -> Quat {
@@ -280,17 +276,6 @@ impl Env for Repose {
     }
 }
 
-impl Repose {
-    fn restore_times(&mut self, [age, held]: [u64; 2]) -> Result<()> {
-        // `age` has no tighter limit: a fork may have shorter episodes.
-        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
-        self.age = age as u32;
-        self.held = held as u32;
-        Ok(())
-    }
-}
-
 impl Resumable for Repose {
     fn save(&self, state: &mut EnvState) {
         state.counters.extend(rng::position(&self.rng));
@@ -307,7 +292,12 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        self.restore_times(state.counters()?)?;
+        let [age, held] = state.counters()?;
+        // `age` has no tighter limit: a fork may have shorter episodes.
+        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
+        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
+        self.age = age as u32;
+        self.held = held as u32;
         let [randomized] = state.counters()?;
         ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
@@ -316,8 +306,7 @@ impl Resumable for Repose {
         self.sim.push(self.task.hand.object.body, [0.0; 3]);
         self.sim.twist(self.task.hand.object.body, [0.0; 3]);
         self.goal = state.numbers()?;
-        let length = self.goal.iter().map(|x| x * x).sum::<f64>().sqrt();
-        ensure!((length - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
+        ensure!((quat::length(&self.goal) - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
         let actuators = self.task.hand.actuators.len();
         self.last.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
         let clipped = self.last.action.iter().all(|action| (-1.0..=1.0).contains(action));

@@ -83,11 +83,10 @@ impl StepSums {
 
 impl AddAssign for StepSums {
     fn add_assign(&mut self, other: Self) {
-        let Self { steps, task, training, turned, diverged } = other;
-        self.steps += steps;
-        add(&mut self.task, task);
-        add(&mut self.training, training);
-        self.turned += turned;
-        self.diverged += diverged;
+        self.steps += other.steps;
+        add(&mut self.task, other.task);
+        add(&mut self.training, other.training);
+        self.turned += other.turned;
+        self.diverged += other.diverged;
     }
 }

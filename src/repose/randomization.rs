@@ -23,7 +23,7 @@ pub struct Randomization {
     /// The scenes with another size of the object, each behind the factor on its lengths. The last one is the nominal scene.
     scenes: Vec<(f64, Scene)>,
     noise: NoiseStd,
-    bias: NoiseStd,
+    pub(super) bias: NoiseStd,
 }
 
 /// What a randomised episode has drawn.
@@ -104,12 +104,6 @@ impl Randomization {
     /// The noise on the observations of an episode, if there is any.
     pub(super) fn noise(&self, draw: &EpisodePhysics) -> Option<&NoiseStd> {
         Some(&self.noise).filter(|_| draw.has_noise)
-    }
-
-    /// Draws the offset of the observations in the episode of `rng`.
-    pub(super) fn draw_bias(&self, draw: &EpisodePhysics, rng: &Rng) -> Vec<(usize, f32)> {
-        let drawn = self.bias.draw(&mut rng::beside(rng, "bias of randomization")).collect();
-        if draw.has_bias { drawn } else { Vec::new() }
     }
 
     /// The force on the object, N, in a step (from 0) of the episode of `rng`, or `None` if it has none.

@@ -74,7 +74,7 @@ pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
 pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
     let read = |observation: &[f32], at: usize| {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
-        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let length = quat::length(&q);
         // Noise this close to the negative of a quaternion leaves no orientation.
         if length > 1e-6 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
     };

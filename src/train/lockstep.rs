@@ -83,7 +83,7 @@ impl Session {
         let iteration = self.agent.iteration;
         let mut own: Vec<(String, String)> = Vec::new();
         for Member { env: hand, number: env, .. } in self.agent.pool.members_mut() {
-            let Some(diverged) = hand.take_diverged() else { continue };
+            let Some(diverged) = hand.diverged.take() else { continue };
             let text = diverged.as_json(&self.config.env, iteration, *env);
             own.push((format!("iteration-{iteration:08}-env-{env}.json"), text));
         }

@@ -11,7 +11,6 @@ mod session;
 mod start;
 
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use anyhow::{Context, Result, anyhow, ensure};
 
@@ -21,7 +20,7 @@ use crate::evaluate::{Actor, Episodes, Trial};
 use crate::os::{self, Requests, say};
 use crate::ppo::{Rise, beats};
 use crate::ranks::{self, Exchange};
-use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums, Task};
+use crate::repose::{EpisodeStats, HEADLINE, Repose, Score, StepSums};
 use crate::run::Histogram;
 use crate::schedule;
 use duties::{Duties, Follower, Lead};
@@ -169,16 +168,6 @@ impl Session {
         if due { histograms(&self.agent.rollout) } else { Vec::new() }
     }
 
-    /// The task as far as training has come.
-    fn task_now(&self) -> Arc<Task> {
-        self.task.at_the_stage_of(&self.config.env.at(self.agent.env_steps))
-    }
-
-    fn evaluation_episodes(&self) -> Episodes {
-        let run = &self.config.run;
-        Episodes { seed: run.seed, purpose: "evaluation", first: 0, count: run.eval_episodes }
-    }
-
     /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Says whether it can go on: no stop
     /// was requested meanwhile.
     ///
@@ -194,7 +183,7 @@ impl Session {
                 "run.patience: the physics of every evaluation episode diverges at once"
             );
             self.take_down(&before);
-            self.rise = Some(Rise::new(known));
+            self.rise = Some(Rise { before: known, best: known, since: 0 });
             duties.keep(self.checkpoint());
         }
         Ok(true)
@@ -218,9 +207,11 @@ impl Session {
         if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
         }
-        let task = self.task_now();
+        let task = self.task.at_the_stage_of(&self.config.env.at(self.agent.env_steps));
+        let run = &self.config.run;
+        let episodes = Episodes { seed: run.seed, purpose: "evaluation", first: 0, count: run.eval_episodes };
         let actor = Actor::Mean(self.agent.ppo.policy.freeze());
-        let trial = Trial { task: &task, actor: &actor, episodes: self.evaluation_episodes(), stop: &requests.stop };
+        let trial = Trial { task: &task, actor: &actor, episodes, stop: &requests.stop };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
             duties.attend(requests);
             Ok(())

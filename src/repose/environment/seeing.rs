@@ -25,7 +25,7 @@ impl Repose {
         last.goal = self.goal;
         last.rot_dist_before = rot_dist_before;
         last.rot_dist = quat::angle_between(object.orientation, self.goal);
-        last.goal_dist = offset.iter().map(|x| x * x).sum::<f64>().sqrt();
+        last.goal_dist = quat::length(&offset);
         last.within = last.rot_dist <= self.lesson.tolerance;
         last.dropped = last.goal_dist >= task.config.fall_dist;
         last.object = object;
