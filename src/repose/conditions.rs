@@ -39,11 +39,9 @@ impl Conditions {
         sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
         let Some(randomization) = &self.randomization else { return };
         sim.change_scene(&randomization.scene_of(self.draw.as_ref(), &task.hand));
-        if let Some(draw) = &self.draw {
-            if draw.has_bias {
-                let rng = &mut rng::beside(rng, "bias of randomization");
-                sensing::combine(&mut self.bias, randomization.bias.draw(rng));
-            }
+        if self.draw.as_ref().is_some_and(|draw| draw.has_bias) {
+            let rng = &mut rng::beside(rng, "bias of randomization");
+            sensing::combine(&mut self.bias, randomization.bias.draw(rng));
         }
     }
 
