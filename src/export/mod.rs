@@ -12,6 +12,7 @@ use crate::config::{EnvConfig, expect_used};
 use crate::evaluate::expect_finite_actions;
 use crate::load::Loaded;
 use crate::os::{self, say};
+use crate::ppo::Checkpoint;
 use crate::repose::{Hand, Task};
 use crate::run;
 use graph::policy_graph;
@@ -73,12 +74,16 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
-    // What is known of the training run that made the policy.
-    let progress = &loaded.checkpoint.progress;
+    add_training(&mut facts, &loaded.checkpoint);
+    facts
+}
+
+/// Adds what is known of the training run that made the policy.
+fn add_training(facts: &mut Vec<(&'static str, String)>, checkpoint: &Checkpoint) {
+    let progress = &checkpoint.progress;
     facts.extend((progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string())));
     facts.extend(progress.best.map(|[goals, _]| ("goals_per_episode", goals.to_string())));
-    facts.extend(loaded.checkpoint.provenance.clone().map(|text| ("provenance", text)));
-    facts
+    facts.extend(checkpoint.provenance.clone().map(|text| ("provenance", text)));
 }
 
 fn described(hand: &Hand) -> String {

@@ -5,7 +5,7 @@ use mujoco_rs::prelude::MjModel;
 use tempfile::NamedTempFile;
 
 use super::constants::*;
-use crate::os::shortened;
+use crate::os::{self, shortened};
 
 /// A description of the first such value: the quantity, by MuJoCo's name, and the object it belongs to. MuJoCo itself
 /// prints every array of a model, so that none is forgotten here.
@@ -16,7 +16,7 @@ pub fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let printed = || {
         let file = NamedTempFile::new()?;
         model.print(file.path()).map_err(|error| anyhow!("{error}"))?;
-        Ok(std::fs::read(file.path())?)
+        os::read_bytes(file.path())
     };
     let text: Result<Vec<u8>> = printed();
     let text = text.context(
