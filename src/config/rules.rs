@@ -6,7 +6,7 @@ use std::fmt::Display;
 use toml::{Table, Value};
 
 use super::overlay::{brief, lookup, number, settings};
-use super::settings::{Backend, Config, Precision};
+use super::settings::{Backend, Config, PpoConfig, Precision};
 use crate::os::shortened;
 use crate::sim::Parts;
 
@@ -84,7 +84,8 @@ pub fn violations(config: &Config) -> Vec<String> {
     hand(config, &mut rules);
     randomization(config, &table, &mut rules);
     nets(config, &mut rules);
-    learning(config, &mut rules);
+    samples(config, &mut rules);
+    learning(&config.ppo, &mut rules);
     rules.0
 }
 
@@ -178,7 +179,7 @@ fn nets(config: &Config, rules: &mut Rules) {
     rules.check(weights <= 1 << 25, "ppo.hidden", sizes, "have at most 2^25 weights between its layers");
 }
 
-fn learning(config: &Config, rules: &mut Rules) {
+fn samples(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
     let horizon = ppo.horizon;
     let whole = [horizon.from, horizon.to].iter().all(|steps| steps.fract() == 0.0);
@@ -195,6 +196,9 @@ fn learning(config: &Config, rules: &mut Rules) {
     let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
     rules.check(dealt, "run.shards", shards, rule);
+}
+
+fn learning(ppo: &PpoConfig, rules: &mut Rules) {
     let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
     let precision = Value::try_from(ppo.precision).expect("a string");
     rules.check(computable, "ppo.precision", precision, "be \"f32\" with ppo.backend = \"candle\"");

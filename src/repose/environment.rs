@@ -176,6 +176,15 @@ impl Repose {
         self.sim.refresh();
     }
 
+    fn restore_times(&mut self, [age, held]: [u64; 2]) -> Result<()> {
+        // `age` has no tighter limit: a fork may have shorter episodes.
+        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
+        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
+        self.age = age as u32;
+        self.held = held as u32;
+        Ok(())
+    }
+
     /// Decides whether the lesson replaces a goal that was not reached. The decision is random, so the state needs no clock.
     fn gives_up(&mut self) -> bool {
         let chance = self.lesson.redirect_chance;
@@ -292,12 +301,7 @@ impl Resumable for Repose {
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
-        let [age, held] = state.counters()?;
-        // `age` has no tighter limit: a fork may have shorter episodes.
-        let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
-        self.age = age as u32;
-        self.held = held as u32;
+        self.restore_times(state.counters()?)?;
         let [randomized] = state.counters()?;
         ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
         self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
