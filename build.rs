@@ -22,8 +22,16 @@ const NAMES: [&str; 2] = ["libmujoco.so.3.17.0", "libmuj-sr.so.3.17.0"];
 /// Wheels of `mujoco` 3.17.0: (target architecture, pip platform tag, sha256). The Python tag only selects the wheel; the
 /// library in it does not depend on Python.
 const WHEELS: [(&str, &str, &str); 2] = [
-    ("x86_64", "manylinux_2_28_x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
-    ("aarch64", "manylinux_2_28_aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
+    (
+        "x86_64",
+        "manylinux_2_28_x86_64",
+        "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874",
+    ),
+    (
+        "aarch64",
+        "manylinux_2_28_aarch64",
+        "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9",
+    ),
 ];
 
 fn main() {
@@ -54,7 +62,12 @@ fn main() {
     };
     // A binary looks for the library beside itself, in a `lib` folder beside or above itself, and where it was built. That place
     // means nothing on the machine where a package is installed.
-    let places = ["$ORIGIN", "$ORIGIN/lib", "$ORIGIN/../lib", &library_folder.display().to_string()];
+    let places = [
+        "$ORIGIN",
+        "$ORIGIN/lib",
+        "$ORIGIN/../lib",
+        &library_folder.display().to_string(),
+    ];
     let packaged = env::var_os("SHADOW_REPOSE_PACKAGE").is_some();
     for place in &places[..places.len() - usize::from(packaged)] {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{place}");
@@ -72,42 +85,80 @@ fn version_facts() {
         let output = command.output().ok().filter(|o| o.status.success())?;
         Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
-    let commit = output(Command::new("git").args(["describe", "--always", "--dirty", "--abbrev=12"]));
+    let commit =
+        output(Command::new("git").args(["describe", "--always", "--dirty", "--abbrev=12"]));
     let rustc = output(Command::new(variable("RUSTC")).arg("--version"));
-    println!("cargo::rustc-env=SHADOW_REPOSE_COMMIT={}", commit.unwrap_or_else(|| "unknown".into()));
-    println!("cargo::rustc-env=SHADOW_REPOSE_RUSTC={}", rustc.unwrap_or_else(|| "unknown".into()));
-    println!("cargo::rustc-env=SHADOW_REPOSE_TARGET={}", variable("TARGET"));
+    println!(
+        "cargo::rustc-env=SHADOW_REPOSE_COMMIT={}",
+        commit.unwrap_or_else(|| "unknown".into())
+    );
+    println!(
+        "cargo::rustc-env=SHADOW_REPOSE_RUSTC={}",
+        rustc.unwrap_or_else(|| "unknown".into())
+    );
+    println!(
+        "cargo::rustc-env=SHADOW_REPOSE_TARGET={}",
+        variable("TARGET")
+    );
 }
 
 /// Fetches the wheel and makes `library` of the one in it.
 fn fetch(library: &Path) -> Result<(), String> {
-    let (os, arch) = (variable("CARGO_CFG_TARGET_OS"), variable("CARGO_CFG_TARGET_ARCH"));
+    let (os, arch) = (
+        variable("CARGO_CFG_TARGET_OS"),
+        variable("CARGO_CFG_TARGET_ARCH"),
+    );
     let (_, platform, hash) = WHEELS
         .iter()
         .find(|(name, ..)| os == "linux" && *name == arch)
         .ok_or(format!("no download is configured for {os} on {arch}"))?;
     let work = PathBuf::from(variable("OUT_DIR")).join("mujoco-wheel");
-    let selection = ["--python-version", "311", "--implementation", "cp", "--abi", "cp311", "--platform", platform];
+    let selection = [
+        "--python-version",
+        "311",
+        "--implementation",
+        "cp",
+        "--abi",
+        "cp311",
+        "--platform",
+        platform,
+    ];
     pip::unpack_wheel(&format!("mujoco=={VERSION}"), hash, &selection, &work)?;
     let told = |error: std::io::Error| error.to_string();
     let unpacked = work.join("mujoco").join(NAMES[0]);
     let mut content = fs::read(&unpacked).map_err(|e| format!("{}: {e}", unpacked.display()))?;
     let [name, own] = NAMES.map(|name| format!("\0{name}\0").into_bytes());
-    let places: Vec<usize> =
-        content.windows(name.len()).enumerate().filter(|(_, part)| *part == name).map(|(at, _)| at).collect();
+    let places: Vec<usize> = content
+        .windows(name.len())
+        .enumerate()
+        .filter(|(_, part)| *part == name)
+        .map(|(at, _)| at)
+        .collect();
     let [place] = places[..] else {
-        return Err(format!("{} holds its name {} times", unpacked.display(), places.len()));
+        return Err(format!(
+            "{} holds its name {} times",
+            unpacked.display(),
+            places.len()
+        ));
     };
     content[place..place + own.len()].copy_from_slice(&own);
-    let folder = library.parent().expect("the library path has a parent folder");
+    let folder = library
+        .parent()
+        .expect("the library path has a parent folder");
     fs::create_dir_all(folder).map_err(told)?;
     // Writes under another name, then renames: an interrupted build leaves no incomplete library behind.
     let partial = folder.join(format!("libmujoco.partial.{}", std::process::id()));
     fs::write(&partial, content).map_err(told)?;
     fs::rename(&partial, library).map_err(told)?;
     // As old as this script, so that the next build does not take it for something that has changed since this one.
-    let written = fs::metadata("build.rs").and_then(|facts| facts.modified()).map_err(told)?;
-    fs::File::options().write(true).open(library).and_then(|file| file.set_modified(written)).map_err(told)?;
+    let written = fs::metadata("build.rs")
+        .and_then(|facts| facts.modified())
+        .map_err(told)?;
+    fs::File::options()
+        .write(true)
+        .open(library)
+        .and_then(|file| file.set_modified(written))
+        .map_err(told)?;
     let _ = fs::remove_dir_all(&work);
     Ok(())
 }

@@ -64,7 +64,12 @@ pub struct Episodes {
 impl Episodes {
     /// The first `count` episodes for a score.
     pub fn scored(seed: u64, count: usize) -> Self {
-        Self { seed, purpose: "score", first: 0, count }
+        Self {
+            seed,
+            purpose: "score",
+            first: 0,
+            count,
+        }
     }
 }
 
@@ -101,11 +106,19 @@ pub struct Lane {
 
 impl Lane {
     fn new(task: &Arc<Task>) -> Self {
-        Self { env: Repose::new(task), noise: rng::stream(0, "unused", 0), running: false, end: None }
+        Self {
+            env: Repose::new(task),
+            noise: rng::stream(0, "unused", 0),
+            running: false,
+            end: None,
+        }
     }
 
     fn start(&mut self, episodes: Episodes, episode: usize, observation: &mut [f32]) {
-        self.env.reset(rng::stream(episodes.seed, episodes.purpose, episode as u64), observation);
+        self.env.reset(
+            rng::stream(episodes.seed, episodes.purpose, episode as u64),
+            observation,
+        );
         self.env.take_sums();
         self.noise = rng::stream(episodes.seed, "play noise", episode as u64);
         self.running = true;
@@ -113,7 +126,10 @@ impl Lane {
 
     /// The record of the episode, once.
     fn episode(&mut self) -> EpisodeStats {
-        EpisodeStats { turned: self.env.take_sums().turned, ..self.env.episode() }
+        EpisodeStats {
+            turned: self.env.take_sums().turned,
+            ..self.env.episode()
+        }
     }
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Option<End> {
@@ -158,8 +174,15 @@ pub fn expect_finite_values(task: &Arc<Task>, policy: &Policy) -> Result<()> {
     let player = Player::new(task, Episodes::scored(0, 1));
     let policy = policy.freeze();
     let mut value = [0.0_f32];
-    policy.compute(&player.observation, [&mut [], &mut value], &mut policy.workspace(1));
-    ensure!((value[0] * value[0]).is_finite(), "the values of the policy are not finite");
+    policy.compute(
+        &player.observation,
+        [&mut [], &mut value],
+        &mut policy.workspace(1),
+    );
+    ensure!(
+        (value[0] * value[0]).is_finite(),
+        "the values of the policy are not finite"
+    );
     Ok(())
 }
 
@@ -185,7 +208,9 @@ impl Trial<'_> {
             }
             Ok(())
         };
-        Ok(self.play(&mut observer)?.map(|played| Score::of(&played, self.task.config.ctrl_dt)))
+        Ok(self
+            .play(&mut observer)?
+            .map(|played| Score::of(&played, self.task.config.ctrl_dt)))
     }
 
     /// Plays the episodes that `exchange` assigns to this rank, seen by the observer. Returns the episodes of all ranks in order,
@@ -193,7 +218,11 @@ impl Trial<'_> {
     ///
     /// # Errors
     /// Fails as [`Trial::play`] does.
-    pub fn play_together(&self, exchange: &Exchange, observer: &mut Observer) -> Result<Option<Vec<EpisodeStats>>> {
+    pub fn play_together(
+        &self,
+        exchange: &Exchange,
+        observer: &mut Observer,
+    ) -> Result<Option<Vec<EpisodeStats>>> {
         let Episodes { first, count, .. } = self.episodes;
         let own = exchange.own(LANES.min(count));
         let groups = (first + own.start..first + count).step_by(LANES);
@@ -251,38 +280,90 @@ impl<'a> Lanes<'a> {
     fn start(&mut self, first: usize, observer: &mut Observer) -> Result<()> {
         let episodes = self.trial.episodes;
         self.first = first;
-        self.count = self.lanes.len().min(episodes.first + episodes.count - first);
+        self.count = self
+            .lanes
+            .len()
+            .min(episodes.first + episodes.count - first);
         let size = self.spaces.observation_size;
         let rows = self.observations.par_chunks_exact_mut(size);
-        self.lanes[..self.count].par_iter_mut().zip(rows).enumerate().for_each(|(i, (lane, row))| {
-            stepping("episode", first + i, || lane.start(episodes, first + i, row));
-        });
+        self.lanes[..self.count]
+            .par_iter_mut()
+            .zip(rows)
+            .enumerate()
+            .for_each(|(i, (lane, row))| {
+                stepping("episode", first + i, || {
+                    lane.start(episodes, first + i, row)
+                });
+            });
         let rows = self.observations.chunks_exact(size);
         for (i, (lane, observation)) in self.lanes[..self.count].iter().zip(rows).enumerate() {
-            observer(Moment { episode: first + i, env: &lane.env, observation, step: None })?;
+            observer(Moment {
+                episode: first + i,
+                env: &lane.env,
+                observation,
+                step: None,
+            })?;
         }
         Ok(())
     }
 
     /// Takes one step in each lane whose episode has not ended.
     fn step(&mut self, observer: &mut Observer) -> Result<()> {
-        let Self { trial, lanes, observations, actions, work, first, .. } = self;
-        let Spaces { observation_size, action_size, .. } = self.spaces;
-        trial.actor.choose(observations, lanes, actions, work.as_mut());
-        let mut running = lanes.iter().zip(actions.chunks_exact(action_size)).filter(|(lane, _)| lane.running);
-        ensure!(running.all(|(_, action)| action.iter().all(|x| x.is_finite())), NOT_FINITE);
-        let acted = lanes.par_iter_mut().zip(actions.par_chunks_exact(action_size));
-        let rows = acted.zip(observations.par_chunks_exact_mut(observation_size)).enumerate();
-        rows.filter(|(_, ((lane, _), _))| lane.running).try_for_each(|(i, ((lane, action), row))| {
-            let episode = *first + i;
-            let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
-            stepped.map(drop).map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))
-        })?;
-        let rows = observations.chunks_exact(observation_size).zip(actions.chunks_exact(action_size));
-        let running = lanes.iter_mut().zip(rows).enumerate().filter(|(_, (lane, _))| lane.running);
+        let Self {
+            trial,
+            lanes,
+            observations,
+            actions,
+            work,
+            first,
+            ..
+        } = self;
+        let Spaces {
+            observation_size,
+            action_size,
+            ..
+        } = self.spaces;
+        trial
+            .actor
+            .choose(observations, lanes, actions, work.as_mut());
+        let mut running = lanes
+            .iter()
+            .zip(actions.chunks_exact(action_size))
+            .filter(|(lane, _)| lane.running);
+        ensure!(
+            running.all(|(_, action)| action.iter().all(|x| x.is_finite())),
+            NOT_FINITE
+        );
+        let acted = lanes
+            .par_iter_mut()
+            .zip(actions.par_chunks_exact(action_size));
+        let rows = acted
+            .zip(observations.par_chunks_exact_mut(observation_size))
+            .enumerate();
+        rows.filter(|(_, ((lane, _), _))| lane.running)
+            .try_for_each(|(i, ((lane, action), row))| {
+                let episode = *first + i;
+                let stepped = stepping("episode", episode, || caught(|| lane.step(action, row)));
+                stepped
+                    .map(drop)
+                    .map_err(|panic| anyhow!("episode {episode} panicked: {panic}"))
+            })?;
+        let rows = observations
+            .chunks_exact(observation_size)
+            .zip(actions.chunks_exact(action_size));
+        let running = lanes
+            .iter_mut()
+            .zip(rows)
+            .enumerate()
+            .filter(|(_, (lane, _))| lane.running);
         for (i, (lane, (observation, action))) in running {
             let step = Some((action, lane.end));
-            observer(Moment { episode: *first + i, env: &lane.env, observation, step })?;
+            observer(Moment {
+                episode: *first + i,
+                env: &lane.env,
+                observation,
+                step,
+            })?;
             lane.running = lane.end.is_none();
         }
         Ok(())
@@ -291,12 +372,17 @@ impl<'a> Lanes<'a> {
 
 impl Actor<'static> {
     /// The actors that need no policy, by the names that a user gives in place of one.
-    pub const WITHOUT_POLICY: [(&'static str, Self); 3] =
-        [("zero", Self::Zero), ("random", Self::Random), ("wave", Self::Wave)];
+    pub const WITHOUT_POLICY: [(&'static str, Self); 3] = [
+        ("zero", Self::Zero),
+        ("random", Self::Random),
+        ("wave", Self::Wave),
+    ];
 
     /// The place of this name in [`Self::WITHOUT_POLICY`].
     pub fn without_policy(name: &Path) -> Option<usize> {
-        Self::WITHOUT_POLICY.iter().position(|(known, _)| name == Path::new(known))
+        Self::WITHOUT_POLICY
+            .iter()
+            .position(|(known, _)| name == Path::new(known))
     }
 }
 
@@ -320,13 +406,26 @@ impl Actor<'_> {
     }
 
     /// Writes the actions of these lanes, of which there is at least one, one row each. Actions of lanes that have ended are not used.
-    fn choose(&self, observations: &[f32], lanes: &mut [Lane], actions: &mut [f32], work: Option<&mut Workspace>) {
+    fn choose(
+        &self,
+        observations: &[f32],
+        lanes: &mut [Lane],
+        actions: &mut [f32],
+        work: Option<&mut Workspace>,
+    ) {
         if let (Some(policy), Some(work)) = (self.policy(), work) {
             policy.compute(observations, [actions, &mut []], work);
         }
-        let Spaces { observation_size, action_size: size, .. } = lanes[0].env.spaces();
+        let Spaces {
+            observation_size,
+            action_size: size,
+            ..
+        } = lanes[0].env.spaces();
         if let Actor::Outside(act) = self {
-            act(&observations[..lanes.len() * observation_size], &mut actions[..lanes.len() * size]);
+            act(
+                &observations[..lanes.len() * observation_size],
+                &mut actions[..lanes.len() * size],
+            );
         }
         for (lane, row) in lanes.iter_mut().zip(actions.chunks_exact_mut(size)) {
             match self {
@@ -364,10 +463,19 @@ pub struct Player {
 impl Player {
     /// Creates a player at the start of the first of `episodes`. The caller counts the episodes.
     pub fn new(task: &Arc<Task>, episodes: Episodes) -> Self {
-        let Spaces { observation_size, action_size, .. } = task.spaces();
+        let Spaces {
+            observation_size,
+            action_size,
+            ..
+        } = task.spaces();
         let observation = vec![0.0; observation_size];
         let action = vec![0.0; action_size];
-        let mut player = Self { lane: Lane::new(task), observation, action, work: None };
+        let mut player = Self {
+            lane: Lane::new(task),
+            observation,
+            action,
+            work: None,
+        };
         player.start(episodes, episodes.first);
         player
     }
@@ -386,9 +494,17 @@ impl Player {
 
     /// Takes one step with the action of `actor` after a change to it.
     pub fn step_changed(&mut self, actor: &Actor, change: impl FnOnce(&mut [f32])) -> Option<End> {
-        self.work = self.work.take().or_else(|| actor.policy().map(|policy| policy.workspace(1)));
+        self.work = self
+            .work
+            .take()
+            .or_else(|| actor.policy().map(|policy| policy.workspace(1)));
         let lane = std::slice::from_mut(&mut self.lane);
-        actor.choose(&self.observation, lane, &mut self.action, self.work.as_mut());
+        actor.choose(
+            &self.observation,
+            lane,
+            &mut self.action,
+            self.work.as_mut(),
+        );
         change(&mut self.action);
         self.lane.step(&self.action, &mut self.observation)
     }
@@ -407,27 +523,38 @@ mod tests {
     use crate::ranks::Exchange;
 
     #[test]
-    fn a_policy_that_treats_a_cubes_rotations_as_the_same_acts_alike_however_the_cube_is_turned_onto_itself() {
+    fn a_policy_that_treats_a_cubes_rotations_as_the_same_acts_alike_however_the_cube_is_turned_onto_itself()
+     {
         for alike in [true, false] {
             let config = Config::default();
             let task = Task::new(&config).unwrap();
             let mut spaces = task.spaces();
             if !alike {
-                spaces.object_and_goal.iter_mut().for_each(|places| places.rotations = 1);
+                spaces
+                    .object_and_goal
+                    .iter_mut()
+                    .for_each(|places| places.rotations = 1);
             }
             let ppo = Ppo::new(&config.ppo, spaces, 0, Exchange::alone(1)).unwrap();
             let actor = Actor::Mean(ppo.policy.freeze());
             let mut work = actor.policy().map(|policy| policy.workspace(2));
             // Cube and goal coincide: once unrotated, once both rotated by half a turn about their own x axis.
-            let Spaces { observation_size: size, .. } = task.spaces();
+            let Spaces {
+                observation_size: size,
+                ..
+            } = task.spaces();
             let mut observations = vec![0.1; 2 * size];
-            for (row, q) in observations.chunks_exact_mut(size).zip([[1.0, 0.0], [0.0, 1.0]]) {
+            for (row, q) in observations
+                .chunks_exact_mut(size)
+                .zip([[1.0, 0.0], [0.0, 1.0]])
+            {
                 let places = task.spaces().object_and_goal.unwrap();
                 for place in [places.object, places.goal] {
                     row[place..place + 4].copy_from_slice(&[q[0], q[1], 0.0, 0.0]);
                 }
             }
-            let (mut lanes, mut actions) = ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * 20]);
+            let (mut lanes, mut actions) =
+                ([Lane::new(&task), Lane::new(&task)], vec![0.0; 2 * 20]);
             actor.choose(&observations, &mut lanes, &mut actions, work.as_mut());
             let (one, other) = actions.split_at(20);
             assert_eq!(one == other, alike);

@@ -36,20 +36,33 @@ impl GoalTimes {
     pub fn new(config: &EnvConfig) -> Self {
         let hold = config.max_consecutive_successes;
         let second = (1.0 / config.ctrl_dt).round() as u32;
-        Self { hold, second, under_way: BTreeMap::new(), reached: Vec::new(), episodes: 0, early_drops: 0 }
+        Self {
+            hold,
+            second,
+            under_way: BTreeMap::new(),
+            reached: Vec::new(),
+            episodes: 0,
+            early_drops: 0,
+        }
     }
 
     /// Adds a reset or step. The steps of one episode must come in order.
     pub fn observe(&mut self, moment: &Moment) {
         let stats = moment.env.episode();
-        let next = Goal { steps: stats.length, angle: moment.env.rot_dist() };
+        let next = Goal {
+            steps: stats.length,
+            angle: moment.env.rot_dist(),
+        };
         let Some((_, end)) = moment.step else {
             self.under_way.insert(moment.episode, (0, next));
             return;
         };
         let (goals, goal) = self.under_way.entry(moment.episode).or_insert((0, next));
         if stats.goals > *goals {
-            self.reached.push(Goal { steps: stats.length - goal.steps, angle: goal.angle });
+            self.reached.push(Goal {
+                steps: stats.length - goal.steps,
+                angle: goal.angle,
+            });
             *goals = stats.goals;
             *goal = next;
         }
@@ -64,7 +77,11 @@ impl GoalTimes {
     /// the hold. `drops_first_second` is a fraction of the episodes. `steps_fit` is the line of the steps without the hold over
     /// the angle: its offset, and its slope in steps per rad.
     pub fn named(&self) -> [(&'static str, Value); 3] {
-        let mut steps: Vec<f64> = self.reached.iter().map(|goal| f64::from(goal.steps)).collect();
+        let mut steps: Vec<f64> = self
+            .reached
+            .iter()
+            .map(|goal| f64::from(goal.steps))
+            .collect();
         steps.sort_by(f64::total_cmp);
         let at = |fraction: f64| percentile(&steps, fraction);
         let to_goal = json!({
@@ -75,7 +92,10 @@ impl GoalTimes {
         let [offset, slope] = line(self.reached.iter().map(turning));
         [
             ("steps_to_goal", to_goal),
-            ("drops_first_second", json!(self.early_drops as f64 / self.episodes as f64)),
+            (
+                "drops_first_second",
+                json!(self.early_drops as f64 / self.episodes as f64),
+            ),
             ("steps_fit", json!({ "settle": offset, "per_rad": slope })),
         ]
     }
@@ -85,7 +105,8 @@ impl GoalTimes {
 fn percentile(sorted: &[f64], fraction: f64) -> f64 {
     let place = fraction * sorted.len().saturating_sub(1) as f64;
     let below = place as usize;
-    let [low, high] = [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
+    let [low, high] =
+        [below, below + 1].map(|i| sorted.get(i).or(sorted.last()).copied().unwrap_or(f64::NAN));
     low + place.fract() * (high - low)
 }
 
@@ -96,7 +117,11 @@ fn line(points: impl Iterator<Item = [f64; 2]> + Clone) -> [f64; 2] {
     let x_mean = mean(&|[x, _]| x);
     let y_mean = mean(&|[_, y]| y);
     let spread = mean(&|[x, _]| (x - x_mean).powi(2));
-    let slope = if spread > 0.0 { mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread } else { f64::NAN };
+    let slope = if spread > 0.0 {
+        mean(&|[x, y]| (x - x_mean) * (y - y_mean)) / spread
+    } else {
+        f64::NAN
+    };
     [y_mean - slope * x_mean, slope]
 }
 
@@ -107,7 +132,10 @@ mod tests {
 
     fn goal_times(reached: &[(u32, f64)]) -> GoalTimes {
         let mut goal_times = GoalTimes::new(&Config::default().env);
-        goal_times.reached = reached.iter().map(|&(steps, angle)| Goal { steps, angle }).collect();
+        goal_times.reached = reached
+            .iter()
+            .map(|&(steps, angle)| Goal { steps, angle })
+            .collect();
         goal_times
     }
 
@@ -116,9 +144,15 @@ mod tests {
         // 50 steps to hold, 34 to settle, 30 per rad.
         let reached: Vec<(u32, f64)> = (0..=10).map(|i| (84 + 3 * i, 0.1 * f64::from(i))).collect();
         let named = goal_times(&reached).named();
-        assert_eq!(named[0].1, json!({ "mean": 99.0, "p10": 87.0, "p50": 99.0, "p90": 111.0, "p99": 113.7 }));
+        assert_eq!(
+            named[0].1,
+            json!({ "mean": 99.0, "p10": 87.0, "p50": 99.0, "p90": 111.0, "p99": 113.7 })
+        );
         let [settle, per_rad] = ["settle", "per_rad"].map(|key| named[2].1[key].as_f64().unwrap());
-        assert!((settle - 34.0).abs() < 1e-9 && (per_rad - 30.0).abs() < 1e-9, "{settle} {per_rad}");
+        assert!(
+            (settle - 34.0).abs() < 1e-9 && (per_rad - 30.0).abs() < 1e-9,
+            "{settle} {per_rad}"
+        );
     }
 
     #[test]
@@ -126,6 +160,9 @@ mod tests {
         let none = goal_times(&[]).named();
         assert!(none[0].1["mean"].is_null() && none[0].1["p50"].is_null() && none[1].1.is_null());
         let one = goal_times(&[(90, 1.0)]).named();
-        assert_eq!((&one[0].1["p99"], &one[2].1["per_rad"]), (&json!(90.0), &Value::Null));
+        assert_eq!(
+            (&one[0].1["p99"], &one[2].1["per_rad"]),
+            (&json!(90.0), &Value::Null)
+        );
     }
 }

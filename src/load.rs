@@ -60,8 +60,14 @@ impl PolicySource {
     pub fn find(place: &Path) -> Result<Self> {
         let name = place.display();
         let needs_none = Actor::without_policy(place).is_some();
-        ensure!(!needs_none, "`{name}` acts without a policy; a file or folder of that name is ./{name}");
-        match BUILTIN.iter().find(|policy| place == Path::new(policy.name)) {
+        ensure!(
+            !needs_none,
+            "`{name}` acts without a policy; a file or folder of that name is ./{name}"
+        );
+        match BUILTIN
+            .iter()
+            .find(|policy| place == Path::new(policy.name))
+        {
             Some(policy) => Ok(Self::BuiltIn(policy)),
             None => run::resolve_checkpoint(place).map(Self::File),
         }
@@ -88,7 +94,10 @@ impl PolicySource {
     /// # Errors
     /// Fails as [`PolicySource::load`] does.
     pub fn load_for_any_scene(&self) -> Result<(Checkpoint, Config)> {
-        self.load(&[Override { key: MODEL.into(), value: BUILTIN_MODEL.into() }])
+        self.load(&[Override {
+            key: MODEL.into(),
+            value: BUILTIN_MODEL.into(),
+        }])
     }
 
     /// Reads the checkpoint or policy and the settings for playing it, overlaid with `overrides`.
@@ -153,9 +162,19 @@ impl Loaded {
             .with_context(|| format!("cannot use the policy {origin}"))?;
         let name = match &origin {
             PolicySource::BuiltIn(policy) => policy.title.to_owned(),
-            PolicySource::File(path) => format!("{}, {} control steps", path.display(), checkpoint.progress.env_steps),
+            PolicySource::File(path) => format!(
+                "{}, {} control steps",
+                path.display(),
+                checkpoint.progress.env_steps
+            ),
         };
-        Ok(Self { origin, name, record, policy, checkpoint })
+        Ok(Self {
+            origin,
+            name,
+            record,
+            policy,
+            checkpoint,
+        })
     }
 
     /// The settings for playing it, overlaid with `overrides`.
@@ -163,7 +182,12 @@ impl Loaded {
     /// # Errors
     /// Fails as [`settings`] does.
     pub fn settings(&self, overrides: &[Override]) -> Result<Config> {
-        settings(&self.checkpoint, self.origin.path(), player(&self.checkpoint), overrides)
+        settings(
+            &self.checkpoint,
+            self.origin.path(),
+            player(&self.checkpoint),
+            overrides,
+        )
     }
 
     /// Loads its task, with settings overlaid with `overrides`.
@@ -192,14 +216,22 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
 /// Fails if there is no file, if one cannot be read or used, or if all are damaged (with the error of the last one).
 pub fn newest_sound(list: impl Fn() -> Result<Vec<PathBuf>>) -> Result<(PathBuf, Checkpoint)> {
     let found = || first_sound(&list()?);
-    found().or_else(|error| if is_absence(&error) { found() } else { Err(error) })
+    found().or_else(|error| {
+        if is_absence(&error) {
+            found()
+        } else {
+            Err(error)
+        }
+    })
 }
 
 fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
     let (last, others) = places.split_last().context("there is no checkpoint")?;
     for path in others {
         match read(path) {
-            Err(error) if is_damage(&error) => say!("warning: {error:#}\n  Trying the previous one."),
+            Err(error) if is_damage(&error) => {
+                say!("warning: {error:#}\n  Trying the previous one.")
+            }
             result => return Ok((path.clone(), result?)),
         }
     }
@@ -208,8 +240,12 @@ fn first_sound(places: &[PathBuf]) -> Result<(PathBuf, Checkpoint)> {
 
 /// Whether the file is not there.
 fn is_absence(error: &Error) -> bool {
-    let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
-    kinds.map(std::io::Error::kind).any(|kind| kind == std::io::ErrorKind::NotFound)
+    let kinds = error
+        .chain()
+        .filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+    kinds
+        .map(std::io::Error::kind)
+        .any(|kind| kind == std::io::ErrorKind::NotFound)
 }
 
 /// Whether the bytes of the file are damaged, as opposed to intact but unusable.
@@ -221,15 +257,25 @@ pub fn is_damage(error: &Error) -> bool {
 ///
 /// # Errors
 /// Fails if they are invalid, belong to another policy, or name a scene that no setting in `sets` names.
-pub fn settings(checkpoint: &Checkpoint, path: &Path, reader: Reader, sets: &[Override]) -> Result<Config> {
-    let config = Settings::new().stored(source(checkpoint, path), reader).sets(sets).resolve()?;
+pub fn settings(
+    checkpoint: &Checkpoint,
+    path: &Path,
+    reader: Reader,
+    sets: &[Override],
+) -> Result<Config> {
+    let config = Settings::new()
+        .stored(source(checkpoint, path), reader)
+        .sets(sets)
+        .resolve()?;
     expect_policy(checkpoint, &config.ppo)?;
     Ok(config)
 }
 
 /// What plays the policy of a checkpoint.
 fn player(checkpoint: &Checkpoint) -> Reader {
-    Reader::Player { env_steps: checkpoint.progress.env_steps }
+    Reader::Player {
+        env_steps: checkpoint.progress.env_steps,
+    }
 }
 
 /// The settings in a checkpoint in the file `path`, as text.
@@ -242,16 +288,30 @@ pub fn source(checkpoint: &Checkpoint, path: &Path) -> Source {
 ///
 /// # Errors
 /// Fails as [`settings`] does.
-pub fn for_fork(checkpoint: &Checkpoint, path: &Path, settings: Settings) -> Result<(Config, Config)> {
+pub fn for_fork(
+    checkpoint: &Checkpoint,
+    path: &Path,
+    settings: Settings,
+) -> Result<(Config, Config)> {
     let parent = Settings::new().file(source(checkpoint, path)).resolve()?;
     expect_policy(checkpoint, &parent.ppo)?;
-    let Progress { iteration, ref fork, .. } = checkpoint.progress;
-    let made = iteration - fork.as_ref().map_or(0, |fork| fork.iteration).min(iteration);
+    let Progress {
+        iteration,
+        ref fork,
+        ..
+    } = checkpoint.progress;
+    let made = iteration
+        - fork
+            .as_ref()
+            .map_or(0, |fork| fork.iteration)
+            .min(iteration);
     let mut after = parent.clone();
     if made > parent.ppo.critic_first {
         after.ppo.critic_first = 0;
     }
-    let config = settings.stored(Source::new(path, after.to_text()), Reader::Run).resolve()?;
+    let config = settings
+        .stored(Source::new(path, after.to_text()), Reader::Run)
+        .resolve()?;
     Ok((parent, config))
 }
 
@@ -281,9 +341,15 @@ mod tests {
         let lists = Cell::new(0);
         let list = || {
             lists.set(lists.get() + 1);
-            Ok(vec![if lists.get() == 1 { gone.clone() } else { there.clone() }])
+            Ok(vec![if lists.get() == 1 {
+                gone.clone()
+            } else {
+                there.clone()
+            }])
         };
         assert_eq!(newest_sound(list).unwrap().0, there);
-        assert!(is_absence(&newest_sound(|| Ok(vec![gone.clone()])).err().unwrap()));
+        assert!(is_absence(
+            &newest_sound(|| Ok(vec![gone.clone()])).err().unwrap()
+        ));
     }
 }

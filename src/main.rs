@@ -19,17 +19,20 @@ fn main() -> ExitCode {
     let trains = matches!(command, Command::Train(_));
     let allowed = if trains { Ok(()) } else { ranks::expect_one() };
     let done = |result: anyhow::Result<()>| result.map(|()| ExitCode::SUCCESS);
-    let result = allowed.and_then(|()| Requests::listen(trains)).and_then(|requests| match command {
-        Command::Train(args) => train(&args, &requests),
-        Command::Play(args) => play::play(&args, &requests),
-        Command::View(args) => done(view::view(&args)),
-        Command::Export(args) => done(export::export(&args)),
-        Command::Plot(args) => done(plot::plot(&args)),
-        Command::Runs(args) => done(runs::runs(&args)),
-        Command::Bench(args) => done(bench::bench(&args)),
-        Command::Completions { shell } => done(manual::completions(shell)),
-        Command::Man => done(manual::man()),
-    });
+    let result =
+        allowed
+            .and_then(|()| Requests::listen(trains))
+            .and_then(|requests| match command {
+                Command::Train(args) => train(&args, &requests),
+                Command::Play(args) => play::play(&args, &requests),
+                Command::View(args) => done(view::view(&args)),
+                Command::Export(args) => done(export::export(&args)),
+                Command::Plot(args) => done(plot::plot(&args)),
+                Command::Runs(args) => done(runs::runs(&args)),
+                Command::Bench(args) => done(bench::bench(&args)),
+                Command::Completions { shell } => done(manual::completions(shell)),
+                Command::Man => done(manual::man()),
+            });
     result.unwrap_or_else(|error| match error.downcast::<clap::Error>() {
         Ok(answer) => tell(&answer),
         Err(error) => {

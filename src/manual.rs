@@ -17,27 +17,51 @@ pub fn completions(shell: Shell) -> Result<()> {
     let mut program = command();
     if shell != Shell::Bash {
         clap_complete::generate(shell, &mut program, PROGRAM, &mut text);
-        let more = if shell == Shell::Fish { after_commands(&program) } else { String::new() };
+        let more = if shell == Shell::Fish {
+            after_commands(&program)
+        } else {
+            String::new()
+        };
         return os::print(&(String::from_utf8(text)? + &more));
     }
     // For a name with a hyphen, clap_complete 4.6 gives each command two names in the script, and completes nothing after a command.
-    clap_complete::generate(shell, &mut program.name("shadow_repose"), "shadow_repose", &mut text);
+    clap_complete::generate(
+        shell,
+        &mut program.name("shadow_repose"),
+        "shadow_repose",
+        &mut text,
+    );
     let text = String::from_utf8(text)?.replace(" shadow_repose\n", &format!(" {PROGRAM}\n"));
     os::print(&text)
 }
 
 /// What clap_complete 4.6 leaves out for fish: the values of arguments without an option, and the commands after `help`.
 fn after_commands(program: &clap::Command) -> String {
-    let names = |command: &clap::Command| command.get_subcommands().map(|of| of.get_name().to_owned()).collect();
-    let values = |command: &clap::Command| {
-        let values = command.get_positionals().flat_map(clap::Arg::get_possible_values);
-        values.map(|value| value.get_name().to_owned()).collect::<Vec<_>>()
+    let names = |command: &clap::Command| {
+        command
+            .get_subcommands()
+            .map(|of| of.get_name().to_owned())
+            .collect()
     };
-    let commands = program.get_subcommands().map(|command| (command.get_name(), values(command)));
-    let commands = commands.chain([("help", names(program))]).filter(|(_, words)| !words.is_empty());
+    let values = |command: &clap::Command| {
+        let values = command
+            .get_positionals()
+            .flat_map(clap::Arg::get_possible_values);
+        values
+            .map(|value| value.get_name().to_owned())
+            .collect::<Vec<_>>()
+    };
+    let commands = program
+        .get_subcommands()
+        .map(|command| (command.get_name(), values(command)));
+    let commands = commands
+        .chain([("help", names(program))])
+        .filter(|(_, words)| !words.is_empty());
     let line = |(name, words): (&str, Vec<String>)| {
         let words = words.join(" ");
-        format!("complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n")
+        format!(
+            "complete -c {PROGRAM} -n \"__fish_shadow_repose_using_subcommand {name}\" -f -a \"{words}\"\n"
+        )
     };
     commands.map(line).collect()
 }
@@ -56,7 +80,10 @@ pub fn man() -> Result<()> {
     whole.render_synopsis_section(&mut page)?;
     whole.render_description_section(&mut page)?;
     let mut page = String::from_utf8(page)?;
-    for command in program.get_subcommands().filter(|command| command.get_name() != "help") {
+    for command in program
+        .get_subcommands()
+        .filter(|command| command.get_name() != "help")
+    {
         let mut section = Vec::new();
         let part = clap_mangen::Man::new(command.clone());
         part.render_description_section(&mut section)?;
@@ -64,7 +91,10 @@ pub fn man() -> Result<()> {
         part.render_extra_section(&mut section)?;
         // Sections of the command's own page are parts of one section here.
         let section = String::from_utf8(section)?.replace(".SH ", ".SS ");
-        page += &format!(".SH \"SHADOW-REPOSE {}\"\n{section}", command.get_name().to_uppercase());
+        page += &format!(
+            ".SH \"SHADOW-REPOSE {}\"\n{section}",
+            command.get_name().to_uppercase()
+        );
     }
     os::print(&page)
 }

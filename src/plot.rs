@@ -55,24 +55,45 @@ pub fn plot(args: &PlotArgs) -> Result<()> {
     run::expect_output(&args.out.path, tables.iter().map(PathBuf::as_path), None)?;
     let output = PictureFile::create(&args.out)?;
     let asked = args.metric.iter().map(|name| (&name[..], None));
-    let metrics: Vec<Metric> = if args.metric.is_empty() { DEFAULT.to_vec() } else { asked.collect() };
-    let wanted: Vec<&str> = metrics.iter().flat_map(|(usual, other)| [*usual].into_iter().chain(*other)).collect();
+    let metrics: Vec<Metric> = if args.metric.is_empty() {
+        DEFAULT.to_vec()
+    } else {
+        asked.collect()
+    };
+    let wanted: Vec<&str> = metrics
+        .iter()
+        .flat_map(|(usual, other)| [*usual].into_iter().chain(*other))
+        .collect();
     let runs = runs(args, &wanted)?;
     expect_columns(&runs, &args.metric)?;
-    ensure!(!args.seeds || runs.len() > 1, "--seeds: there is only one run; give the runs of several seeds");
+    ensure!(
+        !args.seeds || runs.len() > 1,
+        "--seeds: there is only one run; give the runs of several seeds"
+    );
     let along = match args.along {
         Along::Steps => "million control steps",
         Along::Hours => "hours of collecting and learning",
     };
     let legend = if args.seeds {
-        vec![format!("mean of {} seeds, from the lowest to the highest", runs.len())]
+        vec![format!(
+            "mean of {} seeds, from the lowest to the highest",
+            runs.len()
+        )]
     } else {
         runs.iter().map(|run| run.name.clone()).collect()
     };
     let window = window(&runs, args.smooth);
-    let panels =
-        metrics.into_iter().map(|metric| panel(known_name(metric, &runs), &runs, window, args.seeds)).collect();
-    Chart { legend, along: along.to_owned(), panels, size: args.size }.write(output)?;
+    let panels = metrics
+        .into_iter()
+        .map(|metric| panel(known_name(metric, &runs), &runs, window, args.seeds))
+        .collect();
+    Chart {
+        legend,
+        along: along.to_owned(),
+        panels,
+        size: args.size,
+    }
+    .write(output)?;
     let plural = if runs.len() == 1 { "" } else { "s" };
     say!("{}: {} run{plural}", args.out.path.display(), runs.len());
     Ok(())
@@ -84,7 +105,9 @@ fn known_name<'a>((usual, other): Metric<'a>, runs: &[RunTable]) -> &'a str {
         let mut columns = runs.iter().filter_map(|run| run.columns.get(name));
         columns.any(|values| values.iter().any(|x| !x.is_nan()))
     };
-    other.filter(|other| !is_known(usual) && is_known(other)).unwrap_or(usual)
+    other
+        .filter(|other| !is_known(usual) && is_known(other))
+        .unwrap_or(usual)
 }
 
 /// The panel of a metric: a curve for each run, or for several seeds one curve and a band.
@@ -98,8 +121,16 @@ fn panel(name: &str, runs: &[RunTable], window: f64, seeds: bool) -> Subplot {
         }
         curves = vec![mean_and_band(&curves)];
     }
-    let nothing = if name.starts_with(EVALUATION) { "no evaluation yet" } else { "nothing yet" };
-    Subplot { title, curves, nothing: nothing.to_owned() }
+    let nothing = if name.starts_with(EVALUATION) {
+        "no evaluation yet"
+    } else {
+        "nothing yet"
+    };
+    Subplot {
+        title,
+        curves,
+        nothing: nothing.to_owned(),
+    }
 }
 
 /// Reads the table of each run once, however many names the run has, e.g. a link `latest`. Warns of each that cannot be drawn.
@@ -119,7 +150,11 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
             continue;
         }
         let table = run::read_metrics(place, required, wanted).and_then(|table| {
-            ensure!(!table.columns[ALONG[0]].is_empty(), "{}: no rows yet", place.display());
+            ensure!(
+                !table.columns[ALONG[0]].is_empty(),
+                "{}: no rows yet",
+                place.display()
+            );
             Ok(table)
         });
         match table {
@@ -128,7 +163,12 @@ fn runs(args: &PlotArgs, wanted: &[&str]) -> Result<Vec<RunTable>> {
                     Along::Steps => columns[ALONG[0]].iter().map(|steps| steps / 1e6).collect(),
                     Along::Hours => hours(&columns[ALONG[1]], &columns[ALONG[2]]),
                 };
-                runs.push(RunTable { name: name_of(place), along, names, columns });
+                runs.push(RunTable {
+                    name: name_of(place),
+                    along,
+                    names,
+                    columns,
+                });
             }
             Err(error) if runs.is_empty() && i + 1 == args.runs.len() => return Err(error),
             Err(error) => say!("warning: {error:#}; skipped"),
@@ -156,15 +196,24 @@ fn expect_columns(runs: &[RunTable], metrics: &[String]) -> Result<()> {
         let lacking = runs.iter().filter(|run| !run.columns.contains_key(name));
         let lacking: Vec<&str> = lacking.map(|run| &run.name[..]).collect();
         if lacking.len() == runs.len() {
-            let mut known: Vec<&str> = runs.iter().flat_map(|run| &run.names).map(String::as_str).collect();
+            let mut known: Vec<&str> = runs
+                .iter()
+                .flat_map(|run| &run.names)
+                .map(String::as_str)
+                .collect();
             known.sort_unstable();
             known.dedup();
             let mut nearest = similar(name, known.into_iter(), '/');
             nearest.truncate(SUGGESTIONS);
             let name: String = name.chars().take(64).collect();
             match &nearest[..] {
-                [] => bail!("no run has a column {name}; the first line of metrics.csv names all columns"),
-                nearest => bail!("no run has a column {name}; did you mean {}?", nearest.join(" or ")),
+                [] => bail!(
+                    "no run has a column {name}; the first line of metrics.csv names all columns"
+                ),
+                nearest => bail!(
+                    "no run has a column {name}; did you mean {}?",
+                    nearest.join(" or ")
+                ),
             }
         }
         if !lacking.is_empty() {
@@ -178,10 +227,20 @@ impl RunTable {
     /// The curve of a metric, without points if the run has no such column. Each evaluation counts by itself, at the step at which it
     /// was made. Other values are averaged over windows of so many steps.
     fn curve(&self, name: &str, window: f64) -> Curve {
-        let Some(values) = self.columns.get(name) else { return Curve::default() };
+        let Some(values) = self.columns.get(name) else {
+            return Curve::default();
+        };
         let dots = name.starts_with(EVALUATION);
-        let lengths = if dots { vec![1; values.len()] } else { lengths_of_windows(&self.columns[ALONG[0]], window) };
-        Curve { points: smooth(&self.along, values, &lengths), band: Vec::new(), dots }
+        let lengths = if dots {
+            vec![1; values.len()]
+        } else {
+            lengths_of_windows(&self.columns[ALONG[0]], window)
+        };
+        Curve {
+            points: smooth(&self.along, values, &lengths),
+            band: Vec::new(),
+            dots,
+        }
     }
 }
 
@@ -189,12 +248,20 @@ impl RunTable {
 /// first curve, and the others are interpolated linearly.
 fn mean_and_band(curves: &[Curve]) -> Curve {
     let dots = curves.iter().any(|curve| curve.dots);
-    let mut mean = Curve { dots, ..Curve::default() };
+    let mut mean = Curve {
+        dots,
+        ..Curve::default()
+    };
     for &[x, _] in curves.first().map_or(&[][..], |curve| &curve.points) {
-        let Some(values) = curves.iter().map(|curve| value_at(&curve.points, x)).collect::<Option<Vec<f64>>>() else {
+        let Some(values) = curves
+            .iter()
+            .map(|curve| value_at(&curve.points, x))
+            .collect::<Option<Vec<f64>>>()
+        else {
             continue;
         };
-        mean.points.push([x, values.iter().sum::<f64>() / values.len() as f64]);
+        mean.points
+            .push([x, values.iter().sum::<f64>() / values.len() as f64]);
         mean.band.push([
             values.iter().copied().fold(f64::INFINITY, f64::min),
             values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -208,7 +275,9 @@ fn lengths_of_windows(steps: &[f64], window: f64) -> Vec<usize> {
     let first = steps[0];
     // Rounded, because steps are whole numbers and the window is a multiple of their difference.
     steps
-        .chunk_by(|a, b| ((a - first) / window + 1e-9).floor() == ((b - first) / window + 1e-9).floor())
+        .chunk_by(|a, b| {
+            ((a - first) / window + 1e-9).floor() == ((b - first) / window + 1e-9).floor()
+        })
         .map(<[f64]>::len)
         .collect()
 }
@@ -233,8 +302,19 @@ fn name_of(place: &Path) -> String {
     } else {
         whole.file_stem()
     };
-    let name = name.map_or_else(|| place.display().to_string(), |n| n.to_string_lossy().into());
-    name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()
+    let name = name.map_or_else(
+        || place.display().to_string(),
+        |n| n.to_string_lossy().into(),
+    );
+    name.chars()
+        .map(|c| {
+            if c.is_control() {
+                char::REPLACEMENT_CHARACTER
+            } else {
+                c
+            }
+        })
+        .collect()
 }
 
 /// The means over consecutive windows of these numbers of rows, `[x, value]`. Rows without a value are skipped, as are windows with
@@ -245,7 +325,11 @@ fn smooth(along: &[f64], values: &[f64], lengths: &[usize]) -> Vec<[f64; 2]> {
         let window = begin..begin + length;
         begin = window.end;
         let mean = |all: &[f64]| {
-            let known: Vec<f64> = all[window.clone()].iter().copied().filter(|value| value.is_finite()).collect();
+            let known: Vec<f64> = all[window.clone()]
+                .iter()
+                .copied()
+                .filter(|value| value.is_finite())
+                .collect();
             (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
         };
         Some([mean(along)?, mean(values)?])
@@ -260,8 +344,12 @@ mod tests {
     #[test]
     fn a_run_is_named_after_its_folder_and_a_table_by_itself_after_its_file() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-        let names =
-            ["docs/curves", "docs/curves/default-0.csv", "runs/seed-1/metrics.csv"].map(|of| name_of(&root.join(of)));
+        let names = [
+            "docs/curves",
+            "docs/curves/default-0.csv",
+            "runs/seed-1/metrics.csv",
+        ]
+        .map(|of| name_of(&root.join(of)));
         assert_eq!(names, ["curves", "default-0", "seed-1"]);
     }
 
@@ -269,14 +357,24 @@ mod tests {
     fn a_point_is_the_mean_of_the_rows_that_have_a_value() {
         let along = [1.0, 2.0, 3.0, 4.0, 5.0];
         let values = [1.0, f64::NAN, f64::NAN, f64::NAN, 7.0];
-        assert_eq!(smooth(&along, &values, &[2, 2, 1]), [[1.5, 1.0], [5.0, 7.0]]);
+        assert_eq!(
+            smooth(&along, &values, &[2, 2, 1]),
+            [[1.5, 1.0], [5.0, 7.0]]
+        );
         assert_eq!(smooth(&along, &values, &[5]), [[3.0, 4.0]]);
     }
 
     #[test]
     fn a_window_is_as_many_steps_in_a_table_with_fewer_rows() {
-        let rows = |step: u32, count: u32| (1..=count).map(|i| f64::from(step * i)).collect::<Vec<f64>>();
-        assert_eq!(lengths_of_windows(&rows(16_384, 7), 3.0 * 16_384.0), [3, 3, 1]);
+        let rows = |step: u32, count: u32| {
+            (1..=count)
+                .map(|i| f64::from(step * i))
+                .collect::<Vec<f64>>()
+        };
+        assert_eq!(
+            lengths_of_windows(&rows(16_384, 7), 3.0 * 16_384.0),
+            [3, 3, 1]
+        );
         assert_eq!(lengths_of_windows(&rows(100, 5), 250.0), [3, 2]);
         assert_eq!(lengths_of_windows(&rows(400, 3), 250.0), [1, 1, 1]);
         assert_eq!(lengths_of_windows(&[5.0], f64::INFINITY), [1]);
@@ -284,14 +382,30 @@ mod tests {
 
     #[test]
     fn the_mean_of_seeds_is_taken_where_all_of_them_have_values() {
-        let curve = |points: &[[f64; 2]]| Curve { points: points.to_vec(), ..Curve::default() };
-        let (a, b) = (curve(&[[1.0, 0.0], [2.0, 1.0], [4.0, 2.0]]), curve(&[[1.5, 4.0], [2.0, 5.0], [3.0, 9.0]]));
+        let curve = |points: &[[f64; 2]]| Curve {
+            points: points.to_vec(),
+            ..Curve::default()
+        };
+        let (a, b) = (
+            curve(&[[1.0, 0.0], [2.0, 1.0], [4.0, 2.0]]),
+            curve(&[[1.5, 4.0], [2.0, 5.0], [3.0, 9.0]]),
+        );
         let found = mean_and_band(&[a, b]);
-        assert_eq!((found.points, found.band), (vec![[2.0, 3.0]], vec![[1.0, 5.0]]));
+        assert_eq!(
+            (found.points, found.band),
+            (vec![[2.0, 3.0]], vec![[1.0, 5.0]])
+        );
         // The second has no point at 2, but one on each side.
         let (a, b) = (curve(&[[2.0, 1.0]]), curve(&[[1.0, 0.0], [3.0, 6.0]]));
         let found = mean_and_band(&[a, b]);
-        assert_eq!((found.points, found.band), (vec![[2.0, 2.0]], vec![[1.0, 3.0]]));
-        assert!(mean_and_band(&[curve(&[[1.0, 2.0]]), curve(&[])]).points.is_empty());
+        assert_eq!(
+            (found.points, found.band),
+            (vec![[2.0, 2.0]], vec![[1.0, 3.0]])
+        );
+        assert!(
+            mean_and_band(&[curve(&[[1.0, 2.0]]), curve(&[])])
+                .points
+                .is_empty()
+        );
     }
 }

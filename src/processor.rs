@@ -1,7 +1,10 @@
 //! Reports a processor that MuJoCo cannot run on. The library uses AVX from its first instructions on. They run before `main`
 //! and would end the program by SIGILL.
 
-#![expect(unsafe_code, reason = "only the linker can place a function before those of the libraries")]
+#![expect(
+    unsafe_code,
+    reason = "only the linker can place a function before those of the libraries"
+)]
 
 use std::io::Write;
 

@@ -25,7 +25,9 @@ pub const CUBE_ROTATIONS: [[f32; 4]; 24] = [
 
 /// A set of the rotations of a cube, given by their numbers, as bits.
 pub fn mask(rotations: &[usize]) -> u32 {
-    rotations.iter().fold(0, |mask, rotation| mask | 1 << rotation)
+    rotations
+        .iter()
+        .fold(0, |mask, rotation| mask | 1 << rotation)
 }
 
 /// The Hamilton product `a ⊗ b`: first the rotation `b`, then `a`.
@@ -78,7 +80,11 @@ pub fn angle_between(a: Quat, b: Quat) -> f64 {
 pub fn rotation_vector(q: Quat) -> [f64; 3] {
     let [w, axis @ ..] = canonical(q);
     let sine = length(&axis);
-    let factor = if sine > 1e-9 { 2.0 * sine.atan2(w) / sine } else { 2.0 };
+    let factor = if sine > 1e-9 {
+        2.0 * sine.atan2(w) / sine
+    } else {
+        2.0
+    };
     axis.map(|x| factor * x)
 }
 
@@ -107,7 +113,10 @@ mod tests {
 
     #[test]
     fn a_quarter_turn_about_z_takes_x_to_y() {
-        assert!(close(&rotate(ABOUT_Z_90, [1.0, 0.0, 0.0]), &[0.0, 1.0, 0.0]));
+        assert!(close(
+            &rotate(ABOUT_Z_90, [1.0, 0.0, 0.0]),
+            &[0.0, 1.0, 0.0]
+        ));
     }
 
     #[test]
@@ -115,7 +124,10 @@ mod tests {
         let (i, j) = ([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]);
         assert_eq!(mul(i, j), [0.0, 0.0, 0.0, 1.0]);
         assert_eq!(mul(j, i), [0.0, 0.0, 0.0, -1.0]);
-        assert!(close(&mul(ABOUT_Z_90, conj(ABOUT_Z_90)), &[1.0, 0.0, 0.0, 0.0]));
+        assert!(close(
+            &mul(ABOUT_Z_90, conj(ABOUT_Z_90)),
+            &[1.0, 0.0, 0.0, 0.0]
+        ));
     }
 
     #[test]
@@ -147,15 +159,24 @@ mod tests {
             .collect();
         // The angle of a uniform rotation has the density (1 - cos a) / π, so its mean is π/2 + 2/π.
         let mean = angles.iter().sum::<f64>() / angles.len() as f64;
-        assert!((mean - (PI / 2.0 + 2.0 / PI)).abs() < 0.02, "mean angle {mean}");
+        assert!(
+            (mean - (PI / 2.0 + 2.0 / PI)).abs() < 0.02,
+            "mean angle {mean}"
+        );
     }
 
     #[test]
     fn a_rotation_vector_is_the_axis_times_the_shorter_angle() {
         assert!(close(&rotation_vector(ABOUT_Z_90), &[0.0, 0.0, PI / 2.0]));
-        assert!(close(&rotation_vector(ABOUT_Z_90.map(|x| -x)), &[0.0, 0.0, PI / 2.0]));
+        assert!(close(
+            &rotation_vector(ABOUT_Z_90.map(|x| -x)),
+            &[0.0, 0.0, PI / 2.0]
+        ));
         let (cos, sin) = (1e-15, 1.0);
-        assert!(close(&rotation_vector([-cos, sin, 0.0, 0.0]), &[-PI, 0.0, 0.0]));
+        assert!(close(
+            &rotation_vector([-cos, sin, 0.0, 0.0]),
+            &[-PI, 0.0, 0.0]
+        ));
         assert!(close(&rotation_vector([1.0, 0.0, 0.0, 0.0]), &[0.0; 3]));
     }
 }

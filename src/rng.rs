@@ -83,7 +83,10 @@ mod tests {
         for _ in 0..37 {
             rng.random::<u32>();
             let mut again = at(position(&rng));
-            assert_eq!(again.clone().random::<[u64; 40]>(), rng.clone().random::<[u64; 40]>());
+            assert_eq!(
+                again.clone().random::<[u64; 40]>(),
+                rng.clone().random::<[u64; 40]>()
+            );
             assert_eq!(position(&again), position(&rng));
             again.random::<u32>();
             assert_ne!(position(&again), position(&rng));
@@ -94,11 +97,18 @@ mod tests {
     fn what_is_beside_a_generator_does_not_depend_on_its_position() {
         let mut rng = stream(3, "episode", 1 << 40);
         let draws = |rng: &Rng| {
-            [beside(rng, "randomization"), beside_at(rng, "noise", 0), beside_at(rng, "noise", 7)]
-                .map(|mut r| r.random::<u64>())
+            [
+                beside(rng, "randomization"),
+                beside_at(rng, "noise", 0),
+                beside_at(rng, "noise", 7),
+            ]
+            .map(|mut r| r.random::<u64>())
         };
         let before = draws(&rng);
-        assert_eq!(before[0], stream(3, "randomization", 1 << 40).random::<u64>());
+        assert_eq!(
+            before[0],
+            stream(3, "randomization", 1 << 40).random::<u64>()
+        );
         assert_eq!(before[1], stream(3, "noise", 1 << 40).random::<u64>());
         assert_ne!(before[1], before[2]);
         rng.random::<u64>();

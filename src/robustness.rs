@@ -17,7 +17,11 @@ use crate::repose::{Score, Task, measure};
 const CHANGES: [(&str, &str, &[&str]); 9] = [
     ("friction", FRICTION, &["0.5", "0.7", "1.3"]),
     ("cube mass", MASS, &["0.5", "2.0"]),
-    ("cube size", "env.cube_size_scale", &["0.8", "0.9", "1.1", "1.2"]),
+    (
+        "cube size",
+        "env.cube_size_scale",
+        &["0.8", "0.9", "1.1", "1.2"],
+    ),
     ("gains", "env.gains_scale", &["0.75", "1.5"]),
     ("damping", "env.damping_scale", &["0.3", "3.0"]),
     ("delay", "env.action_delay", &["1", "2", "3"]),
@@ -29,8 +33,7 @@ const CHANGES: [(&str, &str, &[&str]); 9] = [
 const FRICTION: &str = "env.friction_scale";
 const MASS: &str = "env.cube_mass_scale";
 const NOISE: &str = "{ joint_pos = 0.01, joint_vel = 0.02, cube_pos = 0.002, cube_quat = 0.02, fingertips = 0.002 }";
-const TWICE_THE_NOISE: &str =
-    "{ joint_pos = 0.02, joint_vel = 0.04, cube_pos = 0.004, cube_quat = 0.04, fingertips = 0.004 }";
+const TWICE_THE_NOISE: &str = "{ joint_pos = 0.02, joint_vel = 0.04, cube_pos = 0.004, cube_quat = 0.04, fingertips = 0.004 }";
 
 /// The values of friction and mass that are combined.
 const FRICTIONS: [&str; 4] = ["0.5", "0.7", "1.0", "1.3"];
@@ -82,7 +85,11 @@ pub fn robustness(
     report: &TableOutput,
     requests: &Requests,
 ) -> Result<ExitCode> {
-    let output = report.picture.as_ref().map(PictureFile::create).transpose()?;
+    let output = report
+        .picture
+        .as_ref()
+        .map(PictureFile::create)
+        .transpose()?;
     let Episodes { seed, count, .. } = episodes;
     let rows = played(playable(task)?, actor, episodes, requests)?;
     let interrupted = requests.stop.load(std::sync::atomic::Ordering::Relaxed);
@@ -98,7 +105,11 @@ pub fn robustness(
         Some(file) => picture(&rows, count, place).write(file)?,
         None => {}
     }
-    Ok(if interrupted { os::exit_code(requests.signal()) } else { ExitCode::SUCCESS })
+    Ok(if interrupted {
+        os::exit_code(requests.signal())
+    } else {
+        ExitCode::SUCCESS
+    })
 }
 
 /// The conditions with their tasks. Leaves out a condition that the task cannot take, such as another size of an object with a mesh, and
@@ -122,33 +133,71 @@ fn played(
     episodes: Episodes,
     requests: &Requests,
 ) -> Result<Vec<Scored>> {
-    let is_known = |i: usize, task: &Task| playable[..i].iter().any(|(_, other)| other.config == task.config);
-    let different = playable.iter().enumerate().filter(|(i, (_, task))| !is_known(*i, task)).count();
-    let bar = os::progress_bar((different * episodes.count) as u64, "episodes", "robustness");
+    let is_known = |i: usize, task: &Task| {
+        playable[..i]
+            .iter()
+            .any(|(_, other)| other.config == task.config)
+    };
+    let different = playable
+        .iter()
+        .enumerate()
+        .filter(|(i, (_, task))| !is_known(*i, task))
+        .count();
+    let bar = os::progress_bar(
+        (different * episodes.count) as u64,
+        "episodes",
+        "robustness",
+    );
     let mut rows: Vec<Scored> = Vec::new();
     for (condition, task) in playable {
-        let known = rows.iter().find(|row| row.task.config == task.config).map(|row| row.score);
+        let known = rows
+            .iter()
+            .find(|row| row.task.config == task.config)
+            .map(|row| row.score);
         bar.set_message(condition.name.clone());
         let played = match known {
             Some(known) => Some(known),
-            None => Trial { task: &task, actor, episodes, stop: &requests.stop }.score(&bar, &mut |_| {})?,
+            None => Trial {
+                task: &task,
+                actor,
+                episodes,
+                stop: &requests.stop,
+            }
+            .score(&bar, &mut |_| {})?,
         };
         let Some(score) = played else { break };
         if let Some(warning) = score.divergence().filter(|_| known.is_none()) {
             say!("warning: {}: {warning}", condition.name);
         }
-        let nominal = rows.first().map_or(score["goals"], |nominal| nominal.score["goals"]);
+        let nominal = rows
+            .first()
+            .map_or(score["goals"], |nominal| nominal.score["goals"]);
         // Without any goals there is no fraction.
-        let kept = if nominal > 0.0 { score["goals"] / nominal } else { f64::NAN };
-        rows.push(Scored { condition, task, score, kept });
+        let kept = if nominal > 0.0 {
+            score["goals"] / nominal
+        } else {
+            f64::NAN
+        };
+        rows.push(Scored {
+            condition,
+            task,
+            score,
+            kept,
+        });
     }
     Ok(rows)
 }
 
 /// All rows: the task itself, the single changes, and the grid.
 fn conditions() -> Vec<Condition> {
-    let set = |key: &str, value: &str| Override { key: key.into(), value: value.into() };
-    let mut conditions = vec![Condition { name: "nominal".into(), sets: Vec::new() }];
+    let set = |key: &str, value: &str| Override {
+        key: key.into(),
+        value: value.into(),
+    };
+    let mut conditions = vec![Condition {
+        name: "nominal".into(),
+        sets: Vec::new(),
+    }];
     for (name, key, values) in CHANGES {
         for value in values {
             let name = match *value {
@@ -156,13 +205,19 @@ fn conditions() -> Vec<Condition> {
                 TWICE_THE_NOISE => "twice the noise".to_owned(),
                 value => format!("{name} {}", value.trim_matches('"')),
             };
-            conditions.push(Condition { name, sets: vec![set(key, value)] });
+            conditions.push(Condition {
+                name,
+                sets: vec![set(key, value)],
+            });
         }
     }
     for friction in FRICTIONS {
         for mass in MASSES {
             let name = format!("friction {friction}, cube mass {mass}");
-            conditions.push(Condition { name, sets: vec![set(FRICTION, friction), set(MASS, mass)] });
+            conditions.push(Condition {
+                name,
+                sets: vec![set(FRICTION, friction), set(MASS, mass)],
+            });
         }
     }
     conditions
@@ -170,15 +225,22 @@ fn conditions() -> Vec<Condition> {
 
 /// The mean fraction of goals over the single changes, each counted as at most 1.
 fn mean_kept(rows: &[Scored]) -> f64 {
-    let single = rows.iter().skip(1).filter(|row| !row.condition.is_in_grid());
-    let kept: Vec<f64> = single.map(|row| if row.kept > 1.0 { 1.0 } else { row.kept }).collect();
+    let single = rows
+        .iter()
+        .skip(1)
+        .filter(|row| !row.condition.is_in_grid());
+    let kept: Vec<f64> = single
+        .map(|row| if row.kept > 1.0 { 1.0 } else { row.kept })
+        .collect();
     kept.iter().sum::<f64>() / kept.len() as f64
 }
 
 fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Value {
     let of_row = |row: &Scored| {
         let value = |set: &Override| {
-            let table: toml::Table = format!("value = {}", set.value).parse().expect("the values are TOML");
+            let table: toml::Table = format!("value = {}", set.value)
+                .parse()
+                .expect("the values are TOML");
             (set.key.clone(), json!(table["value"]))
         };
         json!({
@@ -198,28 +260,71 @@ fn as_json(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> Val
 
 fn table(rows: &[Scored], episodes: usize, seed: u64, checkpoint: &str) -> String {
     let mut text = format!("checkpoint {checkpoint}\n{episodes} episodes a row, seed {seed}\n\n");
-    text += &format!("{:<30} {:>5}  {:<15} {:>7} {:>6}\n", "", "goals", "95 % interval", "drops", "kept");
-    for Scored { condition, score, kept, .. } in rows {
+    text += &format!(
+        "{:<30} {:>5}  {:<15} {:>7} {:>6}\n",
+        "", "goals", "95 % interval", "drops", "kept"
+    );
+    for Scored {
+        condition,
+        score,
+        kept,
+        ..
+    } in rows
+    {
         let [low, high] = score.goals_ci95.map(|goals| number(goals, 2));
         let drops = format!("{} %", measure("drop_rate").text(score["drop_rate"]));
         let goals = number(score["goals"], 2);
         let kept = number(*kept, 2);
-        text += &format!("{:<30} {goals:>5}  {:<15} {drops:>7} {kept:>6}\n", condition.name, format!("{low} … {high}"));
+        text += &format!(
+            "{:<30} {goals:>5}  {:<15} {drops:>7} {kept:>6}\n",
+            condition.name,
+            format!("{low} … {high}")
+        );
     }
-    text + &format!("\nmean kept over the single changes, each at most 1: {}\n", number(mean_kept(rows), 3))
+    text + &format!(
+        "\nmean kept over the single changes, each at most 1: {}\n",
+        number(mean_kept(rows), 3)
+    )
 }
 
 fn picture(rows: &[Scored], episodes: usize, checkpoint: &str) -> BarChart {
-    let bars = rows.iter().filter(|row| !row.condition.is_in_grid()).map(|row| {
-        let nominal = rows[0].score["goals"];
-        let note = format!("{:.2} goals, {:.0} % drops", row.score["goals"], 100.0 * row.score["drop_rate"]);
-        let interval = row.score.goals_ci95.map(|goals| goals / nominal);
-        draw::NamedBar { name: row.condition.name.clone(), value: row.kept, interval, note }
-    });
-    let grid: Vec<f64> = rows.iter().filter(|row| row.condition.is_in_grid()).map(|row| row.kept).collect();
-    let row = |mass: usize| grid.iter().skip(mass).step_by(MASSES.len()).copied().collect();
+    let bars = rows
+        .iter()
+        .filter(|row| !row.condition.is_in_grid())
+        .map(|row| {
+            let nominal = rows[0].score["goals"];
+            let note = format!(
+                "{:.2} goals, {:.0} % drops",
+                row.score["goals"],
+                100.0 * row.score["drop_rate"]
+            );
+            let interval = row.score.goals_ci95.map(|goals| goals / nominal);
+            draw::NamedBar {
+                name: row.condition.name.clone(),
+                value: row.kept,
+                interval,
+                note,
+            }
+        });
+    let grid: Vec<f64> = rows
+        .iter()
+        .filter(|row| row.condition.is_in_grid())
+        .map(|row| row.kept)
+        .collect();
+    let row = |mass: usize| {
+        grid.iter()
+            .skip(mass)
+            .step_by(MASSES.len())
+            .copied()
+            .collect()
+    };
     let cells = (0..MASSES.len()).map(row).collect();
-    let named = |name: &str, values: &[&str]| values.iter().map(|value| format!("{name} {value}")).collect();
+    let named = |name: &str, values: &[&str]| {
+        values
+            .iter()
+            .map(|value| format!("{name} {value}"))
+            .collect()
+    };
     BarChart {
         title: format!("Goals kept under a change: {checkpoint}, {episodes} episodes a row"),
         bars: bars.collect(),
@@ -238,14 +343,26 @@ mod tests {
     fn row(condition: Condition, goals: u32, kept: f64) -> Scored {
         let config = Settings::new().sets(&condition.sets).resolve().unwrap();
         let task = Task::new(&config).unwrap();
-        let episode = EpisodeStats { length: 10, goals, ..Default::default() };
-        Scored { condition, task, score: Score::of(&[episode, episode], 0.01), kept }
+        let episode = EpisodeStats {
+            length: 10,
+            goals,
+            ..Default::default()
+        };
+        Scored {
+            condition,
+            task,
+            score: Score::of(&[episode, episode], 0.01),
+            kept,
+        }
     }
 
     #[test]
     fn the_rows_are_those_that_are_published_and_each_changes_the_task() {
         let conditions = conditions();
-        let names: Vec<&str> = conditions[..22].iter().map(|condition| condition.name.as_str()).collect();
+        let names: Vec<&str> = conditions[..22]
+            .iter()
+            .map(|condition| condition.name.as_str())
+            .collect();
         let expected = "nominal, friction 0.5, friction 0.7, friction 1.3, cube mass 0.5, cube mass 2.0, cube size 0.8, \
                         cube size 0.9, cube size 1.1, cube size 1.2, gains 0.75, gains 1.5, damping 0.3, damping 3.0, \
                         delay 1, delay 2, delay 3, noise, twice the noise, sim_dt 0.005, sim_dt 0.002, cone elliptic";
@@ -253,7 +370,12 @@ mod tests {
         assert_eq!(conditions.len(), 22 + 12);
         let nominal = Config::default();
         for condition in &conditions[1..22] {
-            assert_ne!(Settings::new().sets(&condition.sets).resolve().unwrap(), nominal, "{}", condition.name);
+            assert_ne!(
+                Settings::new().sets(&condition.sets).resolve().unwrap(),
+                nominal,
+                "{}",
+                condition.name
+            );
         }
     }
 
@@ -261,17 +383,48 @@ mod tests {
     fn what_is_kept_is_averaged_over_the_single_changes_and_never_more_than_all() {
         let conditions = conditions();
         let kept = [1.0, 0.5, 1.2];
-        let mut rows: Vec<Scored> =
-            conditions[..3].iter().zip(kept).map(|(of, kept)| row(of.clone(), 2, kept)).collect();
+        let mut rows: Vec<Scored> = conditions[..3]
+            .iter()
+            .zip(kept)
+            .map(|(of, kept)| row(of.clone(), 2, kept))
+            .collect();
         rows.push(row(conditions[24].clone(), 2, 0.1));
         assert_eq!(mean_kept(&rows), 0.75);
-        let of_nothing: Vec<Scored> = conditions[..3].iter().map(|of| row(of.clone(), 0, f64::NAN)).collect();
-        assert!(mean_kept(&of_nothing).is_nan() && as_json(&of_nothing, 2, 3, "x")["mean_kept"].is_null());
+        let of_nothing: Vec<Scored> = conditions[..3]
+            .iter()
+            .map(|of| row(of.clone(), 0, f64::NAN))
+            .collect();
+        assert!(
+            mean_kept(&of_nothing).is_nan()
+                && as_json(&of_nothing, 2, 3, "x")["mean_kept"].is_null()
+        );
         let value = as_json(&rows, 2, 3, "x");
-        assert_eq!(value["rows"][1]["set"], json!({ "env.friction_scale": 0.5 }));
+        assert_eq!(
+            value["rows"][1]["set"],
+            json!({ "env.friction_scale": 0.5 })
+        );
         assert_eq!(value["rows"][2]["kept"], 1.2);
-        let keys: Vec<&str> = value["rows"][0].as_object().unwrap().keys().map(String::as_str).collect();
-        assert_eq!(keys, ["name", "set", "goals_per_episode", "goals_ci95", "drop_rate", "kept"]);
-        assert!(table(&rows, 2, 3, "x").lines().any(|line| line.starts_with("friction 0.5") && line.ends_with("0.50")));
+        let keys: Vec<&str> = value["rows"][0]
+            .as_object()
+            .unwrap()
+            .keys()
+            .map(String::as_str)
+            .collect();
+        assert_eq!(
+            keys,
+            [
+                "name",
+                "set",
+                "goals_per_episode",
+                "goals_ci95",
+                "drop_rate",
+                "kept"
+            ]
+        );
+        assert!(
+            table(&rows, 2, 3, "x")
+                .lines()
+                .any(|line| line.starts_with("friction 0.5") && line.ends_with("0.50"))
+        );
     }
 }

@@ -14,7 +14,10 @@ use std::sync::Mutex;
 /// blocks for many threads, and enough items in each for full vectors of work.
 pub fn block_sizes(items: usize, in_all: usize) -> Vec<usize> {
     let size = (in_all / 32).clamp(8, 64);
-    (0..items).step_by(size).map(|first| size.min(items - first)).collect()
+    (0..items)
+        .step_by(size)
+        .map(|first| size.min(items - first))
+        .collect()
 }
 
 /// Calls `work(block, round)` for each block and each round below `rounds` on the threads of rayon's current pool, and
@@ -29,14 +32,24 @@ pub fn in_rounds<B: Send>(
 ) -> Vec<B> {
     let mut blocks: Vec<B> = blocks.into_iter().collect();
     // Each block that waits, with its next round.
-    let waiting: Mutex<VecDeque<(&mut B, usize)>> = Mutex::new(blocks.iter_mut().map(|block| (block, 0)).collect());
+    let waiting: Mutex<VecDeque<(&mut B, usize)>> =
+        Mutex::new(blocks.iter_mut().map(|block| (block, 0)).collect());
     // The lock is not held during work, so no panic can occur under it.
     rayon::broadcast(|_| {
         loop {
-            let Some((block, round)) = waiting.lock().expect("no panic under this lock").pop_front() else { break };
+            let Some((block, round)) = waiting
+                .lock()
+                .expect("no panic under this lock")
+                .pop_front()
+            else {
+                break;
+            };
             if round < rounds {
                 work(block, round);
-                waiting.lock().expect("no panic under this lock").push_back((block, round + 1));
+                waiting
+                    .lock()
+                    .expect("no panic under this lock")
+                    .push_back((block, round + 1));
             }
         }
     });
@@ -55,7 +68,8 @@ pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
 /// The message of a panic.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
+    text.or_else(|| panic.downcast_ref::<&str>().copied())
+        .unwrap_or("no message")
 }
 
 #[cfg(test)]
@@ -66,12 +80,24 @@ mod tests {
     #[test]
     fn every_block_goes_through_all_rounds_in_order_on_any_number_of_threads() {
         for threads in [1, 2, 8] {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             for blocks in [1, 3, 20] {
-                let seen = pool.install(|| in_rounds(vec![Vec::new(); blocks], 50, |seen, round| seen.push(round)));
-                assert_eq!(seen, vec![(0..50).collect::<Vec<_>>(); blocks], "{threads} threads, {blocks} blocks");
+                let seen = pool.install(|| {
+                    in_rounds(vec![Vec::new(); blocks], 50, |seen, round| seen.push(round))
+                });
+                assert_eq!(
+                    seen,
+                    vec![(0..50).collect::<Vec<_>>(); blocks],
+                    "{threads} threads, {blocks} blocks"
+                );
                 let numbers = pool.install(|| in_rounds(0..blocks, 3, |_, _| {}));
-                assert!(numbers.into_iter().eq(0..blocks), "blocks are returned in order");
+                assert!(
+                    numbers.into_iter().eq(0..blocks),
+                    "blocks are returned in order"
+                );
             }
         }
     }
@@ -80,10 +106,16 @@ mod tests {
     #[test]
     fn work_that_is_parallel_in_itself_does_not_hang() {
         for threads in [1, 2, 4] {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             let sums = pool.install(|| {
                 in_rounds(vec![0u64; 5], 40, |sum, round| {
-                    *sum += (0..2000u64).into_par_iter().map(|i| std::hint::black_box(i ^ round as u64)).sum::<u64>();
+                    *sum += (0..2000u64)
+                        .into_par_iter()
+                        .map(|i| std::hint::black_box(i ^ round as u64))
+                        .sum::<u64>();
                 })
             });
             assert!(sums.iter().all(|&sum| sum == sums[0] && sum > 0));
@@ -92,8 +124,17 @@ mod tests {
 
     #[test]
     fn a_panic_in_one_block_ends_the_call_instead_of_hanging_it() {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
-        let panicking = || pool.install(|| in_rounds(0..6, 10, |&mut block, round| assert!(block != 4 || round != 3)));
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(4)
+            .build()
+            .unwrap();
+        let panicking = || {
+            pool.install(|| {
+                in_rounds(0..6, 10, |&mut block, round| {
+                    assert!(block != 4 || round != 3)
+                })
+            })
+        };
         assert!(std::panic::catch_unwind(std::panic::AssertUnwindSafe(panicking)).is_err());
     }
 
@@ -105,7 +146,14 @@ mod tests {
             let (last, first) = sizes.split_last().unwrap();
             assert!(first.iter().all(|size| size == &sizes[0]) && *last <= sizes[0] && *last > 0);
         }
-        assert_eq!((block_sizes(1024, 1024)[0], block_sizes(8192, 8192)[0], block_sizes(1, 1).len()), (32, 64, 1));
+        assert_eq!(
+            (
+                block_sizes(1024, 1024)[0],
+                block_sizes(8192, 8192)[0],
+                block_sizes(1, 1).len()
+            ),
+            (32, 64, 1)
+        );
         assert_eq!(block_sizes(64, 1024), [32, 32], "a shard of many");
     }
 }

@@ -1,7 +1,9 @@
 //! The quantities that a training run logs: what each one is, and in which unit. The columns of `metrics.csv` and the tags in
 //! TensorBoard are their names.
 
-use crate::repose::{Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, task_terms, training_terms};
+use crate::repose::{
+    Better, Description, Lesson, MEASURES, OF_EVALUATIONS, OF_TRAINING, task_terms, training_terms,
+};
 
 /// A logged quantity.
 pub struct Tag {
@@ -19,8 +21,18 @@ const GROUPS: [(&str, &[&str], &str, &str); 3] = [
         "training",
         "Training episodes that ended in the iteration, without the randomised ones.",
     ),
-    ("randomized/", &OF_TRAINING, "randomised training", "Randomised training episodes that ended in the iteration."),
-    ("eval/", &OF_EVALUATIONS, "evaluation", "Episodes of the task itself with mean actions."),
+    (
+        "randomized/",
+        &OF_TRAINING,
+        "randomised training",
+        "Randomised training episodes that ended in the iteration.",
+    ),
+    (
+        "eval/",
+        &OF_EVALUATIONS,
+        "evaluation",
+        "Episodes of the task itself with mean actions.",
+    ),
 ];
 
 /// What is logged besides scores and rewards: name, title, description.
@@ -54,24 +66,36 @@ const OTHERS: [(&str, &str, &str); 21] = [
 pub fn tag(name: &str) -> Option<Tag> {
     let other = OTHERS.iter().find(|(known, ..)| *known == name);
     if let Some((_, title, description)) = other {
-        return Some(Tag { title: (*title).to_owned(), description: (*description).to_owned() });
+        return Some(Tag {
+            title: (*title).to_owned(),
+            description: (*description).to_owned(),
+        });
     }
     let (group, part) = name.split_once('/')?;
     let term = |list: &[Description]| {
         let found = list.iter().find(|term| term.0 == part);
         found.map(|term| format!("{}, mean per step.", term.1.trim_end_matches('.')))
     };
-    let of_lesson = || Lesson::descriptions().find(|value| value.0 == part).map(|value| value.1.to_owned());
+    let of_lesson = || {
+        Lesson::descriptions()
+            .find(|value| value.0 == part)
+            .map(|value| value.1.to_owned())
+    };
     let description = match group {
         "reward" => term(&task_terms()),
         "training" => term(&training_terms()).or_else(of_lesson),
         _ => None,
     };
     if let Some(description) = description {
-        return Some(Tag { title: format!("{group}: {part}"), description });
+        return Some(Tag {
+            title: format!("{group}: {part}"),
+            description,
+        });
     }
     GROUPS.iter().find_map(|(group, measures, of, episodes)| {
-        let column = name.strip_prefix(group).filter(|column| measures.contains(column))?;
+        let column = name
+            .strip_prefix(group)
+            .filter(|column| measures.contains(column))?;
         let measure = MEASURES.iter().find(|measure| measure.column == column)?;
         let better = match measure.better {
             Better::Higher => "Higher is better.",

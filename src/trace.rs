@@ -26,8 +26,13 @@ impl Trace {
         let hand = &task.hand;
         // The entries that are not zero: row, column and value.
         let mirror = task.mirror().map(|matrix| -> Value {
-            let entries = matrix.iter().enumerate().filter(|(_, value)| **value != 0.0);
-            entries.map(|(i, value)| json!([i / hand.layout.size, i % hand.layout.size, value])).collect()
+            let entries = matrix
+                .iter()
+                .enumerate()
+                .filter(|(_, value)| **value != 0.0);
+            entries
+                .map(|(i, value)| json!([i / hand.layout.size, i % hand.layout.size, value]))
+                .collect()
         });
         let mut header = json!({
             "sim_dt": config.sim_dt,
@@ -53,7 +58,11 @@ impl Trace {
             "mirror_matrix": mirror,
         });
         add_settings(config, &mut header);
-        Self { header, episodes: Vec::new(), last: usize::MAX }
+        Self {
+            header,
+            episodes: Vec::new(),
+            last: usize::MAX,
+        }
     }
 
     /// Records `moment` if it may be needed.
@@ -81,7 +90,8 @@ impl Trace {
 
     /// The whole text.
     pub fn finish(self) -> String {
-        let lines = std::iter::once(self.header.to_string()).chain(self.episodes.into_iter().flatten());
+        let lines =
+            std::iter::once(self.header.to_string()).chain(self.episodes.into_iter().flatten());
         lines.map(|line| line + "\n").collect()
     }
 }
@@ -101,8 +111,9 @@ fn record(moment: &Moment) -> Value {
         });
     };
     let details = &env.last;
-    let mut reward =
-        Map::from_iter(named(task_terms(), details.reward).map(|(name, value)| (name.to_owned(), json!(value))));
+    let mut reward = Map::from_iter(
+        named(task_terms(), details.reward).map(|(name, value)| (name.to_owned(), json!(value))),
+    );
     reward.insert("total".into(), json!(details.reward.iter().sum::<f64>()));
     json!({
         "episode": episode,

@@ -17,7 +17,8 @@ use crate::see;
 use crate::sim::{Camera, Look};
 
 /// What to do where no window can be opened.
-const INSTEAD: &str = "Without a window, --web shows the hand in a browser, and --out hand.png draws it.";
+const INSTEAD: &str =
+    "Without a window, --web shows the hand in a browser, and --out hand.png draws it.";
 
 /// Shows the scene in a window or on a page, or writes one picture of it.
 ///
@@ -33,8 +34,12 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     };
     expect_together(&[made], &args.given).map_err(|text| usage_error("view", &text))?;
     let file = args.settings.config.as_deref();
-    let config = Settings::new().user_file(file)?.sets(&args.settings.set).resolve()?;
-    let choice = Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
+    let config = Settings::new()
+        .user_file(file)?
+        .sets(&args.settings.set)
+        .resolve()?;
+    let choice =
+        Actor::without_policy(Path::new(&args.actions)).context("an actor for each motion")?;
     let look = args.shot.sized(args.size, args.quality);
     let load = || task_for_display(&config, &look);
     match (&args.out, args.web) {
@@ -45,7 +50,13 @@ pub fn view(args: &ViewArgs) -> Result<()> {
             crate::run::expect_output(&to.path, file, config.env.model_file())?;
             let output = os::OutputFile::create(&to.path)?;
             let (_, actor) = &Actor::WITHOUT_POLICY[choice];
-            let [width, height] = see::screenshot(output, &load()?, actor, Episodes::scored(args.seed, 1), args.at)?;
+            let [width, height] = see::screenshot(
+                output,
+                &load()?,
+                actor,
+                Episodes::scored(args.seed, 1),
+                args.at,
+            )?;
             say!("{}: {width}x{height}", to.path.display());
         }
         (None, Some(port)) => show_on_page(port, &load()?, choice, args.seed, look.camera)?,
@@ -78,15 +89,34 @@ fn task_for_display(config: &Config, look: &Look) -> Result<Arc<Task>> {
 }
 
 /// Shows the scene on a page, with a slider for each actuator, for as long as the program runs.
-fn show_on_page(port: u16, task: &Arc<Task>, choice: usize, seed: u64, camera: Option<Camera>) -> Result<()> {
+fn show_on_page(
+    port: u16,
+    task: &Arc<Task>,
+    choice: usize,
+    seed: u64,
+    camera: Option<Camera>,
+) -> Result<()> {
     let sliders = see::Sliders::new(task);
-    let title = task.config.model_file().map_or("The built-in hand".into(), |file| file.display().to_string());
-    let about = see::About { title, policy: None, seed: Some(seed) };
+    let title = task
+        .config
+        .model_file()
+        .map_or("The built-in hand".into(), |file| {
+            file.display().to_string()
+        });
+    let about = see::About {
+        title,
+        policy: None,
+        seed: Some(seed),
+    };
     let own = sliders.clone();
     let step = move |player: &mut Player| {
         let (_, actor) = &Actor::WITHOUT_POLICY[choice];
         player.step_changed(actor, |action| own.change(action))
     };
-    let acting = see::LiveActor { step: Rc::new(step), policy: None, task: task.clone() };
+    let acting = see::LiveActor {
+        step: Rc::new(step),
+        policy: None,
+        task: task.clone(),
+    };
     see::Live::open(port, (&about, camera), 1, &acting, Some(sliders))?.show(&mut || acting.clone())
 }

@@ -51,5 +51,8 @@ fn after_the_first_iteration_no_array_of_samples_or_weights_is_allocated() {
     // gemm packs the largest weight matrix, of the first layer, into its own buffer. An array of all weights, or of a block of rows
     // in a net, would be larger. An array of all samples would be much larger.
     let packed = 4 * size * config.ppo.hidden[0];
-    assert!(first > 500_000 && later.iter().all(|&largest| largest <= packed), "{first} bytes, then {later:?}");
+    assert!(
+        first > 500_000 && later.iter().all(|&largest| largest <= packed),
+        "{first} bytes, then {later:?}"
+    );
 }

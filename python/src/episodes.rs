@@ -14,15 +14,21 @@ pub(crate) fn columns<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
     let floats = |of: &dyn Fn(usize, &EpisodeStats) -> f64| column(py, count, episodes, of);
-    let counts = |of: fn(&EpisodeStats) -> u32| column(py, count, episodes, &|_, episode| i64::from(of(episode)));
-    let flags = |of: fn(&EpisodeStats) -> bool| column(py, count, episodes, &|_, episode| of(episode));
+    let counts = |of: fn(&EpisodeStats) -> u32| {
+        column(py, count, episodes, &|_, episode| i64::from(of(episode)))
+    };
+    let flags =
+        |of: fn(&EpisodeStats) -> bool| column(py, count, episodes, &|_, episode| of(episode));
     columns.set_item("r", floats(&|hand, _| returns[hand]))?;
     columns.set_item("l", counts(|episode| episode.length))?;
     columns.set_item("goals", counts(|episode| episode.goals))?;
     columns.set_item("dropped", flags(|episode| episode.dropped))?;
     columns.set_item("diverged", flags(|episode| episode.diverged))?;
     columns.set_item("randomized", flags(|episode| episode.randomized))?;
-    columns.set_item("rot_dist", floats(&|_, episode| episode.rot_dist_sum / f64::from(episode.length.max(1))))?;
+    columns.set_item(
+        "rot_dist",
+        floats(&|_, episode| episode.rot_dist_sum / f64::from(episode.length.max(1))),
+    )?;
     let terms = PyDict::new(py);
     for (i, name) in task_terms().into_iter().map(|term| term.0).enumerate() {
         terms.set_item(name, floats(&|_, episode| episode.reward[i]))?;

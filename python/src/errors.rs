@@ -10,7 +10,9 @@ use pyo3::prelude::*;
 
 /// The exception for an error about the user's input.
 pub(crate) fn refused(error: Error) -> PyErr {
-    let kinds = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+    let kinds = error
+        .chain()
+        .filter_map(|cause| cause.downcast_ref::<std::io::Error>());
     let kind = kinds.map(std::io::Error::kind).next();
     let text = format!("{error:#}");
     match kind {

@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
 use anyhow::{Context, ensure};
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods,
+    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -15,7 +16,8 @@ use shadow_repose::config::Config;
 use shadow_repose::env::{Autoreset, End, EnvPool, EnvState};
 use shadow_repose::ranks::Exchange;
 use shadow_repose::repose::{
-    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms, training_terms,
+    EpisodeStats, Lesson, Randomization, Repose, Task, TaskReward, TrainingReward, task_terms,
+    training_terms,
 };
 
 use crate::episodes::columns;
@@ -59,7 +61,12 @@ struct State {
 }
 
 /// The ends, at the numbers that Python gets for them.
-const ENDS: [Option<End>; 4] = [None, Some(End::Terminated), Some(End::Truncated), Some(End::Redirected)];
+const ENDS: [Option<End>; 4] = [
+    None,
+    Some(End::Terminated),
+    Some(End::Truncated),
+    Some(End::Redirected),
+];
 
 const NOT_RESET: &str = "reset the hands before they step";
 const FAILED: &str = "an earlier step failed: reset the hands before they step again";
@@ -86,10 +93,16 @@ impl Hands {
             Ok(guard) => guard,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => {
-                return Err(PyRuntimeError::new_err("another thread is using these hands"));
+                return Err(PyRuntimeError::new_err(
+                    "another thread is using these hands",
+                ));
             }
         };
-        if guard.is_some() { Ok(guard) } else { Err(PyRuntimeError::new_err("these hands are closed")) }
+        if guard.is_some() {
+            Ok(guard)
+        } else {
+            Err(PyRuntimeError::new_err("these hands are closed"))
+        }
     }
 
     fn observation_size(&self) -> usize {
@@ -97,7 +110,8 @@ impl Hands {
     }
 
     fn rows<'py>(&self, py: Python<'py>, rows: Vec<f32>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        rows.into_pyarray(py).reshape([self.count, self.observation_size()])
+        rows.into_pyarray(py)
+            .reshape([self.count, self.observation_size()])
     }
 
     /// The lesson after `env_steps`. Every goal that is reached ends with a redirection, which the caller may ignore.
@@ -113,22 +127,34 @@ impl Hands {
     /// Starts the lesson that applies now. As in a training, it applies for the steps of an iteration.
     fn begin_lesson(&self, state: &mut State) {
         let steps = |from| (self.config.ppo.horizon_at(from) * self.count) as u64;
-        if state.lesson_from.is_none_or(|from| state.env_steps >= from.saturating_add(steps(from))) {
+        if state
+            .lesson_from
+            .is_none_or(|from| state.env_steps >= from.saturating_add(steps(from)))
+        {
             state.lesson_from = Some(state.env_steps);
             state.pool.set_lesson(self.lesson(state.env_steps));
         }
     }
 
     /// The last observations `[N, O]` of the environments that the last step cut off or ended, and zeros for the others.
-    fn finals<'py>(&self, py: Python<'py>, state: &State) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
+    fn finals<'py>(
+        &self,
+        py: Python<'py>,
+        state: &State,
+    ) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let size = self.observation_size();
         let members = || state.pool.blocks.iter().flat_map(|block| &block.members);
-        let is_cut = |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
+        let is_cut =
+            |end: &Option<End>| end.is_some_and(|end| end != End::Redirected || self.truncates);
         if self.autoreset != Autoreset::SameStep || !members().any(|member| is_cut(&member.end)) {
             return Ok(None);
         }
         let mut finals = vec![0.0; self.count * size];
-        for (to, member) in finals.chunks_exact_mut(size).zip(members()).filter(|(_, member)| is_cut(&member.end)) {
+        for (to, member) in finals
+            .chunks_exact_mut(size)
+            .zip(members())
+            .filter(|(_, member)| is_cut(&member.end))
+        {
             to.copy_from_slice(&member.final_observation);
         }
         self.rows(py, finals).map(Some)
@@ -142,12 +168,21 @@ impl Hands {
         actions: &[f32],
         rewards: &mut [f32],
     ) -> PyResult<Vec<(usize, EpisodeStats)>> {
-        let State { pool, workers, observations, .. } = &mut *state;
+        let State {
+            pool,
+            workers,
+            observations,
+            ..
+        } = &mut *state;
         let workers = workers.pool()?;
-        let stepped =
-            py.detach(|| guarded(|| workers.install(|| pool.step(actions, self.autoreset, rewards, observations))));
-        let stepped =
-            stepped.and_then(|stepped| stepped.map_err(|error| PyRuntimeError::new_err(format!("{error:#}"))));
+        let stepped = py.detach(|| {
+            guarded(|| {
+                workers.install(|| pool.step(actions, self.autoreset, rewards, observations))
+            })
+        });
+        let stepped = stepped.and_then(|stepped| {
+            stepped.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))
+        });
         if stepped.is_err() {
             state.can_step = Err(FAILED);
         }
@@ -155,15 +190,30 @@ impl Hands {
     }
 
     /// The terms of the last step, and zeros where a new episode took the place of the step.
-    fn step_terms<'py>(&self, py: Python<'py>, state: &mut State, restarted: &[bool]) -> PyResult<Terms<'py>> {
-        let weight = state.lesson_from.map_or(1.0, |from| self.lesson(from).task_reward);
-        let steps = state.pool.envs_mut().zip(restarted).map(|(hand, restarted)| match restarted {
-            true => (TaskReward::default(), TrainingReward::default(), hand.rot_dist()),
-            false => {
-                let step = &hand.last;
-                (step.reward, step.training, step.rot_dist)
-            }
-        });
+    fn step_terms<'py>(
+        &self,
+        py: Python<'py>,
+        state: &mut State,
+        restarted: &[bool],
+    ) -> PyResult<Terms<'py>> {
+        let weight = state
+            .lesson_from
+            .map_or(1.0, |from| self.lesson(from).task_reward);
+        let steps = state
+            .pool
+            .envs_mut()
+            .zip(restarted)
+            .map(|(hand, restarted)| match restarted {
+                true => (
+                    TaskReward::default(),
+                    TrainingReward::default(),
+                    hand.rot_dist(),
+                ),
+                false => {
+                    let step = &hand.last;
+                    (step.reward, step.training, step.rot_dist)
+                }
+            });
         let steps: Vec<(TaskReward, TrainingReward, f64)> = steps.collect();
         let terms = PyDict::new(py);
         let put = |name: &str, values: Vec<f64>| {
@@ -171,12 +221,28 @@ impl Hands {
             terms.set_item(name, values.into_pyarray(py))
         };
         for (i, term) in task_terms().iter().enumerate() {
-            put(term.0, steps.iter().map(|(reward, ..)| weight * reward[i]).collect())?;
+            put(
+                term.0,
+                steps
+                    .iter()
+                    .map(|(reward, ..)| weight * reward[i])
+                    .collect(),
+            )?;
         }
-        for (i, term) in training_terms().iter().enumerate().filter(|_| self.training) {
-            put(term.0, steps.iter().map(|(_, training, _)| training[i]).collect())?;
+        for (i, term) in training_terms()
+            .iter()
+            .enumerate()
+            .filter(|_| self.training)
+        {
+            put(
+                term.0,
+                steps.iter().map(|(_, training, _)| training[i]).collect(),
+            )?;
         }
-        let errors: Vec<f32> = steps.iter().map(|(.., rot_dist)| *rot_dist as f32).collect();
+        let errors: Vec<f32> = steps
+            .iter()
+            .map(|(.., rot_dist)| *rot_dist as f32)
+            .collect();
         Ok((terms, errors.into_pyarray(py)))
     }
 }
@@ -184,21 +250,39 @@ impl Hands {
 impl State {
     /// The ends `[N]` of the last step as numbers.
     fn ends(&self) -> Vec<u8> {
-        let number = |end: &Option<End>| ENDS.iter().position(|one| one == end).expect("an end") as u8;
-        self.pool.blocks.iter().flat_map(|block| &block.members).map(|member| number(&member.end)).collect()
+        let number =
+            |end: &Option<End>| ENDS.iter().position(|one| one == end).expect("an end") as u8;
+        self.pool
+            .blocks
+            .iter()
+            .flat_map(|block| &block.members)
+            .map(|member| number(&member.end))
+            .collect()
     }
 
     /// Which environments have finished an episode and have not begun the next one.
     fn waiting(&self) -> Vec<bool> {
         let members = self.pool.blocks.iter().flat_map(|block| &block.members);
-        members.map(|member| matches!(member.end, Some(End::Terminated | End::Truncated))).collect()
+        members
+            .map(|member| matches!(member.end, Some(End::Terminated | End::Truncated)))
+            .collect()
     }
 
     /// Restores the environments and their ends, and has them observe `size` values each.
-    fn restore(&mut self, saved: &EnvState, ends: Vec<Option<End>>, size: usize) -> anyhow::Result<()> {
+    fn restore(
+        &mut self,
+        saved: &EnvState,
+        ends: Vec<Option<End>>,
+        size: usize,
+    ) -> anyhow::Result<()> {
         let mut rest = &mut self.observations[..];
         let sizes = self.pool.block_sizes().into_iter();
-        let rows = sizes.map(|block| rest.split_off_mut(..block * size).expect("rows of each block")).collect();
+        let rows = sizes
+            .map(|block| {
+                rest.split_off_mut(..block * size)
+                    .expect("rows of each block")
+            })
+            .collect();
         self.pool.restore(saved, rows)?;
         let all = self.pool.members_mut().map(|member| &mut member.end);
         all.zip(ends).for_each(|(own, end)| *own = end);
@@ -207,7 +291,11 @@ impl State {
     }
 
     fn started(&mut self, marked: &[bool]) {
-        self.returns.iter_mut().zip(marked).filter(|(_, marked)| **marked).for_each(|(sum, _)| *sum = 0.0);
+        self.returns
+            .iter_mut()
+            .zip(marked)
+            .filter(|(_, marked)| **marked)
+            .for_each(|(sum, _)| *sum = 0.0);
     }
 }
 
@@ -233,12 +321,19 @@ impl Hands {
             "SameStep" => Autoreset::SameStep,
             "NextStep" => Autoreset::NextStep,
             "Disabled" => Autoreset::Disabled,
-            other => return Err(PyValueError::new_err(format!("autoreset_mode = {other}: unknown"))),
+            other => {
+                return Err(PyValueError::new_err(format!(
+                    "autoreset_mode = {other}: unknown"
+                )));
+            }
         };
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
             let overrides = overrides(set, training)?;
-            ensure!((1..=MOST_HANDS).contains(&count), "num_envs = {count}: must lie in [1, {MOST_HANDS}]");
+            ensure!(
+                (1..=MOST_HANDS).contains(&count),
+                "num_envs = {count}: must lie in [1, {MOST_HANDS}]"
+            );
             let (config, task) = match &policy {
                 None => resolve(config.as_deref(), &overrides)?,
                 Some(policy) => {
@@ -249,7 +344,11 @@ impl Hands {
                     policy.get().resolve(&overrides, training)?
                 }
             };
-            let randomization = if training { Randomization::new(&task, &config.randomization)? } else { None };
+            let randomization = if training {
+                Randomization::new(&task, &config.randomization)?
+            } else {
+                None
+            };
             let hand = |_| {
                 let goes_on = !stop.load(std::sync::atomic::Ordering::Relaxed);
                 goes_on.then(|| Repose::randomized(&task, randomization.as_ref()))
@@ -269,12 +368,27 @@ impl Hands {
             returns: vec![0.0; count],
             can_step: Err(NOT_RESET),
         };
-        Ok(Self { task, config, training, autoreset, truncates, terms, count, state: Mutex::new(Some(state)) })
+        Ok(Self {
+            task,
+            config,
+            training,
+            autoreset,
+            truncates,
+            terms,
+            count,
+            state: Mutex::new(Some(state)),
+        })
     }
 
     /// The groups of an observation: (name, first index, length, unit).
     fn layout(&self) -> Vec<(&'static str, usize, usize, &'static str)> {
-        self.task.hand.layout.groups.iter().map(|group| (group.name, group.start, group.length, group.unit)).collect()
+        self.task
+            .hand
+            .layout
+            .groups
+            .iter()
+            .map(|group| (group.name, group.start, group.length, group.unit))
+            .collect()
     }
 
     /// The number of values in an action.
@@ -309,7 +423,10 @@ impl Hands {
     /// Whether the environments have been reset and no step has failed since.
     #[getter]
     fn can_step(&self) -> PyResult<bool> {
-        Ok(self.locked()?.as_ref().is_some_and(|state| state.can_step.is_ok()))
+        Ok(self
+            .locked()?
+            .as_ref()
+            .is_some_and(|state| state.can_step.is_ok()))
     }
 
     #[getter]
@@ -334,13 +451,21 @@ impl Hands {
         marked: Option<PyReadonlyArray1<'py, bool>>,
         aged: bool,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let marked = marked.map_or(vec![true; self.count], |marked| marked.as_array().iter().copied().collect());
+        let marked = marked.map_or(vec![true; self.count], |marked| {
+            marked.as_array().iter().copied().collect()
+        });
         if marked.len() != self.count {
-            return Err(PyValueError::new_err(format!("{} marks for {} hands", marked.len(), self.count)));
+            return Err(PyValueError::new_err(format!(
+                "{} marks for {} hands",
+                marked.len(),
+                self.count
+            )));
         }
         let all = marked.iter().all(|marked| *marked);
         if let (Some(_), false) = (seed, all) {
-            return Err(PyValueError::new_err("a seed restarts all hands: give no seed with a reset_mask"));
+            return Err(PyValueError::new_err(
+                "a seed restarts all hands: give no seed with a reset_mask",
+            ));
         }
         let mut guard = self.locked()?;
         let state = guard.as_mut().expect("not closed");
@@ -352,9 +477,16 @@ impl Hands {
             state.pool.reseed(seed);
         }
         self.begin_lesson(state);
-        let State { pool, workers, observations, .. } = &mut *state;
+        let State {
+            pool,
+            workers,
+            observations,
+            ..
+        } = &mut *state;
         let workers = workers.pool()?;
-        let started = py.detach(|| guarded(|| workers.install(|| pool.restart(&marked, aged && all, observations))));
+        let started = py.detach(|| {
+            guarded(|| workers.install(|| pool.restart(&marked, aged && all, observations)))
+        });
         if let Err(error) = started {
             state.can_step = Err(FAILED);
             return Err(error);
@@ -365,38 +497,72 @@ impl Hands {
     }
 
     /// Steps all environments once.
-    fn step<'py>(&self, py: Python<'py>, actions: PyReadonlyArray2<'py, f32>) -> PyResult<Stepped<'py>> {
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        actions: PyReadonlyArray2<'py, f32>,
+    ) -> PyResult<Stepped<'py>> {
         let n = self.count;
         let size = self.action_size();
         if actions.shape() != [n, size] {
-            return Err(PyValueError::new_err(format!("actions must have the shape ({n}, {size})")));
+            return Err(PyValueError::new_err(format!(
+                "actions must have the shape ({n}, {size})"
+            )));
         }
         // A copy, because another Python thread may write to the array meanwhile.
         let actions: Vec<f32> = actions.as_array().iter().copied().collect();
         if let Some(at) = actions.iter().position(|x| x.is_nan()) {
-            return Err(PyValueError::new_err(format!("actions[{}, {}] is NaN", at / size, at % size)));
+            return Err(PyValueError::new_err(format!(
+                "actions[{}, {}] is NaN",
+                at / size,
+                at % size
+            )));
         }
         let mut guard = self.locked()?;
         let state = guard.as_mut().expect("not closed");
         state.can_step.map_err(PyRuntimeError::new_err)?;
         let waiting = state.waiting();
-        if let (Autoreset::Disabled, Some(hand)) = (self.autoreset, waiting.iter().position(|waits| *waits)) {
+        if let (Autoreset::Disabled, Some(hand)) =
+            (self.autoreset, waiting.iter().position(|waits| *waits))
+        {
             let text = format!("the episode of hand {hand} is over: reset it with a reset_mask");
             return Err(PyRuntimeError::new_err(text));
         }
-        let restarted = if self.autoreset == Autoreset::NextStep { waiting } else { vec![false; n] };
+        let restarted = if self.autoreset == Autoreset::NextStep {
+            waiting
+        } else {
+            vec![false; n]
+        };
         self.begin_lesson(state);
         let mut rewards = vec![0.0; n];
         let episodes = self.advance(py, state, &actions, &mut rewards)?;
         let stepped = restarted.iter().filter(|restarted| !**restarted).count() as u64;
         state.env_steps = state.env_steps.saturating_add(stepped);
-        state.returns.iter_mut().zip(&rewards).for_each(|(sum, reward)| *sum += f64::from(*reward));
-        let ended = if episodes.is_empty() { None } else { Some(columns(py, n, &episodes, &mut state.returns)?) };
+        state
+            .returns
+            .iter_mut()
+            .zip(&rewards)
+            .for_each(|(sum, reward)| *sum += f64::from(*reward));
+        let ended = if episodes.is_empty() {
+            None
+        } else {
+            Some(columns(py, n, &episodes, &mut state.returns)?)
+        };
         let observations = self.rows(py, state.observations.clone())?;
         let ends = state.ends().into_pyarray(py);
         let finals = self.finals(py, state)?;
-        let terms = self.terms.then(|| self.step_terms(py, state, &restarted)).transpose()?;
-        Ok((observations, rewards.into_pyarray(py), ends, ended, finals, terms))
+        let terms = self
+            .terms
+            .then(|| self.step_terms(py, state, &restarted))
+            .transpose()?;
+        Ok((
+            observations,
+            rewards.into_pyarray(py),
+            ends,
+            ended,
+            finals,
+            terms,
+        ))
     }
 
     /// The complete state of the environments: numbers `[N, k]`, counters `[N, m]`, ends `[N]` and returns `[N]`. The last array
@@ -417,7 +583,11 @@ impl Hands {
         state.can_step.map_err(PyRuntimeError::new_err)?;
         let EnvState { numbers, counters } = guarded(|| state.pool.save())?;
         // Where a new episode begins at once, the future does not depend on an end.
-        let ends = if self.autoreset == Autoreset::SameStep { vec![0; self.count] } else { state.ends() };
+        let ends = if self.autoreset == Autoreset::SameStep {
+            vec![0; self.count]
+        } else {
+            state.ends()
+        };
         let wide = numbers.len() / self.count;
         let long = counters.len() / self.count;
         Ok((
@@ -425,7 +595,12 @@ impl Hands {
             counters.into_pyarray(py).reshape([self.count, long])?,
             ends.into_pyarray(py),
             state.returns.clone().into_pyarray(py),
-            vec![state.seed, state.env_steps, state.lesson_from.unwrap_or(state.env_steps)].into_pyarray(py),
+            vec![
+                state.seed,
+                state.env_steps,
+                state.lesson_from.unwrap_or(state.env_steps),
+            ]
+            .into_pyarray(py),
         ))
     }
 
@@ -441,8 +616,11 @@ impl Hands {
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
         let mut guard = self.locked()?;
         let state = guard.as_mut().expect("not closed");
-        let ends: Option<Vec<Option<End>>> =
-            ends.as_array().iter().map(|end| ENDS.get(usize::from(*end)).copied()).collect();
+        let ends: Option<Vec<Option<End>>> = ends
+            .as_array()
+            .iter()
+            .map(|end| ENDS.get(usize::from(*end)).copied())
+            .collect();
         let returns: Vec<f64> = returns.as_array().iter().copied().collect();
         let times: Vec<u64> = times.as_array().iter().copied().collect();
         let rows = [numbers.shape()[0], counters.shape()[0], returns.len()];
@@ -453,11 +631,20 @@ impl Hands {
         };
         let restore = || {
             let ends = ends.context("an end is none of 0, 1, 2, 3")?;
-            ensure!(rows == [n; 3] && ends.len() == n, "it is the state of {} hands, these are {n}", ends.len());
+            ensure!(
+                rows == [n; 3] && ends.len() == n,
+                "it is the state of {} hands, these are {n}",
+                ends.len()
+            );
             let waits = |end: &Option<End>| matches!(end, Some(End::Terminated | End::Truncated));
             let due = self.autoreset == Autoreset::SameStep && ends.iter().any(waits);
-            ensure!(!due, "there, hands wait for their next episode; here they never do (autoreset_mode)");
-            let &[seed, env_steps, lesson_from] = times.as_slice() else { anyhow::bail!("three numbers are missing") };
+            ensure!(
+                !due,
+                "there, hands wait for their next episode; here they never do (autoreset_mode)"
+            );
+            let &[seed, env_steps, lesson_from] = times.as_slice() else {
+                anyhow::bail!("three numbers are missing")
+            };
             state.can_step = Err(NOT_SET);
             state.pool.set_lesson(self.lesson(lesson_from));
             state.pool.reseed(seed);
@@ -467,7 +654,9 @@ impl Hands {
             state.returns = returns;
             state.restore(&saved, ends, self.observation_size())
         };
-        guarded(restore)?.context("not a state of such hands").map_err(refused)?;
+        guarded(restore)?
+            .context("not a state of such hands")
+            .map_err(refused)?;
         self.rows(py, state.observations.clone())
     }
 
@@ -485,6 +674,14 @@ impl Hands {
     fn _panic_for_a_test(&self, py: Python) -> PyResult<()> {
         let mut guard = self.locked()?;
         let workers = guard.as_mut().expect("not closed").workers.pool()?;
-        py.detach(|| guarded(|| workers.install(|| (0..4).into_par_iter().for_each(|i| assert!(i != 2, "as asked")))))
+        py.detach(|| {
+            guarded(|| {
+                workers.install(|| {
+                    (0..4)
+                        .into_par_iter()
+                        .for_each(|i| assert!(i != 2, "as asked"))
+                })
+            })
+        })
     }
 }

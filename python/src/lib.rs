@@ -33,7 +33,11 @@ mod _native {
 fn flush_before_the_end() {
     shadow_repose::sim::before_fatal_error(|message| {
         Python::attach(|py| {
-            let flushed = py.run(c"import sys; sys.stdout.flush(); sys.stderr.flush()", None, None);
+            let flushed = py.run(
+                c"import sys; sys.stdout.flush(); sys.stderr.flush()",
+                None,
+                None,
+            );
             drop(flushed);
         });
         eprintln!("error: {message}");

@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex};
 
 use anyhow::Result;
 use numpy::{
-    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+    IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -48,19 +49,38 @@ impl Policy {
     ///
     /// # Errors
     /// Fails if the settings are invalid, or if the scene cannot be used.
-    pub(crate) fn resolve(&self, overrides: &[Override], training: bool) -> Result<(Config, Arc<Task>)> {
+    pub(crate) fn resolve(
+        &self,
+        overrides: &[Override],
+        training: bool,
+    ) -> Result<(Config, Arc<Task>)> {
         let overrides = self.with(overrides);
-        let is_of_task = |set: &&Override| matches!(set.key.split('.').next(), Some("env" | "hand"));
+        let is_of_task =
+            |set: &&Override| matches!(set.key.split('.').next(), Some("env" | "hand"));
         let of_task: Vec<Override> = overrides.iter().filter(is_of_task).cloned().collect();
         let task = self.loaded.task(&of_task)?;
         let whole = if training {
-            let learnt = Override { key: "training.assist".into(), value: "0".into() };
+            let learnt = Override {
+                key: "training.assist".into(),
+                value: "0".into(),
+            };
             let overrides: Vec<Override> = [learnt].into_iter().chain(overrides).collect();
-            load::settings(&self.loaded.checkpoint, self.loaded.origin.path(), Reader::Run, &overrides)?
+            load::settings(
+                &self.loaded.checkpoint,
+                self.loaded.origin.path(),
+                Reader::Run,
+                &overrides,
+            )?
         } else {
             Config::default()
         };
-        Ok((Config { env: task.config.clone(), ..whole }, task))
+        Ok((
+            Config {
+                env: task.config.clone(),
+                ..whole
+            },
+            task,
+        ))
     }
 
     /// Computes rows of `width` values for the observations.
@@ -74,7 +94,9 @@ impl Policy {
         let size = self.loaded.policy.spaces.observation_size;
         let [rows, found] = [observations.shape()[0], observations.shape()[1]];
         if found != size {
-            return Err(PyValueError::new_err(format!("observations of {found} values, this policy reads {size}")));
+            return Err(PyValueError::new_err(format!(
+                "observations of {found} values, this policy reads {size}"
+            )));
         }
         let seen: Vec<f32> = observations.as_array().iter().copied().collect();
         // Another call may be using the threads. In a fork made meanwhile, they stay in use for ever.
@@ -103,7 +125,11 @@ impl Policy {
             let set = overrides(set, false)?;
             let loaded = Loaded::find(Some(&place), &set)?;
             let settings = text(&*loaded.task(&set)?);
-            anyhow::Ok(Self { loaded, set, settings })
+            anyhow::Ok(Self {
+                loaded,
+                set,
+                settings,
+            })
         };
         py.detach(|| guarded(load))?.map_err(refused)
     }
@@ -118,7 +144,11 @@ impl Policy {
     #[getter]
     fn place(&self) -> PathBuf {
         let path = self.loaded.origin.path();
-        if self.loaded.origin.file().is_some() { std::path::absolute(path).unwrap_or(path.into()) } else { path.into() }
+        if self.loaded.origin.file().is_some() {
+            std::path::absolute(path).unwrap_or(path.into())
+        } else {
+            path.into()
+        }
     }
 
     /// The settings of its task, as JSON.
@@ -155,7 +185,8 @@ impl Policy {
         observations: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray1<f32>>> {
         let rows = observations.shape()[0];
-        self.computed(py, observations, 1, ppo::Policy::values)?.reshape([rows])
+        self.computed(py, observations, 1, ppo::Policy::values)?
+            .reshape([rows])
     }
 }
 
@@ -178,13 +209,22 @@ fn ask(
     let size = spaces.action_size;
     let rows = actions.len() / size;
     let asked = Python::attach(|py| {
-        let seen = observations.to_vec().into_pyarray(py).reshape([rows, spaces.observation_size])?;
+        let seen = observations
+            .to_vec()
+            .into_pyarray(py)
+            .reshape([rows, spaces.observation_size])?;
         let chosen: PyReadonlyArrayDyn<f32> = act.call1(py, (seen,))?.extract(py)?;
         if chosen.shape() != [rows, size] {
-            let text = format!("actions have the shape {:?}, expected [{rows}, {size}]", chosen.shape());
+            let text = format!(
+                "actions have the shape {:?}, expected [{rows}, {size}]",
+                chosen.shape()
+            );
             return Err(PyValueError::new_err(text));
         }
-        actions.iter_mut().zip(chosen.as_array()).for_each(|(action, chosen)| *action = *chosen);
+        actions
+            .iter_mut()
+            .zip(chosen.as_array())
+            .for_each(|(action, chosen)| *action = *chosen);
         Ok(())
     });
     stop.fetch_or(asked.is_err(), Ordering::Relaxed);
@@ -204,7 +244,9 @@ pub(crate) fn evaluate(
 ) -> PyResult<String> {
     let most = 1 << 20;
     if !(1..=most).contains(&episodes) {
-        return Err(PyValueError::new_err(format!("episodes = {episodes}: must lie in [1, {most}]")));
+        return Err(PyValueError::new_err(format!(
+            "episodes = {episodes}: must lie in [1, {most}]"
+        )));
     }
     let raised = Mutex::new(None);
     let played = Workers::new(threads).long(py, |stop| {
@@ -222,19 +264,43 @@ pub(crate) fn evaluate(
             if let Scored::Function(act) = &scored
                 && let Err(error) = ask(act, task.spaces(), (observations, actions), stop)
             {
-                raised.lock().expect("no panic while it is held").get_or_insert(error);
+                raised
+                    .lock()
+                    .expect("no panic while it is held")
+                    .get_or_insert(error);
             }
         };
-        let actor = loaded.map_or(Actor::Outside(&outside), |loaded| Actor::Mean(loaded.policy.freeze()));
+        let actor = loaded.map_or(Actor::Outside(&outside), |loaded| {
+            Actor::Mean(loaded.policy.freeze())
+        });
         let checkpoint = loaded.map(|loaded| loaded.origin.to_string());
         if let Some(path) = &trace {
-            run::expect_output(path, loaded.and_then(|loaded| loaded.origin.file()), task.config.model_file())?;
+            run::expect_output(
+                path,
+                loaded.and_then(|loaded| loaded.origin.file()),
+                task.config.model_file(),
+            )?;
         }
-        let trial = Trial { task: &task, actor: &actor, episodes: Episodes::scored(seed, episodes), stop };
+        let trial = Trial {
+            task: &task,
+            actor: &actor,
+            episodes: Episodes::scored(seed, episodes),
+            stop,
+        };
         let failed = || raised.lock().expect("no panic while it is held").is_some();
-        played(&trial, seed, checkpoint.as_deref(), trace.as_deref(), &failed)
+        played(
+            &trial,
+            seed,
+            checkpoint.as_deref(),
+            trace.as_deref(),
+            &failed,
+        )
     })?;
-    raised.into_inner().ok().flatten().map_or_else(|| played.map_err(refused), Err)
+    raised
+        .into_inner()
+        .ok()
+        .flatten()
+        .map_or_else(|| played.map_err(refused), Err)
 }
 
 /// Plays the episodes, and writes the first ones to the file `trace`. The result is their score as JSON, or nothing if they were
@@ -248,14 +314,23 @@ fn played(
 ) -> anyhow::Result<String> {
     let config = &trial.task.config;
     let output = trace.map(OutputFile::create).transpose()?;
-    let mut output = output.map(|file| (file, Trace::new(trial.task, trial.actor.name(), checkpoint, seed)));
+    let mut output = output.map(|file| {
+        (
+            file,
+            Trace::new(trial.task, trial.actor.name(), checkpoint, seed),
+        )
+    });
     let mut goal_times = GoalTimes::new(config);
     let played = trial.play(&mut |moment| {
         goal_times.observe(&moment);
-        output.iter_mut().for_each(|(_, trace)| trace.record(&moment));
+        output
+            .iter_mut()
+            .for_each(|(_, trace)| trace.record(&moment));
         Ok(())
     })?;
-    let Some(played) = played.filter(|_| !failed()) else { return Ok(String::new()) };
+    let Some(played) = played.filter(|_| !failed()) else {
+        return Ok(String::new());
+    };
     if let Some((file, trace)) = output {
         file.finish(trace.finish().as_bytes())?;
     }

@@ -18,22 +18,46 @@ pub(crate) type Set = Vec<(String, String)>;
 pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
     for (key, _) in &set {
         let section = key.split('.').next().unwrap_or(key);
-        ensure!(key != "env.num_envs", "env.num_envs: the number of hands is num_envs, not a setting");
-        ensure!(!matches!(section, "ppo" | "run"), "{key}: it is a setting of a learner, and here is none");
+        ensure!(
+            key != "env.num_envs",
+            "env.num_envs: the number of hands is num_envs, not a setting"
+        );
+        ensure!(
+            !matches!(section, "ppo" | "run"),
+            "{key}: it is a setting of a learner, and here is none"
+        );
         let only_training = matches!(section, "training" | "randomization");
-        ensure!(training || !only_training, "{key}: it holds only for VectorEnv(training=True)");
+        ensure!(
+            training || !only_training,
+            "{key}: it holds only for VectorEnv(training=True)"
+        );
     }
-    Ok(set.into_iter().map(|(key, value)| Override { key, value }).collect())
+    Ok(set
+        .into_iter()
+        .map(|(key, value)| Override { key, value })
+        .collect())
 }
 
 /// The settings and the task of environments without a policy.
 ///
 /// # Errors
 /// Fails if the settings are invalid, or if the scene cannot be used.
-pub(crate) fn resolve(config: Option<&Path>, overrides: &[Override]) -> Result<(Config, Arc<Task>)> {
-    let config = Settings::new().user_file(config)?.sets(overrides).resolve()?;
+pub(crate) fn resolve(
+    config: Option<&Path>,
+    overrides: &[Override],
+) -> Result<(Config, Arc<Task>)> {
+    let config = Settings::new()
+        .user_file(config)?
+        .sets(overrides)
+        .resolve()?;
     let task = Task::new(&config)?;
-    Ok((Config { env: task.config.clone(), ..config }, task))
+    Ok((
+        Config {
+            env: task.config.clone(),
+            ..config
+        },
+        task,
+    ))
 }
 
 /// The settings of a task as JSON: an object of sections.

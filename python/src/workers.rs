@@ -25,7 +25,10 @@ pub(crate) struct Workers {
 impl Workers {
     /// Prepares a pool with this number of threads (0: one per core).
     pub(crate) fn new(threads: usize) -> Self {
-        Self { threads, pool: None }
+        Self {
+            threads,
+            pool: None,
+        }
     }
 
     /// The pool of this process, which is started if need be.
@@ -36,9 +39,8 @@ impl Workers {
         let forked = self.forget_of_parent();
         let pool = match self.pool.take() {
             Some((_, pool)) => pool,
-            None if forked => {
-                os::thread_pool(self.threads).map_err(|error| PyRuntimeError::new_err(error.to_string()))?
-            }
+            None if forked => os::thread_pool(self.threads)
+                .map_err(|error| PyRuntimeError::new_err(error.to_string()))?,
             None => os::thread_pool(self.threads).map_err(refused)?,
         };
         Ok(&self.pool.insert((process::id(), pool)).1)
@@ -47,14 +49,21 @@ impl Workers {
     /// Forgets the threads of a parent process, and returns whether there were any. To drop them would take locks that a thread of the
     /// parent may have held at the fork.
     fn forget_of_parent(&mut self) -> bool {
-        self.pool.take_if(|(of, _)| *of != process::id()).map(std::mem::forget).is_some()
+        self.pool
+            .take_if(|(of, _)| *of != process::id())
+            .map(std::mem::forget)
+            .is_some()
     }
 
     /// Does long work in the pool, without Python's lock. Ctrl-C sets the flag that the work gets, waits for its end, and is raised.
     ///
     /// # Errors
     /// Fails if the work panics, or with the exception that a signal raises.
-    pub(crate) fn long<T: Send>(&mut self, py: Python, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
+    pub(crate) fn long<T: Send>(
+        &mut self,
+        py: Python,
+        work: impl FnOnce(&AtomicBool) -> T + Send,
+    ) -> PyResult<T> {
         let pool = self.pool()?;
         let stop = AtomicBool::new(false);
         let (tell, mut told) = mpsc::channel::<()>();
@@ -64,8 +73,9 @@ impl Workers {
                 let _tell = tell;
                 pool.install(|| work(&stop))
             });
-            let running =
-                running.map_err(|error| PyRuntimeError::new_err(format!("cannot start a thread: {error}")))?;
+            let running = running.map_err(|error| {
+                PyRuntimeError::new_err(format!("cannot start a thread: {error}"))
+            })?;
             let mut raised = Ok(());
             loop {
                 let waited = py.detach(|| {
@@ -81,7 +91,9 @@ impl Workers {
                     stop.fetch_or(raised.is_err(), Ordering::Relaxed);
                 }
             }
-            let done = py.detach(|| running.join()).map_err(|panic| panicked(&*panic));
+            let done = py
+                .detach(|| running.join())
+                .map_err(|panic| panicked(&*panic));
             raised.and(done)
         })
     }

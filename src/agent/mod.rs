@@ -11,7 +11,9 @@ use anyhow::{Context, Result, ensure};
 
 use crate::config::{Config, PpoConfig};
 use crate::env::{End, Env, EnvBlock, EnvPool, EnvState, Resumable};
-use crate::ppo::{Array, Checkpoint, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace};
+use crate::ppo::{
+    Array, Checkpoint, Fork, Ppo, Progress, Rollout, RolloutBlock, UpdateStats, Workspace,
+};
 use crate::ranks::Exchange;
 use crate::repose::{Lesson, Randomization, Repose, Task};
 use crate::schedule::in_rounds;
@@ -66,7 +68,11 @@ impl<L> Iteration<L> {
 
     /// The times and the speed, by name.
     pub fn time_named(&self) -> [(&'static str, f64); 3] {
-        [("collect_s", self.collect_s), ("update_s", self.update_s), ("steps_per_s", self.steps_per_s())]
+        [
+            ("collect_s", self.collect_s),
+            ("update_s", self.update_s),
+            ("steps_per_s", self.steps_per_s()),
+        ]
     }
 }
 
@@ -79,7 +85,9 @@ impl Agent<Repose> {
     pub fn for_task(task: &Arc<Task>, config: &Config, exchange: Exchange) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
         let own = exchange.own(config.env.num_envs);
-        let envs = own.map(|_| Repose::randomized(task, randomization.as_ref())).collect();
+        let envs = own
+            .map(|_| Repose::randomized(task, randomization.as_ref()))
+            .collect();
         let settings = config.clone();
         let lessons = move |env_steps| Lesson::at(env_steps, &settings);
         Self::new(envs, &config.ppo, config.run.seed, exchange, lessons)
@@ -102,7 +110,11 @@ impl<E: Env> Agent<E> {
         let mut pool = EnvPool::new(seed, envs, &exchange);
         let ppo = Ppo::new(config, pool.spaces(), seed, exchange.clone())?;
         let mut rollout = ppo.rollout(&pool.block_sizes());
-        let work = pool.block_sizes().into_iter().map(|envs| ppo.workspace(envs)).collect();
+        let work = pool
+            .block_sizes()
+            .into_iter()
+            .map(|envs| ppo.workspace(envs))
+            .collect();
         pool.set_lesson(lessons(0));
         pool.reset(rollout.first_observations_mut());
         Ok(Self {
@@ -125,15 +137,29 @@ impl<E: Env> Agent<E> {
     /// Fails if an environment panics, or if a loss, gradient or weight is not finite.
     pub fn iterate(&mut self, stop: &AtomicBool) -> Result<Option<Iteration<E::Lesson>>> {
         let started = Instant::now();
-        let Some(lesson) = self.collect(stop)? else { return Ok(None) };
+        let Some(lesson) = self.collect(stop)? else {
+            return Ok(None);
+        };
         let collected = Instant::now();
-        let Some(update) = self.ppo.update(&mut self.rollout, self.iteration + 1, stop)? else { return Ok(None) };
+        let Some(update) = self
+            .ppo
+            .update(&mut self.rollout, self.iteration + 1, stop)?
+        else {
+            return Ok(None);
+        };
         self.rollout.carry_over();
         let steps = self.exchange.of_all(self.rollout.samples()) as u64;
         self.iteration += 1;
         self.env_steps += steps;
-        let [collect_s, update_s] = [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
-        Ok(Some(Iteration { lesson, update, steps, collect_s, update_s }))
+        let [collect_s, update_s] =
+            [collected - started, collected.elapsed()].map(|time| time.as_secs_f64());
+        Ok(Some(Iteration {
+            lesson,
+            update,
+            steps,
+            collect_s,
+            update_s,
+        }))
     }
 
     /// Runs the first half of [`Agent::iterate`]: steps the environments through a whole rollout with the learner's actions. Returns
@@ -149,26 +175,42 @@ impl<E: Env> Agent<E> {
         let iteration = self.iteration + 1;
         let horizon = self.rollout.horizon;
         let acting = ppo.acting();
-        let parts = self.pool.blocks.iter_mut().zip(&mut self.rollout.blocks).zip(&mut self.work);
-        let blocks =
-            parts.map(|((envs, rollout), work)| (ppo.noise(iteration, envs.number), envs, rollout, work, Ok(())));
-        // Each block goes through its steps independently: no thread waits for the others before the rollout is complete.
-        let collected = in_rounds(blocks, horizon, |(noise, envs, rollout, work, result), t| {
-            if result.is_err() || stop.load(Ordering::Relaxed) {
-                return;
-            }
-            acting.act(rollout, t, noise, work);
-            *result = step_block(envs, rollout, t);
-            let row = rollout.step(t, 1);
-            let cut_off = envs.members.iter().map(|member| match member.end {
-                Some(End::Truncated | End::Redirected) => Some(&member.final_observation[..]),
-                Some(End::Terminated) | None => None,
-            });
-            acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, work);
-            if t + 1 == horizon {
-                acting.finish(rollout, horizon, work);
-            }
+        let parts = self
+            .pool
+            .blocks
+            .iter_mut()
+            .zip(&mut self.rollout.blocks)
+            .zip(&mut self.work);
+        let blocks = parts.map(|((envs, rollout), work)| {
+            (
+                ppo.noise(iteration, envs.number),
+                envs,
+                rollout,
+                work,
+                Ok(()),
+            )
         });
+        // Each block goes through its steps independently: no thread waits for the others before the rollout is complete.
+        let collected = in_rounds(
+            blocks,
+            horizon,
+            |(noise, envs, rollout, work, result), t| {
+                if result.is_err() || stop.load(Ordering::Relaxed) {
+                    return;
+                }
+                acting.act(rollout, t, noise, work);
+                *result = step_block(envs, rollout, t);
+                let row = rollout.step(t, 1);
+                let cut_off = envs.members.iter().map(|member| match member.end {
+                    Some(End::Truncated | End::Redirected) => Some(&member.final_observation[..]),
+                    Some(End::Terminated) | None => None,
+                });
+                acting.scale_and_bootstrap(&mut rollout.rewards[row], cut_off, work);
+                if t + 1 == horizon {
+                    acting.finish(rollout, horizon, work);
+                }
+            },
+        );
         collected.into_iter().try_for_each(|(.., result)| result)?;
         Ok((!stop.load(Ordering::Relaxed)).then_some(lesson))
     }
@@ -182,10 +224,17 @@ impl<E: Resumable> Agent<E> {
         progress.env_steps = self.env_steps;
         progress.fork.clone_from(&self.fork);
         self.ppo.save(checkpoint);
-        let EnvState { numbers, counters } = EnvState::joined(self.exchange.all_gather(self.pool.save()));
+        let EnvState { numbers, counters } =
+            EnvState::joined(self.exchange.all_gather(self.pool.save()));
         let rows = self.exchange.of_all(self.pool.count());
-        checkpoint.insert(NUMBERS, Array::F64(vec![rows, numbers.len() / rows], numbers));
-        checkpoint.insert(COUNTERS, Array::U64(vec![rows, counters.len() / rows], counters));
+        checkpoint.insert(
+            NUMBERS,
+            Array::F64(vec![rows, numbers.len() / rows], numbers),
+        );
+        checkpoint.insert(
+            COUNTERS,
+            Array::U64(vec![rows, counters.len() / rows], counters),
+        );
     }
 
     /// Restores what [`Agent::save`] has added, bit for bit, and takes it out of the checkpoint.
@@ -197,11 +246,16 @@ impl<E: Resumable> Agent<E> {
         self.iteration = progress.iteration;
         self.env_steps = progress.env_steps;
         self.fork.clone_from(&progress.fork);
-        self.ppo.begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
+        self.ppo
+            .begin_after(self.fork.as_ref().map_or(0, |fork| fork.iteration));
         self.ppo.restore(checkpoint)?;
         let numbers = checkpoint.take_doubles(NUMBERS)?;
-        let state = EnvState { numbers, counters: checkpoint.take_counters(COUNTERS)? };
-        self.pool.restore(&state, self.rollout.first_observations_mut())
+        let state = EnvState {
+            numbers,
+            counters: checkpoint.take_counters(COUNTERS)?,
+        };
+        self.pool
+            .restore(&state, self.rollout.first_observations_mut())
     }
 }
 
@@ -209,13 +263,28 @@ impl<E: Resumable> Agent<E> {
 ///
 /// # Errors
 /// Fails with the environment's number if an environment panics.
-pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t: usize) -> Result<()> {
-    let Spaces { observation_size, action_size, .. } = envs.spaces;
+pub fn step_block<E: Env>(
+    envs: &mut EnvBlock<E>,
+    rollout: &mut RolloutBlock,
+    t: usize,
+) -> Result<()> {
+    let Spaces {
+        observation_size,
+        action_size,
+        ..
+    } = envs.spaces;
     let row = rollout.step(t, 1);
     let actions = rollout.step(t, action_size);
     let next = rollout.step(t + 1, observation_size);
-    envs.step(&rollout.actions[actions], &mut rollout.rewards[row.clone()], &mut rollout.observations[next])?;
-    rollout.dones[row].iter_mut().zip(&envs.members).for_each(|(done, member)| *done = member.end.is_some());
+    envs.step(
+        &rollout.actions[actions],
+        &mut rollout.rewards[row.clone()],
+        &mut rollout.observations[next],
+    )?;
+    rollout.dones[row]
+        .iter_mut()
+        .zip(&envs.members)
+        .for_each(|(done, member)| *done = member.end.is_some());
     Ok(())
 }
 
@@ -225,21 +294,36 @@ pub fn step_block<E: Env>(envs: &mut EnvBlock<E>, rollout: &mut RolloutBlock, t:
 /// # Errors
 /// Fails if the checkpoint holds a policy alone, or if the numbers do not match.
 pub fn expect_states(checkpoint: &Checkpoint, config: &Config) -> Result<()> {
-    let Progress { iteration, env_steps, ref fork, .. } = checkpoint.progress;
+    let Progress {
+        iteration,
+        env_steps,
+        ref fork,
+        ..
+    } = checkpoint.progress;
     // The parent of a fork may have made a different number of steps in each iteration.
-    let [before, steps_before] = fork.as_ref().map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
+    let [before, steps_before] = fork
+        .as_ref()
+        .map_or([0, 0], |fork| [fork.iteration, fork.env_steps]);
     let own = i128::from(iteration) - i128::from(before);
     let steps = i128::from(env_steps) - i128::from(steps_before);
     // An iteration makes at least as many steps as the first one, and at most as many as the last one.
     let least = i128::from(config.steps_per_iteration());
     let most = (config.env.num_envs * config.ppo.horizon_at(u64::MAX)) as i128;
     let possible = own >= 0 && (own * least..=own * most).contains(&steps) && steps % least == 0;
-    ensure!(possible, "{iteration} iterations cannot have made {env_steps} steps");
+    ensure!(
+        possible,
+        "{iteration} iterations cannot have made {env_steps} steps"
+    );
     for name in [NUMBERS, COUNTERS] {
-        let shape = checkpoint.shape(name).context("it holds a policy alone, which can be played but not resumed")?;
+        let shape = checkpoint
+            .shape(name)
+            .context("it holds a policy alone, which can be played but not resumed")?;
         let rows = shape.first().copied().unwrap_or(0);
         let expected = config.env.num_envs;
-        ensure!(rows == expected, "it holds the states of {rows} environments, expected {expected}");
+        ensure!(
+            rows == expected,
+            "it holds the states of {rows} environments, expected {expected}"
+        );
     }
     Ok(())
 }

@@ -12,8 +12,11 @@ use crate::repose::Task;
 
 /// The numbers of environments that are compared, the key of their speed in JSON, and how much a step brings compared with a step of
 /// 1024 environments. The worth of a step comes from training runs of 15 M steps with the default settings (`docs/RECIPES.md`).
-const COMPARED: [(usize, &str, f64); 3] =
-    [(512, "steps_per_s_of_512", 0.56), (1024, "steps_per_s_of_1024", 1.0), (2048, "steps_per_s_of_2048", 0.74)];
+const COMPARED: [(usize, &str, f64); 3] = [
+    (512, "steps_per_s_of_512", 0.56),
+    (1024, "steps_per_s_of_1024", 1.0),
+    (2048, "steps_per_s_of_2048", 0.74),
+];
 
 /// Whole iterations of each training run that are measured, in turn, after one that is not.
 const ITERATIONS: usize = 2;
@@ -26,13 +29,22 @@ pub fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let mut measured = Vec::new();
     for (envs, key, worth) in COMPARED {
         let number = format!("env.num_envs={envs}").parse().expect("a setting");
-        let Ok(config) = Settings::new().file(given.clone()).sets(&[number]).resolve() else { continue };
+        let Ok(config) = Settings::new()
+            .file(given.clone())
+            .sets(&[number])
+            .resolve()
+        else {
+            continue;
+        };
         let agent = Agent::for_task(task, &config, Exchange::alone(config.shards()))?;
         measured.push((envs, key, worth, agent, Vec::new()));
     }
     for round in 0..=ITERATIONS {
         for (.., agent, rates) in &mut measured {
-            let speed = agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s();
+            let speed = agent
+                .iterate(&NEVER)?
+                .context("nothing stops it")?
+                .steps_per_s();
             rates.extend((round > 0).then_some(speed));
         }
     }
@@ -44,8 +56,9 @@ pub fn environments(task: &Arc<Task>, config: &Config) -> Result<Found> {
         let speed = median(rates);
         let learning = worth * speed;
         figures.push((key, speed));
-        lines +=
-            &format!("{envs:>5} environments        {speed:>10.0} steps/s   worth {learning:.0} steps/s with 1024\n");
+        lines += &format!(
+            "{envs:>5} environments        {speed:>10.0} steps/s   worth {learning:.0} steps/s with 1024\n"
+        );
         if learning > most {
             most = learning;
             best = Some(envs);

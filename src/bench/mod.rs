@@ -50,7 +50,10 @@ const END_TO_END_ITERATIONS: usize = 4;
 /// Fails if a setting or the scene cannot be used.
 pub fn bench(args: &BenchArgs) -> Result<()> {
     expect_used(&args.settings.set, "bench")?;
-    let mut config = Settings::new().user_file(args.settings.config.as_deref())?.sets(&args.settings.set).resolve()?;
+    let mut config = Settings::new()
+        .user_file(args.settings.config.as_deref())?
+        .sets(&args.settings.set)
+        .resolve()?;
     config.run.threads = args.threads.unwrap_or(config.run.threads);
     os::start_threads(config.run.threads)?;
     let task = Task::new(&config)?;
@@ -62,19 +65,30 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     let hidden = &config.ppo.hidden;
     let mut figures = json!({ "threads": threads, "num_envs": num_envs, "hidden": hidden });
     let samples = config.samples_per_minibatch();
-    let mut lines = format!("{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n");
+    let mut lines = format!(
+        "{threads} threads, {num_envs} environments, nets {hidden:?}, minibatches of {samples}\n"
+    );
     let measures: [(Part, Measurement); 4] = [
         (Part::Physics, physics_and_pool),
         (Part::Learner, learner),
         (Part::Training, end_to_end),
         (Part::Environments, environments),
     ];
-    for (_, measure) in measures.into_iter().filter(|(part, _)| args.only.is_none_or(|only| only == *part)) {
+    for (_, measure) in measures
+        .into_iter()
+        .filter(|(part, _)| args.only.is_none_or(|only| only == *part))
+    {
         let (found, text) = measure(&task, &config)?;
-        found.into_iter().for_each(|(key, value)| figures[key] = json!(value));
+        found
+            .into_iter()
+            .for_each(|(key, value)| figures[key] = json!(value));
         lines += &text;
     }
-    os::print(&if args.json { format!("{figures}\n") } else { lines })
+    os::print(&if args.json {
+        format!("{figures}\n")
+    } else {
+        lines
+    })
 }
 
 /// The measurement of a part.
@@ -91,7 +105,9 @@ struct Bursts {
 impl Bursts {
     fn new(task: &Arc<Task>, config: &Config) -> Result<Self> {
         let randomization = Randomization::new(task, &config.randomization)?;
-        let envs = (0..config.env.num_envs).map(|_| RecordingEnv::new(task, randomization.as_ref())).collect();
+        let envs = (0..config.env.num_envs)
+            .map(|_| RecordingEnv::new(task, randomization.as_ref()))
+            .collect();
         let mut pool = EnvPool::new(config.run.seed, envs, &Exchange::alone(1));
         let mut lesson = Lesson::task(&config.env);
         lesson.randomized = Lesson::at(0, config).randomized;
@@ -99,19 +115,38 @@ impl Bursts {
         let mut rollout = Rollout::new(BURST, &pool.block_sizes(), &task.spaces());
         pool.reset(rollout.first_observations_mut());
         let noise = rng::stream(config.run.seed, "bench", 0);
-        Ok(Self { pool, rollout, noise, std: config.ppo.std.at(0) as f32 })
+        Ok(Self {
+            pool,
+            rollout,
+            noise,
+            std: config.ppo.std.at(0) as f32,
+        })
     }
 
     /// Steps the environments through a burst, and tells the seconds that it took.
     fn step(&mut self) -> f64 {
-        let Self { pool, rollout, noise, std } = self;
-        let actions = rollout.blocks.iter_mut().flat_map(|block| &mut block.actions);
-        actions.for_each(|action| *action = *std * Distribution::<f32>::sample(&StandardNormal, noise));
+        let Self {
+            pool,
+            rollout,
+            noise,
+            std,
+        } = self;
+        let actions = rollout
+            .blocks
+            .iter_mut()
+            .flat_map(|block| &mut block.actions);
+        actions.for_each(|action| {
+            *action = *std * Distribution::<f32>::sample(&StandardNormal, noise)
+        });
         pool.envs_mut().for_each(RecordingEnv::begin);
         let start = Instant::now();
-        let stepped = in_rounds(pool.blocks.iter_mut().zip(&mut rollout.blocks), BURST, |(envs, rollout), t| {
-            step_block(envs, rollout, t).expect("environments do not panic");
-        });
+        let stepped = in_rounds(
+            pool.blocks.iter_mut().zip(&mut rollout.blocks),
+            BURST,
+            |(envs, rollout), t| {
+                step_block(envs, rollout, t).expect("environments do not panic");
+            },
+        );
         drop(stepped);
         start.elapsed().as_secs_f64()
     }
@@ -135,8 +170,15 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
             bare_seconds += replay(&mut bursts.pool)?;
         }
         let done = (in_round * BURST * envs) as f64;
-        let found = [done / bare_seconds, done / pool_seconds, bare_seconds / pool_seconds];
-        rates.iter_mut().zip(found).for_each(|(rates, rate)| rates.push(rate));
+        let found = [
+            done / bare_seconds,
+            done / pool_seconds,
+            bare_seconds / pool_seconds,
+        ];
+        rates
+            .iter_mut()
+            .zip(found)
+            .for_each(|(rates, rate)| rates.push(rate));
     }
     let [physics, pool, share] = rates.map(median);
     let lines = format!(
@@ -144,7 +186,14 @@ fn physics_and_pool(task: &Arc<Task>, config: &Config) -> Result<Found> {
          environments              {pool:>10.0} steps/s   {:.1} % of the physics\n",
         100.0 * share
     );
-    Ok((vec![("physics_steps_per_s", physics), ("pool_steps_per_s", pool), ("pool_share", share)], lines))
+    Ok((
+        vec![
+            ("physics_steps_per_s", physics),
+            ("pool_steps_per_s", pool),
+            ("pool_share", share),
+        ],
+        lines,
+    ))
 }
 
 /// Measures the samples per second and GFLOP/s of gradient steps, and the GFLOP/s of their matrix products alone.
@@ -163,9 +212,16 @@ fn learner(task: &Arc<Task>, config: &Config) -> Result<Found> {
         "learner                   {samples:>10.0} samples/s {gflops:.1} GFLOP/s\n\
          its matrix products alone                      {matmul:.1} GFLOP/s\n"
     );
-    let mut figures = vec![("learner_samples_per_s", samples), ("learner_gflops", gflops), ("matmul_gflops", matmul)];
+    let mut figures = vec![
+        ("learner_samples_per_s", samples),
+        ("learner_gflops", gflops),
+        ("matmul_gflops", matmul),
+    ];
     if let Some(waiting) = waiting {
-        lines += &format!("its threads wait          {:>10.1} % of the time\n", 100.0 * waiting);
+        lines += &format!(
+            "its threads wait          {:>10.1} % of the time\n",
+            100.0 * waiting
+        );
         figures.push(("learner_waits", waiting));
     }
     Ok((figures, lines))
@@ -178,15 +234,32 @@ fn end_to_end(task: &Arc<Task>, config: &Config) -> Result<Found> {
     let begun = Instant::now();
     let mut rates = Vec::new();
     for _ in 0..=END_TO_END_ITERATIONS {
-        rates.push(agent.iterate(&NEVER)?.context("nothing stops it")?.steps_per_s());
+        rates.push(
+            agent
+                .iterate(&NEVER)?
+                .context("nothing stops it")?
+                .steps_per_s(),
+        );
         if begun.elapsed().as_secs_f64() > END_TO_END_S {
             break;
         }
     }
-    let speed = median(if rates.len() > 1 { rates.split_off(1) } else { rates });
+    let speed = median(if rates.len() > 1 {
+        rates.split_off(1)
+    } else {
+        rates
+    });
     let total = config.run.total_steps as f64;
     let hours = total / speed / 3600.0;
     let millions = total / 1e6;
-    let line = format!("end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n");
-    Ok((vec![("end_to_end_steps_per_s", speed), ("default_training_hours", hours)], line))
+    let line = format!(
+        "end to end                {speed:>10.0} steps/s   {millions:.0} M steps take {hours:.1} h\n"
+    );
+    Ok((
+        vec![
+            ("end_to_end_steps_per_s", speed),
+            ("default_training_hours", hours),
+        ],
+        line,
+    ))
 }

@@ -73,8 +73,14 @@ impl RecordingEnv {
         self.scenes.clear();
         for Start { draw, .. } in &self.starts {
             if *draw != self.drawn.0 {
-                let scene = self.randomization.as_ref().map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand));
-                self.drawn = (draw.clone(), scene.unwrap_or_else(|| self.env.task.scene.clone()));
+                let scene = self
+                    .randomization
+                    .as_ref()
+                    .map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand));
+                self.drawn = (
+                    draw.clone(),
+                    scene.unwrap_or_else(|| self.env.task.scene.clone()),
+                );
             }
             self.scenes.push(self.drawn.1.clone());
         }
@@ -95,7 +101,9 @@ impl RecordingEnv {
     fn go_on(&mut self, steps: usize) {
         if let Some(i) = self.starts.iter().position(|start| start.after == steps) {
             self.bare.change_scene(&self.scenes[i]);
-            self.bare.restore(&self.starts[i].state).expect("a state of the same scene");
+            self.bare
+                .restore(&self.starts[i].state)
+                .expect("a state of the same scene");
         }
     }
 }
@@ -122,7 +130,8 @@ impl Env for RecordingEnv {
 
     fn step(&mut self, action: &[f32], observation: &mut [f32]) -> Transition {
         let transition = self.env.step(action, observation);
-        self.steps.push((self.env.sim.ctrl().to_vec(), self.env.last.push));
+        self.steps
+            .push((self.env.sim.ctrl().to_vec(), self.env.last.push));
         transition
     }
 
@@ -146,10 +155,18 @@ pub fn replay(pool: &mut EnvPool<RecordingEnv>) -> Result<f64> {
     let steps = envs[0].steps.len();
     let start = Instant::now();
     in_rounds(&mut pool.blocks, steps, |block, step| {
-        block.members.iter_mut().for_each(|member| member.env.replay(step));
+        block
+            .members
+            .iter_mut()
+            .for_each(|member| member.env.replay(step));
     });
     let seconds = start.elapsed().as_secs_f64();
-    let same = pool.envs_mut().all(|env| env.bare.qpos() == env.env.sim.qpos());
-    ensure!(same, "the replay of the physics did not end in the states of the environments");
+    let same = pool
+        .envs_mut()
+        .all(|env| env.bare.qpos() == env.env.sim.qpos());
+    ensure!(
+        same,
+        "the replay of the physics did not end in the states of the environments"
+    );
     Ok(seconds)
 }

@@ -32,7 +32,11 @@ const PICTURE: &str = "Film, picture and window";
 
 /// Trains a simulated Shadow Hand to turn a cube in its palm to any requested orientation, on a CPU.
 #[derive(Parser)]
-#[command(arg_required_else_help = true, disable_help_flag = true, max_term_width = 100)]
+#[command(
+    arg_required_else_help = true,
+    disable_help_flag = true,
+    max_term_width = 100
+)]
 #[command(after_help = "Examples:\n  shadow-repose play --ckpt builtin\n  shadow-repose train")]
 pub struct Cli {
     /// The command to run.
@@ -47,7 +51,9 @@ pub struct Cli {
 #[derive(Subcommand)]
 pub enum Command {
     /// Train a policy; Ctrl-C saves and stops
-    #[command(after_help = "Examples:\n  shadow-repose train --seed 1 --name first\n  shadow-repose train --resume")]
+    #[command(
+        after_help = "Examples:\n  shadow-repose train --seed 1 --name first\n  shadow-repose train --resume"
+    )]
     Train(TrainArgs),
     /// Play a policy in a window or a browser, as a film, or for its score alone
     #[command(
@@ -55,7 +61,9 @@ pub enum Command {
     )]
     Play(PlayArgs),
     /// Show the scene without a policy, in a window or a browser
-    #[command(after_help = "Examples:\n  shadow-repose view --actions wave\n  shadow-repose view --web")]
+    #[command(
+        after_help = "Examples:\n  shadow-repose view --actions wave\n  shadow-repose view --web"
+    )]
     View(ViewArgs),
     /// Write a policy as an ONNX file, for programs in other languages
     #[command(
@@ -72,7 +80,9 @@ pub enum Command {
     #[command(after_help = "Examples:\n  shadow-repose runs --watch\n  shadow-repose runs RUN RUN")]
     Runs(RunsArgs),
     /// Measure the speed of this machine: physics, environments, learner and whole iterations
-    #[command(after_help = "Examples:\n  shadow-repose bench\n  shadow-repose bench --only training --threads 4")]
+    #[command(
+        after_help = "Examples:\n  shadow-repose bench\n  shadow-repose bench --only training --threads 4"
+    )]
     Bench(BenchArgs),
     /// Print completions for a shell
     #[command(after_help = concat!(
@@ -100,19 +110,27 @@ pub fn command() -> clap::Command {
     ];
     let with_defaults = |arg: clap::Arg| {
         let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
-        arg.help(defaults.iter().fold(help, |help, (key, value)| help.replace(key, value)))
+        arg.help(
+            defaults
+                .iter()
+                .fold(help, |help, (key, value)| help.replace(key, value)),
+        )
     };
     let program = env!("CARGO_PKG_VERSION");
     let commit = env!("SHADOW_REPOSE_COMMIT");
     let version = format!("{program} ({commit}, MuJoCo {})", sim::mujoco_version());
-    Cli::command().version(version).mut_subcommands(|command| command.mut_args(with_defaults))
+    Cli::command()
+        .version(version)
+        .mut_subcommands(|command| command.mut_args(with_defaults))
 }
 
 /// Parses a command line, which begins with the name of the program.
 ///
 /// # Errors
 /// Fails if the command line is wrong, or asks for help or the version.
-pub fn parse_from<T: Into<OsString> + Clone>(words: impl IntoIterator<Item = T>) -> Result<Cli, clap::Error> {
+pub fn parse_from<T: Into<OsString> + Clone>(
+    words: impl IntoIterator<Item = T>,
+) -> Result<Cli, clap::Error> {
     let matches = command().try_get_matches_from(words)?;
     let mut cli = Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command()))?;
     let given = given(&matches);
@@ -315,7 +333,13 @@ pub struct ShotArgs {
 impl ShotArgs {
     /// What to show, with this size and quality.
     pub fn sized(&self, size: [u32; 2], quality: Quality) -> Look {
-        Look { dress: None, size, camera: self.camera, quality, plain: self.plain }
+        Look {
+            dress: None,
+            size,
+            camera: self.camera,
+            quality,
+            plain: self.plain,
+        }
     }
 }
 
@@ -330,7 +354,10 @@ impl PlayArgs {
 pub fn usage_error(name: &str, text: &str) -> clap::Error {
     let mut command = command();
     command.build();
-    command.find_subcommand_mut(name).expect("a command").error(ErrorKind::ArgumentConflict, text)
+    command
+        .find_subcommand_mut(name)
+        .expect("a command")
+        .error(ErrorKind::ArgumentConflict, text)
 }
 
 /// The options of `bench`.

@@ -40,12 +40,31 @@ const GO_WITH: [Row; 6] = [
     (
         Made::Web,
         "a page in a browser (--web)",
-        &["--web", "--hands", "--follow", "--ckpt", "--stochastic", "--seed", "--threads", "--camera", "--plain"],
+        &[
+            "--web",
+            "--hands",
+            "--follow",
+            "--ckpt",
+            "--stochastic",
+            "--seed",
+            "--threads",
+            "--camera",
+            "--plain",
+        ],
     ),
     (
         Made::Score,
         "a score",
-        &["--headless", "--json", "--out FILE.jsonl", "--ckpt", "--stochastic", "--episodes", "--seed", "--threads"],
+        &[
+            "--headless",
+            "--json",
+            "--out FILE.jsonl",
+            "--ckpt",
+            "--stochastic",
+            "--episodes",
+            "--seed",
+            "--threads",
+        ],
     ),
     (
         Made::Robustness,
@@ -66,9 +85,23 @@ const GO_WITH: [Row; 6] = [
     (
         Made::Picture,
         "a film or a picture (--out)",
-        &["--out FILE.mp4", "--out FILE.gif", "--fps", "--at", "--seed", "--size", "--camera", "--quality", "--plain"],
+        &[
+            "--out FILE.mp4",
+            "--out FILE.gif",
+            "--fps",
+            "--at",
+            "--seed",
+            "--size",
+            "--camera",
+            "--quality",
+            "--plain",
+        ],
     ),
-    (Made::Page, "an HTML file (--out)", &["--out FILE.html", "--from-trace", "--camera", "--plain"]),
+    (
+        Made::Page,
+        "an HTML file (--out)",
+        &["--out FILE.html", "--from-trace", "--camera", "--plain"],
+    ),
 ];
 
 type Row = (Made, &'static str, &'static [&'static str]);
@@ -80,7 +113,9 @@ type Row = (Made, &'static str, &'static [&'static str]);
 pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
     let names = |of: &dyn Fn(&Row) -> bool, between: &str| {
         let rows = GO_WITH.iter().filter(|row| of(row));
-        rows.map(|(_, name, _)| *name).collect::<Vec<_>>().join(between)
+        rows.map(|(_, name, _)| *name)
+            .collect::<Vec<_>>()
+            .join(between)
     };
     let is_made = |(row, ..): &Row| made.contains(row);
     for option in given {
@@ -88,7 +123,9 @@ pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
         if GO_WITH.iter().any(takes) && !GO_WITH.iter().any(|row| is_made(row) && takes(row)) {
             let here = names(&is_made, " and ");
             let needed = names(&takes, " or ");
-            return Err(format!("{option} cannot be used with {here}; it applies only to {needed}"));
+            return Err(format!(
+                "{option} cannot be used with {here}; it applies only to {needed}"
+            ));
         }
     }
     Ok(())
@@ -96,8 +133,12 @@ pub fn expect_together(made: &[Made], given: &[String]) -> Result<(), String> {
 
 /// The options of the command that stand on the command line, without those that have their defaults.
 pub fn given(matches: &ArgMatches) -> Vec<String> {
-    let Some((_, of_command)) = matches.subcommand() else { return Vec::new() };
+    let Some((_, of_command)) = matches.subcommand() else {
+        return Vec::new();
+    };
     let ids = of_command.ids().map(clap::Id::as_str);
     let given = ids.filter(|id| of_command.value_source(id) == Some(ValueSource::CommandLine));
-    given.map(|id| format!("--{}", id.replace('_', "-"))).collect()
+    given
+        .map(|id| format!("--{}", id.replace('_', "-")))
+        .collect()
 }

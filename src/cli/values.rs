@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
-use clap::builder::{OsStringValueParser, PossibleValuesParser, RangedU64ValueParser, TypedValueParser};
+use clap::builder::{
+    OsStringValueParser, PossibleValuesParser, RangedU64ValueParser, TypedValueParser,
+};
 
 use crate::os::Destination;
 use crate::sim::{Camera, Quality};
@@ -24,21 +26,34 @@ pub fn threads() -> RangedU64ValueParser<usize> {
 }
 
 pub fn size(text: &str) -> Result<[u32; 2], String> {
-    let (width, height) = text.split_once('x').ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
+    let (width, height) = text
+        .split_once('x')
+        .ok_or("must be WIDTHxHEIGHT, e.g. 640x480")?;
     let pixels = |text: &str, largest: u32| match text.parse() {
         Ok(pixels) if (16..=largest).contains(&pixels) => Ok(pixels),
-        _ => Err(format!("{text} must be a whole number from 16 to {largest}")),
+        _ => Err(format!(
+            "{text} must be a whole number from 16 to {largest}"
+        )),
     };
     Ok([pixels(width, 3840)?, pixels(height, 2160)?])
 }
 
 pub fn camera(text: &str) -> Result<Camera, String> {
-    let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    let numbers: Result<Vec<f64>, _> = text
+        .split(',')
+        .map(|number| number.trim().parse())
+        .collect();
     match numbers.as_deref() {
         Ok(&[azimuth, elevation, distance]) if azimuth.is_finite() && elevation.is_finite() => {
             match (0.05..=10.0).contains(&distance) {
-                true => Ok(Camera { azimuth, elevation, distance }),
-                false => Err(format!("the distance of {distance} m must be from 0.05 to 10 m")),
+                true => Ok(Camera {
+                    azimuth,
+                    elevation,
+                    distance,
+                }),
+                false => Err(format!(
+                    "the distance of {distance} m must be from 0.05 to 10 m"
+                )),
             }
         }
         _ => Err("must be three numbers, e.g. 150,-27,0.66".into()),
@@ -47,19 +62,37 @@ pub fn camera(text: &str) -> Result<Camera, String> {
 
 pub fn steps(text: &str) -> Result<u64, String> {
     // Users write large numbers of steps as 1e8.
-    let float = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
-    let steps = text.parse().ok().or(float).filter(|steps| (1..=LARGEST).contains(steps));
+    let float = text
+        .parse::<f64>()
+        .ok()
+        .filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x))
+        .map(|x| x as u64);
+    let steps = text
+        .parse()
+        .ok()
+        .or(float)
+        .filter(|steps| (1..=LARGEST).contains(steps));
     steps.ok_or_else(|| "must be a whole number of at least 1, e.g. 30000000 or 3e7".into())
 }
 
 pub fn time(text: &str) -> Result<Duration, String> {
-    let time = text.parse::<jiff::SignedDuration>().ok().and_then(|time| Duration::try_from(time).ok());
-    time.filter(|time| !time.is_zero()).ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
+    let time = text
+        .parse::<jiff::SignedDuration>()
+        .ok()
+        .and_then(|time| Duration::try_from(time).ok());
+    time.filter(|time| !time.is_zero())
+        .ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
 }
 
 pub fn quality() -> impl TypedValueParser<Value = Quality> {
     // Shells complete them.
-    PossibleValuesParser::new(["fast", "high"]).map(|text| if text == "fast" { Quality::Fast } else { Quality::High })
+    PossibleValuesParser::new(["fast", "high"]).map(|text| {
+        if text == "fast" {
+            Quality::Fast
+        } else {
+            Quality::High
+        }
+    })
 }
 
 pub fn destination(endings: &'static [&'static str]) -> impl TypedValueParser<Value = Destination> {
@@ -67,6 +100,9 @@ pub fn destination(endings: &'static [&'static str]) -> impl TypedValueParser<Va
 }
 
 pub fn seconds(text: &str) -> Result<f64, String> {
-    let seconds = text.parse().ok().filter(|seconds| (0.0..=3600.0).contains(seconds));
+    let seconds = text
+        .parse()
+        .ok()
+        .filter(|seconds| (0.0..=3600.0).contains(seconds));
     seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
 }

@@ -29,7 +29,9 @@ pub fn expect_used(overrides: &[Override], command: &str) -> Result<()> {
 /// The commands that use a setting.
 fn users(key: &str) -> &'static [&'static str] {
     match key {
-        "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.patience" => &["train"],
+        "run.checkpoint_every" | "run.eval_every" | "run.eval_episodes" | "run.patience" => {
+            &["train"]
+        }
         "env.num_envs" => &["train", "bench"],
         key if ["env.", "hand."].iter().any(|begin| key.starts_with(begin)) => {
             &["train", "bench", "play", "view", "export"]
@@ -44,8 +46,9 @@ mod tests {
 
     #[test]
     fn a_setting_that_a_command_does_not_use_is_refused_with_those_that_do() {
-        let answer =
-            |set: &str, command| expect_used(&[set.parse().unwrap()], command).map_err(|error| error.to_string());
+        let answer = |set: &str, command| {
+            expect_used(&[set.parse().unwrap()], command).map_err(|error| error.to_string())
+        };
         for (set, command, users) in [
             ("env.num_envs=99", "play", "`train` and `bench` do"),
             ("ppo.gamma=0.5", "view", "`train` and `bench` do"),
@@ -56,10 +59,15 @@ mod tests {
             ("env={num_envs=9}", "view", "`train` and `bench` do"),
         ] {
             let refusal = answer(set, command).unwrap_err();
-            assert!(refusal.contains(&format!("`{command}` does not use")) && refusal.contains(users), "{refusal}");
+            assert!(
+                refusal.contains(&format!("`{command}` does not use")) && refusal.contains(users),
+                "{refusal}"
+            );
             assert!(answer(set, "train").is_ok());
         }
-        assert!(answer("env.sim_dt=0.002", "view").is_ok() && answer("run.seed=3", "bench").is_ok());
+        assert!(
+            answer("env.sim_dt=0.002", "view").is_ok() && answer("run.seed=3", "bench").is_ok()
+        );
         assert!(answer("env.foo=1", "view").is_ok(), "reported elsewhere");
     }
 }

@@ -19,14 +19,21 @@ impl Config {
             same
         });
         let differing = own.compared_with(&other).into_iter();
-        differing.map(|(key, [own, other])| format!("{key} = {other}, not {own}")).collect()
+        differing
+            .map(|(key, [own, other])| format!("{key} = {other}, not {own}"))
+            .collect()
     }
 
     /// The settings that make `other` another training run: all but the total number of steps and the number of threads.
     pub fn compared_with(&self, other: &Self) -> Vec<Difference> {
         let [own, other] = [self, other].map(|of| {
             let mut same = of.clone();
-            same.run = RunConfig { total_steps: 0, threads: 0, shards: of.shards(), ..same.run };
+            same.run = RunConfig {
+                total_steps: 0,
+                threads: 0,
+                shards: of.shards(),
+                ..same.run
+            };
             same.flat()
         });
         let both = own.into_iter().zip(other);
@@ -43,13 +50,18 @@ impl Config {
 
     /// The settings that change in the course of a run, by dotted key.
     pub fn ramps(&self) -> Vec<(String, Ramp)> {
-        self.flat().into_iter().filter_map(|(key, value)| Some((key, Ramp::read(&value)?))).collect()
+        self.flat()
+            .into_iter()
+            .filter_map(|(key, value)| Some((key, Ramp::read(&value)?)))
+            .collect()
     }
 
     /// All settings by dotted key.
     fn flat(&self) -> Table {
         let own = Table::try_from(self).expect("a configuration is a tree of tables");
-        settings(&own).map(|(key, value)| (key, value.clone())).collect()
+        settings(&own)
+            .map(|(key, value)| (key, value.clone()))
+            .collect()
     }
 }
 
@@ -61,9 +73,18 @@ impl EnvConfig {
 
     /// The settings of the task that differ from those of `other`, by dotted key.
     pub fn unlike(&self, other: &Self) -> Table {
-        let [own, other] =
-            [self, other].map(|env| Config { env: Self { num_envs: 1, ..env.clone() }, ..Config::default() });
-        other.compared_with(&own).into_iter().map(|(key, [_, own])| (key, own)).collect()
+        let [own, other] = [self, other].map(|env| Config {
+            env: Self {
+                num_envs: 1,
+                ..env.clone()
+            },
+            ..Config::default()
+        });
+        other
+            .compared_with(&own)
+            .into_iter()
+            .map(|(key, [_, own])| (key, own))
+            .collect()
     }
 }
 
@@ -75,9 +96,15 @@ pub fn short(value: &Value) -> String {
 /// A value as part of another one, where text has quotes.
 fn inner(value: &Value) -> String {
     match value {
-        Value::Array(values) => format!("[{}]", values.iter().map(inner).collect::<Vec<_>>().join(",")),
+        Value::Array(values) => format!(
+            "[{}]",
+            values.iter().map(inner).collect::<Vec<_>>().join(",")
+        ),
         Value::Table(parts) => {
-            let parts: Vec<_> = parts.iter().map(|(key, value)| format!("{key}={}", inner(value))).collect();
+            let parts: Vec<_> = parts
+                .iter()
+                .map(|(key, value)| format!("{key}={}", inner(value)))
+                .collect();
             format!("{{{}}}", parts.join(","))
         }
         Value::Float(x) => brief(*x),
@@ -99,11 +126,24 @@ mod tests {
             "training.tolerance.to=0.05",
             "ppo.std=1",
         ];
-        let more = ["run.seed=7", "ppo.precision=bf16-rounded", "run.threads=3", "run.total_steps=7"];
-        let sets: Vec<_> = sets.iter().chain(&more).map(|set| set.parse().unwrap()).collect();
-        let [default, own] = [&[], &sets[..]].map(|sets| Settings::new().sets(sets).resolve().unwrap());
-        let found: Vec<String> =
-            default.compared_with(&own).iter().map(|(key, [_, own])| format!("{key}={}", short(own))).collect();
+        let more = [
+            "run.seed=7",
+            "ppo.precision=bf16-rounded",
+            "run.threads=3",
+            "run.total_steps=7",
+        ];
+        let sets: Vec<_> = sets
+            .iter()
+            .chain(&more)
+            .map(|set| set.parse().unwrap())
+            .collect();
+        let [default, own] =
+            [&[], &sets[..]].map(|sets| Settings::new().sets(sets).resolve().unwrap());
+        let found: Vec<String> = default
+            .compared_with(&own)
+            .iter()
+            .map(|(key, [_, own])| format!("{key}={}", short(own)))
+            .collect();
         let expected = [
             "env.num_envs=64",
             "env.noise={joint_pos=0.1}",
@@ -115,6 +155,13 @@ mod tests {
         ];
         assert_eq!(found, expected);
         let again: Vec<_> = found.iter().map(|set| set.parse().unwrap()).collect();
-        assert!(Settings::new().sets(&again).resolve().unwrap().compared_with(&own).is_empty());
+        assert!(
+            Settings::new()
+                .sets(&again)
+                .resolve()
+                .unwrap()
+                .compared_with(&own)
+                .is_empty()
+        );
     }
 }

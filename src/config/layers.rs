@@ -29,10 +29,13 @@ impl std::str::FromStr for Override {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let parts = text.split_once('=');
-        let parts = parts.map(|(key, value)| Self { key: key.trim().into(), value: value.trim().into() });
-        parts
-            .filter(|parts| !parts.key.is_empty())
-            .ok_or_else(|| format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4"))
+        let parts = parts.map(|(key, value)| Self {
+            key: key.trim().into(),
+            value: value.trim().into(),
+        });
+        parts.filter(|parts| !parts.key.is_empty()).ok_or_else(|| {
+            format!("`{text}` is not of the form key=value, e.g. ppo.learning_rate=1e-4")
+        })
     }
 }
 
@@ -83,7 +86,9 @@ impl Reader {
                 // The sizes of its hand are part of the policy.
                 _ => !["num_envs", "num_hand_dofs", "num_actuators"].contains(&key),
             });
-            let Self::Player { env_steps } = self else { continue };
+            let Self::Player { env_steps } = self else {
+                continue;
+            };
             for (_, value) in keys {
                 if let Some(ramp) = Ramp::read(value) {
                     *value = ramp.at(env_steps).into();
@@ -96,7 +101,9 @@ impl Reader {
 
 /// The scene that the settings of a run name.
 fn model(table: &Table) -> &str {
-    lookup(table, MODEL).and_then(Value::as_str).unwrap_or(BUILTIN_MODEL)
+    lookup(table, MODEL)
+        .and_then(Value::as_str)
+        .unwrap_or(BUILTIN_MODEL)
 }
 
 /// The setting that names this scene, for a shell.
@@ -106,7 +113,9 @@ fn scene_setting(model: &str) -> String {
 
 /// The option that names the scene of these settings, with a space before it, or nothing for the built-in scene.
 pub fn scene_option(env: &EnvConfig) -> String {
-    env.model_file().map_or(String::new(), |_| format!(" --set {}", scene_setting(&env.model)))
+    env.model_file().map_or(String::new(), |_| {
+        format!(" --set {}", scene_setting(&env.model))
+    })
 }
 
 /// Where settings come from: the base, over it what a run has written, then the user's file, then single settings.
@@ -125,12 +134,18 @@ impl Settings {
 
     /// Adds what a run has written, as this reader takes it. Settings that did not exist then have their defaults.
     pub fn stored(self, stored: Source, reader: Reader) -> Self {
-        Self { stored: Some((stored, reader)), ..self }
+        Self {
+            stored: Some((stored, reader)),
+            ..self
+        }
     }
 
     /// Adds a file that the user trusts.
     pub fn file(self, file: Source) -> Self {
-        Self { file: Some(file), ..self }
+        Self {
+            file: Some(file),
+            ..self
+        }
     }
 
     /// Adds the user's file, if one is given. If it is called as one that comes with the program and is not there, it is taken from
@@ -140,7 +155,9 @@ impl Settings {
     /// Fails if the file cannot be read.
     pub fn user_file(self, path: Option<&Path>) -> Result<Self> {
         let Some(path) = path else { return Ok(self) };
-        let own = SHIPPED.into_iter().find(|(place, _)| path == Path::new(place) && !path.exists());
+        let own = SHIPPED
+            .into_iter()
+            .find(|(place, _)| path == Path::new(place) && !path.exists());
         let text = match own {
             Some((place, text)) => {
                 os::say!("note: there is no {place} here: using the one in the program");
@@ -153,7 +170,10 @@ impl Settings {
 
     /// Adds single settings.
     pub fn sets(self, sets: &[Override]) -> Self {
-        Self { sets: sets.to_vec(), ..self }
+        Self {
+            sets: sets.to_vec(),
+            ..self
+        }
     }
 
     /// The configuration that they make together.
@@ -162,13 +182,19 @@ impl Settings {
     /// Fails with one error that lists the unknown keys, the values of a wrong type and the values out of range. Fails if a run has
     /// stored the path of a scene that the user does not name, because no path in a checkpoint is followed.
     pub fn resolve(self) -> Result<Config> {
-        let mut layers = Layers { merged: DEFAULTS.clone(), named: BTreeSet::new(), problems: Vec::new() };
+        let mut layers = Layers {
+            merged: DEFAULTS.clone(),
+            named: BTreeSet::new(),
+            problems: Vec::new(),
+        };
         let mut kept = 0;
         let mut scene = BUILTIN_MODEL.to_owned();
         if let Some((source, reader)) = &self.stored {
             let mut table = reader.take(source.table()?, &self.sets);
             scene = model(&table).to_owned();
-            if let Some(Value::Integer(shards)) = table.get_mut("run").and_then(|run| run.get_mut("shards")) {
+            if let Some(Value::Integer(shards)) =
+                table.get_mut("run").and_then(|run| run.get_mut("shards"))
+            {
                 kept = std::mem::take(shards) as usize;
             }
             layers.lay(&table);
@@ -181,11 +207,16 @@ impl Settings {
             layers.lay(&table_of(key, value, &layers.merged));
         }
         let is_named = layers.named.contains(MODEL);
-        let stored = self.stored.map(|(source, _)| source).filter(|_| self.sets.is_empty());
+        let stored = self
+            .stored
+            .map(|(source, _)| source)
+            .filter(|_| self.sets.is_empty());
         let mut config = layers.resolve(self.file.or(stored))?;
         if scene != BUILTIN_MODEL && !is_named {
             let set = scene_setting(&config.env.model);
-            bail!("it uses a custom scene, and no path in a file is followed: set {set} to use that scene");
+            bail!(
+                "it uses a custom scene, and no path in a file is followed: set {set} to use that scene"
+            );
         }
         if config.run.shards == 0 && kept.is_power_of_two() && config.divides(kept) {
             config.run.shards = kept;
@@ -243,8 +274,13 @@ impl Layers {
         if self.problems.is_empty() {
             return Ok(config);
         }
-        let origin = origin.map_or(String::new(), |source| format!(" ({})", source.path.display()));
-        bail!("invalid configuration{origin}:\n  {}", self.problems.join("\n  "))
+        let origin = origin.map_or(String::new(), |source| {
+            format!(" ({})", source.path.display())
+        });
+        bail!(
+            "invalid configuration{origin}:\n  {}",
+            self.problems.join("\n  ")
+        )
     }
 }
 
@@ -265,7 +301,10 @@ impl Config {
         let mut text = String::new();
         for (section, keys) in &sections {
             text += &format!("[{section}]\n");
-            keys.as_table().into_iter().flatten().for_each(|(key, value)| text += &format!("{key} = {value}\n"));
+            keys.as_table()
+                .into_iter()
+                .flatten()
+                .for_each(|(key, value)| text += &format!("{key} = {value}\n"));
             text.push('\n');
         }
         text
@@ -275,7 +314,10 @@ impl Config {
 impl Source {
     /// This text, from the file `path`.
     pub fn new(path: impl Into<PathBuf>, text: impl Into<String>) -> Self {
-        Self { path: path.into(), text: text.into() }
+        Self {
+            path: path.into(),
+            text: text.into(),
+        }
     }
 
     /// Its settings. The base itself counts as setting nothing.
@@ -285,7 +327,11 @@ impl Source {
         }
         self.text.parse().map_err(|error: toml::de::Error| {
             let lines: Vec<String> = error.to_string().lines().map(os::shortened).collect();
-            anyhow!("{}: not a TOML file: {}", self.path.display(), lines.join("\n"))
+            anyhow!(
+                "{}: not a TOML file: {}",
+                self.path.display(),
+                lines.join("\n")
+            )
         })
     }
 }
@@ -301,7 +347,11 @@ mod tests {
 
     fn errors(overrides: &[&str]) -> String {
         let overrides: Vec<Override> = overrides.iter().map(|s| set(s)).collect();
-        Settings::new().sets(&overrides).resolve().unwrap_err().to_string()
+        Settings::new()
+            .sets(&overrides)
+            .resolve()
+            .unwrap_err()
+            .to_string()
     }
 
     #[test]
@@ -309,7 +359,13 @@ mod tests {
         let config = Config::default();
         assert_eq!(config.env.max_episode_steps(), 1000);
         assert_eq!(config.env.substeps(), 1);
-        assert_eq!(Settings::new().file(file(&config.to_text())).resolve().unwrap(), config);
+        assert_eq!(
+            Settings::new()
+                .file(file(&config.to_text()))
+                .resolve()
+                .unwrap(),
+            config
+        );
     }
 
     fn file(text: &str) -> Source {
@@ -321,58 +377,161 @@ mod tests {
         let stored = file("[env]\nmodel = \"/its own.xml\"\n[run]\nshards = 4");
         let fork = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            let config = Settings::new().stored(stored.clone(), Reader::Run).sets(&sets).resolve();
-            config.map(|config| (config.env.model, config.run.shards)).map_err(|error| error.to_string())
+            let config = Settings::new()
+                .stored(stored.clone(), Reader::Run)
+                .sets(&sets)
+                .resolve();
+            config
+                .map(|config| (config.env.model, config.run.shards))
+                .map_err(|error| error.to_string())
         };
         let refused = fork(&[]).unwrap_err();
-        assert!(refused.ends_with("set \'env.model=/its own.xml\' to use that scene"), "{refused}");
+        assert!(
+            refused.ends_with("set \'env.model=/its own.xml\' to use that scene"),
+            "{refused}"
+        );
         assert_eq!(fork(&["env.model=builtin"]), Ok(("builtin".into(), 4)));
-        assert_eq!(fork(&["env.model=x.xml", "ppo.minibatches=8192"]), Ok(("x.xml".into(), 0)));
-        assert_eq!(fork(&["env.model=x.xml", "run.shards=2"]), Ok(("x.xml".into(), 2)));
+        assert_eq!(
+            fork(&["env.model=x.xml", "ppo.minibatches=8192"]),
+            Ok(("x.xml".into(), 0))
+        );
+        assert_eq!(
+            fork(&["env.model=x.xml", "run.shards=2"]),
+            Ok(("x.xml".into(), 2))
+        );
     }
 
     #[test]
     fn a_file_may_set_part_of_a_ramp() {
         let text = "[training]\ntolerance = { steps = 50_000_000 }\n";
         let config = Settings::new().file(file(text)).resolve().unwrap();
-        assert_eq!(config.training.tolerance.0, Ramp { from: 0.4, to: 0.07, steps: 50_000_000, after: 0 });
+        assert_eq!(
+            config.training.tolerance.0,
+            Ramp {
+                from: 0.4,
+                to: 0.07,
+                steps: 50_000_000,
+                after: 0
+            }
+        );
     }
 
     #[test]
     fn a_ramp_can_be_set_whole_in_part_or_as_a_constant() {
         let tolerance = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Settings::new().sets(&sets).resolve().unwrap().training.tolerance.0
+            Settings::new()
+                .sets(&sets)
+                .resolve()
+                .unwrap()
+                .training
+                .tolerance
+                .0
         };
-        let default = Ramp { from: 0.4, to: 0.07, steps: 20_000_000, after: 0 };
+        let default = Ramp {
+            from: 0.4,
+            to: 0.07,
+            steps: 20_000_000,
+            after: 0,
+        };
         assert_eq!(tolerance(&[]), default);
-        assert_eq!(tolerance(&["training.tolerance=0.07"]), Ramp::constant(0.07));
-        assert_eq!(tolerance(&["training.tolerance.to=0.05"]), Ramp { to: 0.05, ..default });
-        assert_eq!(tolerance(&["training.tolerance.steps=1e6"]), Ramp { steps: 1_000_000, ..default });
+        assert_eq!(
+            tolerance(&["training.tolerance=0.07"]),
+            Ramp::constant(0.07)
+        );
+        assert_eq!(
+            tolerance(&["training.tolerance.to=0.05"]),
+            Ramp {
+                to: 0.05,
+                ..default
+            }
+        );
+        assert_eq!(
+            tolerance(&["training.tolerance.steps=1e6"]),
+            Ramp {
+                steps: 1_000_000,
+                ..default
+            }
+        );
         let whole = tolerance(&["training.tolerance={from=0.3,to=0.06,steps=30000000}"]);
-        assert_eq!(whole, Ramp { from: 0.3, to: 0.06, steps: 30_000_000, after: 0 });
-        assert_eq!(tolerance(&["training.tolerance={to=0.06}"]), Ramp { to: 0.06, ..default });
+        assert_eq!(
+            whole,
+            Ramp {
+                from: 0.3,
+                to: 0.06,
+                steps: 30_000_000,
+                after: 0
+            }
+        );
+        assert_eq!(
+            tolerance(&["training.tolerance={to=0.06}"]),
+            Ramp {
+                to: 0.06,
+                ..default
+            }
+        );
         // Part of a ramp that was set to a constant before.
         let both = tolerance(&["training.tolerance=1", "training.tolerance.to=0.5"]);
-        assert_eq!(both, Ramp { from: 1.0, to: 0.5, steps: 0, after: 0 });
+        assert_eq!(
+            both,
+            Ramp {
+                from: 1.0,
+                to: 0.5,
+                steps: 0,
+                after: 0
+            }
+        );
         // A ramp may begin later, whether its default does or not.
-        assert_eq!(tolerance(&["training.tolerance.after=1e6"]), Ramp { after: 1_000_000, ..default });
+        assert_eq!(
+            tolerance(&["training.tolerance.after=1e6"]),
+            Ramp {
+                after: 1_000_000,
+                ..default
+            }
+        );
         let share = |sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            Settings::new().sets(&sets).resolve().unwrap().randomization.share
+            Settings::new()
+                .sets(&sets)
+                .resolve()
+                .unwrap()
+                .randomization
+                .share
         };
-        let later = Ramp { from: 0.0, to: 0.5, steps: 20_000_000, after: 40_000_000 };
+        let later = Ramp {
+            from: 0.0,
+            to: 0.5,
+            steps: 20_000_000,
+            after: 40_000_000,
+        };
         assert_eq!(share(&[]), later);
-        assert_eq!(share(&["randomization.share.to=0.7"]), Ramp { to: 0.7, ..later });
-        assert_eq!(share(&["randomization.share=0.7"]), Ramp::constant(0.7), "from the first step on");
+        assert_eq!(
+            share(&["randomization.share.to=0.7"]),
+            Ramp { to: 0.7, ..later }
+        );
+        assert_eq!(
+            share(&["randomization.share=0.7"]),
+            Ramp::constant(0.7),
+            "from the first step on"
+        );
     }
 
     #[test]
     fn a_table_by_group_is_set_whole_or_one_group_at_a_time() {
         let noise = |text: &str, sets: &[&str]| {
             let sets: Vec<Override> = sets.iter().map(|text| set(text)).collect();
-            let noise = Settings::new().file(file(text)).sets(&sets).resolve().unwrap().env.noise;
-            noise.into_iter().map(|(group, std)| format!("{group} {std}")).collect::<Vec<_>>().join(", ")
+            let noise = Settings::new()
+                .file(file(text))
+                .sets(&sets)
+                .resolve()
+                .unwrap()
+                .env
+                .noise;
+            noise
+                .into_iter()
+                .map(|(group, std)| format!("{group} {std}"))
+                .collect::<Vec<_>>()
+                .join(", ")
         };
         let both = "[env]\nnoise = { joint_pos = 1, cube_pos = 0.5 }";
         assert_eq!(noise("", &[]), "");
@@ -384,22 +543,50 @@ mod tests {
             "cube_pos 0.5, cube_quat 2, joint_pos 3"
         );
         let none = file("[env]\nnoise = {}");
-        let fork = Settings::new().stored(file(both), Reader::Run).file(none).resolve().unwrap();
+        let fork = Settings::new()
+            .stored(file(both), Reader::Run)
+            .file(none)
+            .resolve()
+            .unwrap();
         assert!(fork.env.noise.is_empty());
     }
 
     #[test]
     fn what_is_wrong_with_a_ramp_is_said_by_name() {
         for (bad, part) in [
-            ("training.tolerance=0", "training.tolerance = 0: must be above 0"),
-            ("training.tolerance.from=-1", "training.tolerance.from = -1: must be above 0"),
-            ("training.tolerance=wide", "training.tolerance = \"wide\": must be a number, or { from = …"),
-            ("training.tolerance=nan", "training.tolerance.from = nan: must be a finite number"),
-            ("training.tolerance.form=1", "training.tolerance.form: unknown key"),
-            ("training.tolerance.steps=-1", "training.tolerance.steps = -1: must be a whole number"),
-            ("training.hold.to=0.4", "training.hold.to = 0.4: must be at least 1"),
+            (
+                "training.tolerance=0",
+                "training.tolerance = 0: must be above 0",
+            ),
+            (
+                "training.tolerance.from=-1",
+                "training.tolerance.from = -1: must be above 0",
+            ),
+            (
+                "training.tolerance=wide",
+                "training.tolerance = \"wide\": must be a number, or { from = …",
+            ),
+            (
+                "training.tolerance=nan",
+                "training.tolerance.from = nan: must be a finite number",
+            ),
+            (
+                "training.tolerance.form=1",
+                "training.tolerance.form: unknown key",
+            ),
+            (
+                "training.tolerance.steps=-1",
+                "training.tolerance.steps = -1: must be a whole number",
+            ),
+            (
+                "training.hold.to=0.4",
+                "training.hold.to = 0.4: must be at least 1",
+            ),
             ("ppo.std.to=0", "ppo.std.to = 0: must be above 0"),
-            ("ppo.desired_kl.to=0", "must be above 0 at both ends, or 0 throughout"),
+            (
+                "ppo.desired_kl.to=0",
+                "must be above 0 at both ends, or 0 throughout",
+            ),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(part), "{bad}: {part} is not in\n{text}");
@@ -411,13 +598,25 @@ mod tests {
         let trained = "[env]\nnum_envs = 0\nrot_eps = 0.2\n[ppo]\nhidden = [9]\ngamma = \"much\"\nnot_yet = 1\n\
                        [training]\ngoal_reward = 3\n[of_tomorrow]\nx = 1\n[run]\nseed = -1";
         let policy = |text: &str, sets: &[Override]| {
-            Settings::new().stored(file(text), Reader::Player { env_steps: 0 }).sets(sets).resolve()
+            Settings::new()
+                .stored(file(text), Reader::Player { env_steps: 0 })
+                .sets(sets)
+                .resolve()
         };
         let found = policy(trained, &[set("env.sim_dt=0.005")]).unwrap();
-        assert_eq!((found.env.rot_eps, found.env.sim_dt, found.ppo.hidden), (0.2, 0.005, vec![9]));
+        assert_eq!(
+            (found.env.rot_eps, found.env.sim_dt, found.ppo.hidden),
+            (0.2, 0.005, vec![9])
+        );
         let whole = Config::default();
         let played = policy(&whole.to_text(), &[]).unwrap();
-        assert_eq!(played, Config { env: whole.env.at(0), ..whole });
+        assert_eq!(
+            played,
+            Config {
+                env: whole.env.at(0),
+                ..whole
+            }
+        );
         for (bad, part) in [
             ("[env]\nrot_eps = 0", "env.rot_eps = 0: must be above 0"),
             ("[env]\nnot_yet = 1", "env.not_yet: unknown key"),
@@ -430,17 +629,36 @@ mod tests {
 
     #[test]
     fn a_users_file_holds_only_what_differs_and_set_wins_over_it() {
-        let source = Source::new("my.toml", "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8");
-        let sets = [set("ppo.gamma=0.97"), set("ppo.activation=tanh"), set("run.total_steps=1e6")];
+        let source = Source::new(
+            "my.toml",
+            "[ppo]\ngamma = 0.98\nhidden = [32]\n[env]\nnum_envs = 8",
+        );
+        let sets = [
+            set("ppo.gamma=0.97"),
+            set("ppo.activation=tanh"),
+            set("run.total_steps=1e6"),
+        ];
         let config = Settings::new().file(source).sets(&sets).resolve().unwrap();
         assert_eq!((config.ppo.gamma, config.env.num_envs), (0.97, 8));
-        assert_eq!((config.ppo.hidden, config.ppo.activation), (vec![32], Activation::Tanh));
-        assert_eq!((config.run.total_steps, config.ppo.lambda), (1_000_000, 0.95));
+        assert_eq!(
+            (config.ppo.hidden, config.ppo.activation),
+            (vec![32], Activation::Tanh)
+        );
+        assert_eq!(
+            (config.run.total_steps, config.ppo.lambda),
+            (1_000_000, 0.95)
+        );
     }
 
     #[test]
     fn all_violations_are_named_together_with_the_rule() {
-        let text = errors(&["ppo.minibatches=7", "env.rot_eps=0", "ppo.gama=1", "env.sim_dt=fast", "ppo.clip=-1"]);
+        let text = errors(&[
+            "ppo.minibatches=7",
+            "env.rot_eps=0",
+            "ppo.gama=1",
+            "env.sim_dt=fast",
+            "ppo.clip=-1",
+        ]);
         for part in [
             "ppo.minibatches = 7: must divide num_envs * horizon",
             "env.rot_eps = 0: must be above 0",
@@ -455,8 +673,14 @@ mod tests {
     #[test]
     fn the_control_step_must_be_a_whole_multiple_of_the_physics_step() {
         let text = errors(&["env.sim_dt=0.003"]);
-        assert!(text.contains("env.ctrl_dt = 0.01: must be a whole multiple of env.sim_dt = 0.003"), "{text}");
-        let config = Settings::new().sets(&[set("env.sim_dt=0.002")]).resolve().unwrap();
+        assert!(
+            text.contains("env.ctrl_dt = 0.01: must be a whole multiple of env.sim_dt = 0.003"),
+            "{text}"
+        );
+        let config = Settings::new()
+            .sets(&[set("env.sim_dt=0.002")])
+            .resolve()
+            .unwrap();
         assert_eq!(config.env.substeps(), 5);
     }
 
@@ -471,15 +695,27 @@ mod tests {
             ("ppo.hidden=[]", "must hold one to 64 sizes"),
             ("ppo=3", "must be a section with keys"),
             ("ppo.activation=gelu", "gelu"),
-            ("ppo.away_range=[0.5,0.5]", "must be [near, far] with 0 <= near < far"),
+            (
+                "ppo.away_range=[0.5,0.5]",
+                "must be [near, far] with 0 <= near < far",
+            ),
             ("env.goal_position=[1,2]", "goal_position"),
             ("nonsense=1", "nonsense: unknown key"),
-            ("training.tolerance.step=5", "did you mean training.tolerance.steps?"),
+            (
+                "training.tolerance.step=5",
+                "did you mean training.tolerance.steps?",
+            ),
             ("ppo.lr=1", "configs/repose.toml lists all of them"),
             ("env.cube_size=1", "did you mean env.cube_size_scale?"),
-            ("randomization.mass=1", "did you mean randomization.cube_mass?"),
+            (
+                "randomization.mass=1",
+                "did you mean randomization.cube_mass?",
+            ),
             ("learning_rate=1", "did you mean ppo.learning_rate?"),
-            ("env.quixotic=1", "env.quixotic: unknown key; configs/repose.toml"),
+            (
+                "env.quixotic=1",
+                "env.quixotic: unknown key; configs/repose.toml",
+            ),
             ("env.success_tolerance=3.2", "must be at most 3.14"),
             (
                 "env.goal_position=[1e3,0,0]",

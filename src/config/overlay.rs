@@ -10,18 +10,25 @@ use super::BASE;
 use crate::os::{shortened, similar};
 
 /// The base as tables.
-pub static DEFAULTS: LazyLock<Table> = LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
+pub static DEFAULTS: LazyLock<Table> =
+    LazyLock::new(|| BASE.parse().expect("the built-in configuration is TOML"));
 
 /// The settings of all sections of a table, each with its dotted key.
 pub fn settings(table: &Table) -> impl Iterator<Item = (String, &Value)> {
-    let sections = table.iter().filter_map(|(section, keys)| Some((section, keys.as_table()?)));
-    sections.flat_map(|(section, keys)| keys.iter().map(move |(key, value)| (format!("{section}.{key}"), value)))
+    let sections = table
+        .iter()
+        .filter_map(|(section, keys)| Some((section, keys.as_table()?)));
+    sections.flat_map(|(section, keys)| {
+        keys.iter()
+            .map(move |(key, value)| (format!("{section}.{key}"), value))
+    })
 }
 
 /// The value with this dotted key.
 pub fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
     let (section, rest) = key.split_once('.').unwrap_or((key, ""));
-    rest.split_terminator('.').try_fold(table.get(section)?, |value, part| value.get(part))
+    rest.split_terminator('.')
+        .try_fold(table.get(section)?, |value, part| value.get(part))
 }
 
 /// A number, whole or not.
@@ -32,7 +39,11 @@ pub fn number(value: &Value) -> Option<f64> {
 /// A number as text: `1e300` rather than 301 digits.
 pub fn brief(x: f64) -> String {
     let text = x.to_string();
-    if text.len() > 20 { format!("{x:e}") } else { text }
+    if text.len() > 20 {
+        format!("{x:e}")
+    } else {
+        text
+    }
 }
 
 /// Whether a table of the base is a ramp, rather than a section or values by group.
@@ -43,8 +54,15 @@ pub fn is_ramp(table: &Table) -> bool {
 /// The table that sets this one value over `merged`. Text that is not a TOML value becomes a string, as does any text
 /// for a string key. Numbers may lack the zero before their point, which TOML requires.
 pub fn table_of(key: &str, text: &str, merged: &Table) -> Table {
-    let parse = |text: &str| format!("value = {text}").parse::<Table>().ok().filter(|t| t.len() == 1);
-    let parsed = parse(text).or_else(|| parse(&with_zeros(text))).and_then(|mut t| t.remove("value"));
+    let parse = |text: &str| {
+        format!("value = {text}")
+            .parse::<Table>()
+            .ok()
+            .filter(|t| t.len() == 1)
+    };
+    let parsed = parse(text)
+        .or_else(|| parse(&with_zeros(text)))
+        .and_then(|mut t| t.remove("value"));
     let wants_text = lookup(&DEFAULTS, key).is_some_and(Value::is_str);
     let mut value = match parsed {
         Some(value) if !wants_text || value.is_str() => value,
@@ -55,8 +73,12 @@ pub fn table_of(key: &str, text: &str, merged: &Table) -> Table {
     for depth in (1..parts.len()).rev() {
         let whole = parts[..depth].join(".");
         // `env.noise.joint_pos` changes one value of `env.noise`, so the other values are copied.
-        let by_group = lookup(&DEFAULTS, &whole).and_then(Value::as_table).is_some_and(Table::is_empty);
-        let others = lookup(merged, &whole).and_then(Value::as_table).filter(|_| by_group);
+        let by_group = lookup(&DEFAULTS, &whole)
+            .and_then(Value::as_table)
+            .is_some_and(Table::is_empty);
+        let others = lookup(merged, &whole)
+            .and_then(Value::as_table)
+            .filter(|_| by_group);
         let mut table = others.cloned().unwrap_or_default();
         table.insert(parts[depth].to_owned(), value);
         value = table.into();
@@ -71,13 +93,23 @@ fn with_zeros(text: &str) -> String {
         let joined = i > 0 && bytes[i - 1].is_ascii_alphanumeric();
         bytes[i] == b'.' && !joined && bytes.get(i + 1).is_some_and(u8::is_ascii_digit)
     };
-    text.char_indices().map(|(i, c)| if begins(i) { "0.".to_owned() } else { c.to_string() }).collect()
+    text.char_indices()
+        .map(|(i, c)| {
+            if begins(i) {
+                "0.".to_owned()
+            } else {
+                c.to_string()
+            }
+        })
+        .collect()
 }
 
 /// Whether `text`, a value of `env.model`, names the scene at the absolute path `stored`.
 pub fn names_scene(text: &str, stored: &str) -> bool {
     let asked = table_of("env.model", text, &DEFAULTS);
-    let file = lookup(&asked, "env.model").and_then(Value::as_str).map(|asked| Path::new(asked).canonicalize());
+    let file = lookup(&asked, "env.model")
+        .and_then(Value::as_str)
+        .map(|asked| Path::new(asked).canonicalize());
     file.is_some_and(|file| file.is_ok_and(|file| file == Path::new(stored)))
 }
 
@@ -85,7 +117,13 @@ pub fn names_scene(text: &str, stored: &str) -> bool {
 const MOST_PROBLEMS: usize = 30;
 
 /// Applies `table` over `merged`, which has the keys and types of `base`. What does not fit is skipped and reported.
-pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, problems: &mut Vec<String>) {
+pub fn overlay(
+    merged: &mut Table,
+    table: &Table,
+    base: &Table,
+    prefix: &str,
+    problems: &mut Vec<String>,
+) {
     for (key, value) in table {
         if problems.len() >= MOST_PROBLEMS {
             return;
@@ -104,9 +142,14 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
             } else if expected.is_empty() {
                 // Values by group replace all earlier ones. The names of the groups are checked elsewhere.
                 merged[key] = Table::new().into();
-                expected = given.keys().map(|name| (name.clone(), 0.0.into())).collect();
+                expected = given
+                    .keys()
+                    .map(|name| (name.clone(), 0.0.into()))
+                    .collect();
             }
-            let target = merged[key].as_table_mut().expect("the merged tables are those of the base");
+            let target = merged[key]
+                .as_table_mut()
+                .expect("the merged tables are those of the base");
             let parts = format!("{name}.");
             overlay(target, &given, &expected, &parts, problems);
             // The remaining parts alone are not the ramp that the user wrote, so no other rule is applied to them.
@@ -120,7 +163,11 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
             Err(rule) => {
                 let number = value.as_float().filter(|x| x.is_finite());
                 let value = number.map_or_else(|| value.to_string(), brief);
-                problems.push(format!("{} = {}: must be {rule}", shortened(&name), shortened(&value)));
+                problems.push(format!(
+                    "{} = {}: must be {rule}",
+                    shortened(&name),
+                    shortened(&value)
+                ));
             }
         }
     }
@@ -129,12 +176,26 @@ pub fn overlay(merged: &mut Table, table: &Table, base: &Table, prefix: &str, pr
 /// What a value sets in a table of the base, if it fits: a plain number in place of a ramp is a constant.
 fn inner(expected: &Table, value: &Value) -> Option<Table> {
     if is_ramp(expected) && number(value).is_some() {
-        let parts = [("from", value.clone()), ("to", value.clone()), ("steps", 0.into()), ("after", 0.into())];
-        return Some(parts.into_iter().map(|(part, value)| (part.to_owned(), value)).collect());
+        let parts = [
+            ("from", value.clone()),
+            ("to", value.clone()),
+            ("steps", 0.into()),
+            ("after", 0.into()),
+        ];
+        return Some(
+            parts
+                .into_iter()
+                .map(|(part, value)| (part.to_owned(), value))
+                .collect(),
+        );
     }
     let mut given = value.as_table()?.clone();
     // A complete ramp without `after` starts at step 0, even if the default has an `after`. `to_text` relies on this.
-    if is_ramp(expected) && ["from", "to", "steps"].iter().all(|part| given.contains_key(*part)) {
+    if is_ramp(expected)
+        && ["from", "to", "steps"]
+            .iter()
+            .all(|part| given.contains_key(*part))
+    {
         given.entry("after").or_insert(0.into());
     }
     Some(given)
@@ -148,17 +209,28 @@ fn typed(expected: &Value, value: &Value) -> Result<Value, String> {
         (Float(_), Integer(i)) => Ok(Float(*i as f64)),
         (Integer(_), Integer(i)) if *i >= 0 => Ok(value.clone()),
         // Users write large numbers of steps as 1e8.
-        (Integer(_), Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => Ok(Integer(*x as i64)),
+        (Integer(_), Float(x)) if x.fract() == 0.0 && (0.0..9e15).contains(x) => {
+            Ok(Integer(*x as i64))
+        }
         (Array(expected), Array(values)) => {
             // An empty list is a list of names.
-            let one = expected.first().cloned().unwrap_or(Value::String(String::new()));
+            let one = expected
+                .first()
+                .cloned()
+                .unwrap_or(Value::String(String::new()));
             let typed: Result<Vec<_>, _> = values.iter().map(|v| typed(&one, v)).collect();
-            typed.map(Array).map_err(|rule| format!("an array of values that are each {rule}"))
+            typed
+                .map(Array)
+                .map_err(|rule| format!("an array of values that are each {rule}"))
         }
         (Value::Table(_), Value::String(text)) if text.starts_with('{') => {
             // A `--set` whose text could not be parsed.
-            let reason = format!("value = {}", with_zeros(text)).parse::<Table>().err();
-            let reason = reason.map_or_else(String::new, |error| format!(": {}", shortened(error.message().trim())));
+            let reason = format!("value = {}", with_zeros(text))
+                .parse::<Table>()
+                .err();
+            let reason = reason.map_or_else(String::new, |error| {
+                format!(": {}", shortened(error.message().trim()))
+            });
             Err(format!("a table of TOML{reason}"))
         }
         _ => Err(type_of(expected)),
@@ -172,7 +244,9 @@ fn type_of(expected: &Value) -> String {
         Integer(_) => "a whole number, not negative",
         Value::String(_) => "a string",
         Array(_) => return format!("an array, e.g. {expected}"),
-        Value::Table(table) if is_ramp(table) => "a number, or { from = …, to = …, steps = …, after = … }",
+        Value::Table(table) if is_ramp(table) => {
+            "a number, or { from = …, to = …, steps = …, after = … }"
+        }
         Value::Table(table) if table.is_empty() => {
             "a table of numbers by group of the observation, e.g. { joint_pos = 0.01 }"
         }
@@ -188,15 +262,24 @@ fn unknown(name: &str) -> String {
         Some(Value::Table(inside)) => inside.keys().map(|key| format!("{whole}.{key}")).collect(),
         _ => {
             let sections = DEFAULTS.keys().filter(|_| whole.is_empty()).cloned();
-            sections.chain(settings(&DEFAULTS).map(|(key, _)| key)).collect()
+            sections
+                .chain(settings(&DEFAULTS).map(|(key, _)| key))
+                .collect()
         }
     };
     let alike = similar(name, known.iter().map(String::as_str), '.');
     let end = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-    let holds = known.iter().map(String::as_str).find(|key| last.len() > 2 && end(key).contains(last));
-    let near = alike.into_iter().find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
+    let holds = known
+        .iter()
+        .map(String::as_str)
+        .find(|key| last.len() > 2 && end(key).contains(last));
+    let near = alike
+        .into_iter()
+        .find(|key| strsim::damerau_levenshtein(&end(key), last) <= 1 + last.len() / 4);
     let all = "configs/repose.toml lists all of them";
-    let hint = near.or(holds).map_or(all.into(), |nearest| format!("did you mean {nearest}?"));
+    let hint = near
+        .or(holds)
+        .map_or(all.into(), |nearest| format!("did you mean {nearest}?"));
     format!("{}: unknown key; {hint}", shortened(name))
 }
 
@@ -206,19 +289,29 @@ mod tests {
 
     fn errors(sets: &[&str]) -> String {
         let sets: Vec<_> = sets.iter().map(|set| set.parse().unwrap()).collect();
-        Settings::new().sets(&sets).resolve().unwrap_err().to_string()
+        Settings::new()
+            .sets(&sets)
+            .resolve()
+            .unwrap_err()
+            .to_string()
     }
 
     #[test]
     fn a_table_that_is_no_toml_is_refused_with_the_reason() {
         for (bad, reason) in [
-            ("training.tolerance={from=1,from=2,to=1,steps=1}", "duplicate key"),
+            (
+                "training.tolerance={from=1,from=2,to=1,steps=1}",
+                "duplicate key",
+            ),
             ("env.noise={joint_pos=1,joint_pos=2}", "duplicate key"),
             ("training.tolerance={from=1 to=2}", "expected `,`"),
             ("training.tolerance={from=.1 to=.2}", "expected `,`"),
         ] {
             let text = errors(&[bad]);
-            assert!(text.contains(": must be a table of TOML: ") && text.contains(reason), "{bad}: {text}");
+            assert!(
+                text.contains(": must be a table of TOML: ") && text.contains(reason),
+                "{bad}: {text}"
+            );
         }
         let file = Source::new("x.toml", "[training]\ntolerance = {from=1,from=2}");
         let file = Settings::new().file(file).resolve().unwrap_err();
@@ -227,30 +320,62 @@ mod tests {
 
     #[test]
     fn numbers_may_begin_with_their_point() {
-        let sets = ["ppo.std=.27", "randomization.gains=[.7,1.6]", "training.tolerance={from=.4,to=.1,steps=9}"];
-        let sets = sets.into_iter().chain(["env.noise.joint_pos=.01", "training.drop_reward=-.5", "env.model=.5x"]);
+        let sets = [
+            "ppo.std=.27",
+            "randomization.gains=[.7,1.6]",
+            "training.tolerance={from=.4,to=.1,steps=9}",
+        ];
+        let sets = sets.into_iter().chain([
+            "env.noise.joint_pos=.01",
+            "training.drop_reward=-.5",
+            "env.model=.5x",
+        ]);
         let sets: Vec<_> = sets.map(|set| set.parse().unwrap()).collect();
         let config = Settings::new().sets(&sets).resolve().unwrap();
-        assert_eq!((config.ppo.std.0.to, config.training.drop_reward.to), (0.27, -0.5));
-        assert_eq!((config.randomization.gains, config.training.tolerance.0.from), ([0.7, 1.6], 0.4));
-        assert_eq!((config.env.noise["joint_pos"], config.env.model.as_str()), (0.01, ".5x"));
+        assert_eq!(
+            (config.ppo.std.0.to, config.training.drop_reward.to),
+            (0.27, -0.5)
+        );
+        assert_eq!(
+            (config.randomization.gains, config.training.tolerance.0.from),
+            ([0.7, 1.6], 0.4)
+        );
+        assert_eq!(
+            (config.env.noise["joint_pos"], config.env.model.as_str()),
+            (0.01, ".5x")
+        );
     }
 
     #[test]
     fn of_a_ramp_with_a_wrong_part_only_that_part_is_told() {
-        for sets in [["ppo.horizon.from=2.5", "ppo.horizon.to=5"], ["ppo.horizon.to=5", "ppo.horizon.from=2.5"]] {
+        for sets in [
+            ["ppo.horizon.from=2.5", "ppo.horizon.to=5"],
+            ["ppo.horizon.to=5", "ppo.horizon.from=2.5"],
+        ] {
             let text = errors(&sets);
             assert_eq!(text.matches("\n  ").count(), 1, "{text}");
-            assert!(text.contains("ppo.horizon.from = 2.5: must be a whole number"), "{text}");
+            assert!(
+                text.contains("ppo.horizon.from = 2.5: must be a whole number"),
+                "{text}"
+            );
         }
     }
 
     #[test]
     fn a_huge_number_is_told_in_few_digits() {
         for (bad, told) in [
-            ("training.tolerance.steps=1e300", "training.tolerance.steps = 1e300: must be a whole number"),
-            ("training.tolerance=-1e300", "training.tolerance = -1e300: must be above 0"),
-            ("env.rot_eps=1e300", "env.rot_eps = 1e300: must be at most 1000000000"),
+            (
+                "training.tolerance.steps=1e300",
+                "training.tolerance.steps = 1e300: must be a whole number",
+            ),
+            (
+                "training.tolerance=-1e300",
+                "training.tolerance = -1e300: must be above 0",
+            ),
+            (
+                "env.rot_eps=1e300",
+                "env.rot_eps = 1e300: must be at most 1000000000",
+            ),
         ] {
             let text = errors(&[bad]);
             assert!(text.contains(told), "{bad}: {text}");

@@ -31,7 +31,12 @@ impl Ramp {
 
     /// A ramp whose value does not change.
     pub fn constant(value: f64) -> Self {
-        Self { from: value, to: value, steps: 0, after: 0 }
+        Self {
+            from: value,
+            to: value,
+            steps: 0,
+            after: 0,
+        }
     }
 
     /// The value after `env_steps` control steps of the run.
@@ -71,10 +76,23 @@ impl Serialize for Ramp {
 
 impl fmt::Display for Ramp {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let Self { from, to, steps, after } = self;
-        let after = if *after == 0 { String::new() } else { format!(", after = {after}") };
+        let Self {
+            from,
+            to,
+            steps,
+            after,
+        } = self;
+        let after = if *after == 0 {
+            String::new()
+        } else {
+            format!(", after = {after}")
+        };
         let constant = *self == Self::constant(*to);
-        if constant { to.fmt(f) } else { write!(f, "{{ from = {from}, to = {to}, steps = {steps}{after} }}") }
+        if constant {
+            to.fmt(f)
+        } else {
+            write!(f, "{{ from = {from}, to = {to}, steps = {steps}{after} }}")
+        }
     }
 }
 
@@ -99,45 +117,99 @@ mod tests {
 
     #[test]
     fn a_ramp_begins_with_one_value_ends_with_the_other_and_stays_there() {
-        let ramp = Ramp { from: 0.4, to: 0.1, steps: 1000, after: 0 };
+        let ramp = Ramp {
+            from: 0.4,
+            to: 0.1,
+            steps: 1000,
+            after: 0,
+        };
         assert_eq!([0, 1000, 9000].map(|steps| ramp.at(steps)), [0.4, 0.1, 0.1]);
-        assert_eq!([0, 1000, 9000].map(|steps| Geometric(ramp).at(steps)), [0.4, 0.1, 0.1]);
+        assert_eq!(
+            [0, 1000, 9000].map(|steps| Geometric(ramp).at(steps)),
+            [0.4, 0.1, 0.1]
+        );
         assert!((ramp.at(500) - 0.25).abs() < 1e-12);
         assert!((Geometric(ramp).at(500) - 0.2).abs() < 1e-12);
     }
 
     #[test]
     fn a_ramp_may_begin_later_and_keeps_its_first_value_until_then() {
-        let ramp = Ramp { from: 0.0, to: 0.5, steps: 1000, after: 4000 };
-        assert_eq!([0, 3999, 4000, 5000, 9000].map(|steps| ramp.at(steps)), [0.0, 0.0, 0.0, 0.5, 0.5]);
+        let ramp = Ramp {
+            from: 0.0,
+            to: 0.5,
+            steps: 1000,
+            after: 4000,
+        };
+        assert_eq!(
+            [0, 3999, 4000, 5000, 9000].map(|steps| ramp.at(steps)),
+            [0.0, 0.0, 0.0, 0.5, 0.5]
+        );
         assert!((ramp.at(4500) - 0.25).abs() < 1e-12);
         let step = Ramp { steps: 0, ..ramp };
         assert_eq!([0, 3999, 4000].map(|steps| step.at(steps)), [0.0, 0.0, 0.5]);
-        assert_eq!([ramp.end(), step.end(), Ramp { after: u64::MAX, ..ramp }.end()], [5000, 4000, u64::MAX]);
-        assert_eq!(ramp.to_string(), "{ from = 0, to = 0.5, steps = 1000, after = 4000 }");
+        assert_eq!(
+            [
+                ramp.end(),
+                step.end(),
+                Ramp {
+                    after: u64::MAX,
+                    ..ramp
+                }
+                .end()
+            ],
+            [5000, 4000, u64::MAX]
+        );
+        assert_eq!(
+            ramp.to_string(),
+            "{ from = 0, to = 0.5, steps = 1000, after = 4000 }"
+        );
     }
 
     #[test]
     fn a_ramp_of_no_steps_is_at_its_end_from_the_first_step_on() {
-        let ramp = Ramp { from: 0.4, to: 0.1, steps: 0, after: 0 };
+        let ramp = Ramp {
+            from: 0.4,
+            to: 0.1,
+            steps: 0,
+            after: 0,
+        };
         assert_eq!([ramp.at(0), Geometric(ramp).at(0), ramp.at(5)], [0.1; 3]);
-        assert_eq!([0, 7].map(|steps| Geometric(Ramp::constant(0.07)).at(steps)), [0.07; 2]);
+        assert_eq!(
+            [0, 7].map(|steps| Geometric(Ramp::constant(0.07)).at(steps)),
+            [0.07; 2]
+        );
         assert_eq!(Ramp::constant(-0.3).at(3), -0.3);
     }
 
     #[test]
-    fn a_ramp_without_a_later_beginning_survives_being_written_and_read_where_the_default_has_one() {
-        for given in ["0", "0.7", "{from=0,to=0.5,steps=20_000_000}", "{from=0.2,to=0.5,steps=0,after=7}"] {
-            let config =
-                Settings::new().sets(&[format!("randomization.share={given}").parse().unwrap()]).resolve().unwrap();
+    fn a_ramp_without_a_later_beginning_survives_being_written_and_read_where_the_default_has_one()
+    {
+        for given in [
+            "0",
+            "0.7",
+            "{from=0,to=0.5,steps=20_000_000}",
+            "{from=0.2,to=0.5,steps=0,after=7}",
+        ] {
+            let config = Settings::new()
+                .sets(&[format!("randomization.share={given}").parse().unwrap()])
+                .resolve()
+                .unwrap();
             let stored = Source::new("config.toml", config.to_text());
             let again = Settings::new().file(stored.clone()).resolve().unwrap();
             let sets = ["ppo.gamma=0.9".parse().unwrap()];
-            let forked = Settings::new().stored(stored, Reader::Run).sets(&sets).resolve().unwrap();
+            let forked = Settings::new()
+                .stored(stored, Reader::Run)
+                .sets(&sets)
+                .resolve()
+                .unwrap();
             let shares = [&config, &again, &forked].map(|config| config.randomization.share);
             assert_eq!(shares, [shares[0]; 3], "{given}");
             assert_eq!(again.randomization.happens(), given != "0");
-            assert_eq!(shares[0].after, if given.contains("after") { 7 } else { 0 }, "{given}");
+            assert_eq!(
+                shares[0].after,
+                if given.contains("after") { 7 } else { 0 },
+                "{given}"
+            );
         }
     }
 }

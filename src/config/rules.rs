@@ -34,8 +34,16 @@ const RANGES: [Range; 5] = [
         |x| x >= 1.0,
         "be at least 1",
     ),
-    ("randomization.share randomization.each ppo.gamma ppo.lambda", |x| (0.0..=1.0).contains(&x), "lie in [0, 1]"),
-    ("env.act_moving_average", |x| 0.0 < x && x <= 1.0, "be above 0 and at most 1"),
+    (
+        "randomization.share randomization.each ppo.gamma ppo.lambda",
+        |x| (0.0..=1.0).contains(&x),
+        "lie in [0, 1]",
+    ),
+    (
+        "env.act_moving_average",
+        |x| 0.0 < x && x <= 1.0,
+        "be above 0 and at most 1",
+    ),
 ];
 
 /// The largest valid values of settings.
@@ -93,13 +101,27 @@ fn magnitudes(table: &Table, rules: &mut Rules) {
     let limited = ["env.", "training.", "randomization."];
     let [least, most] = IN_F32;
     for (key, value) in settings(table).filter(|(key, _)| key != "training.hold") {
-        let most = if limited.iter().any(|section| key.starts_with(section)) { LARGEST } else { most };
+        let most = if limited.iter().any(|section| key.starts_with(section)) {
+            LARGEST
+        } else {
+            most
+        };
         let values = floats(value);
         if let Some(&x) = values.iter().find(|x| x.abs() > most) {
-            rules.check(false, &key, brief(x), format!("be at most {} in magnitude", brief(most)));
+            rules.check(
+                false,
+                &key,
+                brief(x),
+                format!("be at most {} in magnitude", brief(most)),
+            );
         }
         if let Some(&x) = values.iter().find(|x| **x != 0.0 && x.abs() < least) {
-            rules.check(false, &key, brief(x), format!("be 0, or at least {least:e} in magnitude"));
+            rules.check(
+                false,
+                &key,
+                brief(x),
+                format!("be 0, or at least {least:e} in magnitude"),
+            );
         }
     }
 }
@@ -115,13 +137,35 @@ fn floats(value: &Value) -> Vec<f64> {
 }
 
 fn hand(config: &Config, rules: &mut Rules) {
-    let Parts { joints, actuators, fingertips, object, goal, start } = &config.hand;
-    let lists = [("hand.joints", joints), ("hand.actuators", actuators), ("hand.fingertips", fingertips)];
-    let listed = lists.into_iter().flat_map(|(key, names)| names.iter().map(move |name| (key, name)));
-    let single = [("hand.object", object), ("hand.goal", goal), ("hand.start", start)];
+    let Parts {
+        joints,
+        actuators,
+        fingertips,
+        object,
+        goal,
+        start,
+    } = &config.hand;
+    let lists = [
+        ("hand.joints", joints),
+        ("hand.actuators", actuators),
+        ("hand.fingertips", fingertips),
+    ];
+    let listed = lists
+        .into_iter()
+        .flat_map(|(key, names)| names.iter().map(move |name| (key, name)));
+    let single = [
+        ("hand.object", object),
+        ("hand.goal", goal),
+        ("hand.start", start),
+    ];
     for (key, name) in listed.chain(single.into_iter().filter(|(_, name)| !name.is_empty())) {
         let fits = !name.is_empty() && name.len() <= 200 && !name.contains(char::is_control);
-        rules.check(fits, key, shortened(name), "hold names of 1 to 200 bytes without control characters");
+        rules.check(
+            fits,
+            key,
+            shortened(name),
+            "hold names of 1 to 200 bytes without control characters",
+        );
     }
 }
 
@@ -132,16 +176,35 @@ fn env(config: &Config, rules: &mut Rules) {
     let rule = format!("have coordinates of at most {FARTHEST} m");
     rules.check(near, "env.goal_position", format!("{place:?}"), rule);
     let names = |path: &str| path.split('/').all(|name| name.len() <= LONGEST_NAME);
-    let is_path =
-        |path: &str| (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control);
-    rules.check(is_path(&env.model), "env.model", &env.model, "be a path or \"builtin\"");
+    let is_path = |path: &str| {
+        (1..=LONGEST_PATH).contains(&path.len()) && names(path) && !path.contains(char::is_control)
+    };
+    rules.check(
+        is_path(&env.model),
+        "env.model",
+        &env.model,
+        "be a path or \"builtin\"",
+    );
     let ratio = env.ctrl_dt / env.sim_dt;
     let whole = (1.0..=1e4).contains(&ratio.round()) && (ratio / ratio.round() - 1.0).abs() < 1e-6;
-    let rule = format!("be a whole multiple of env.sim_dt = {}, at most 10000 times it", env.sim_dt);
-    rules.check(whole || ratio.is_nan() || ratio <= 0.0, "env.ctrl_dt", env.ctrl_dt, rule);
+    let rule = format!(
+        "be a whole multiple of env.sim_dt = {}, at most 10000 times it",
+        env.sim_dt
+    );
+    rules.check(
+        whole || ratio.is_nan() || ratio <= 0.0,
+        "env.ctrl_dt",
+        env.ctrl_dt,
+        rule,
+    );
     let steps = (env.max_episode_seconds / env.ctrl_dt).round();
     let rule = "last between one and 1e9 steps of env.ctrl_dt";
-    rules.check((1.0..=1e9).contains(&steps), "env.max_episode_seconds", env.max_episode_seconds, rule);
+    rules.check(
+        (1.0..=1e9).contains(&steps),
+        "env.max_episode_seconds",
+        env.max_episode_seconds,
+        rule,
+    );
 }
 
 fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
@@ -149,51 +212,110 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
     let drawn = &config.randomization;
     // A factor that is drawn from a range also has a setting in [env].
     for (key, value) in table["randomization"].as_table().into_iter().flatten() {
-        let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice) else { continue };
+        let Some([Value::Float(low), Value::Float(high)]) = value.as_array().map(Vec::as_slice)
+        else {
+            continue;
+        };
         let name = format!("randomization.{key}");
         let range = format!("[{low}, {high}]");
-        rules.check(0.0 < *low && low <= high, &name, range, "be [low, high] with 0 < low <= high");
+        rules.check(
+            0.0 < *low && low <= high,
+            &name,
+            range,
+            "be [low, high] with 0 < low <= high",
+        );
         let scale = format!("{key}_scale");
         let factor = table["env"][&scale].as_float().expect("a factor");
         rules.check(factor > 0.0, &format!("env.{scale}"), factor, "be above 0");
     }
     let [low, high] = drawn.delay;
     let range = format!("[{low}, {high}]");
-    rules.check(low <= high, "randomization.delay", &range, "be [low, high] with low <= high");
-    let steps = if env.max_episode_seconds >= env.ctrl_dt { env.max_episode_steps() } else { u32::MAX };
+    rules.check(
+        low <= high,
+        "randomization.delay",
+        &range,
+        "be [low, high] with low <= high",
+    );
+    let steps = if env.max_episode_seconds >= env.ctrl_dt {
+        env.max_episode_steps()
+    } else {
+        u32::MAX
+    };
     let rule = format!("be shorter than an episode, which lasts {steps} steps");
-    rules.check(env.action_delay < steps, "env.action_delay", env.action_delay, rule);
-    let rule = format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
+    rules.check(
+        env.action_delay < steps,
+        "env.action_delay",
+        env.action_delay,
+        rule,
+    );
+    let rule =
+        format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");
     let longest = env.action_delay.saturating_add(high);
-    rules.check(high == 0 || longest < steps, "randomization.delay", &range, rule);
+    rules.check(
+        high == 0 || longest < steps,
+        "randomization.delay",
+        &range,
+        rule,
+    );
     let rule = format!("be, with env.action_delay, at most {LONGEST_DELAY}");
     rules.check(longest <= LONGEST_DELAY, "randomization.delay", range, rule);
 }
 
 fn nets(config: &Config, rules: &mut Rules) {
     let hidden = &config.ppo.hidden;
-    let sizes_fit = (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h));
+    let sizes_fit =
+        (1..=64).contains(&hidden.len()) && hidden.iter().all(|h| (1..=16384).contains(h));
     let sizes = format!("{:?}", &hidden[..hidden.len().min(65)]);
-    rules.check(sizes_fit, "ppo.hidden", &sizes, "hold one to 64 sizes from 1 to 16384");
-    let weights = hidden.windows(2).fold(0_usize, |sum, pair| sum.saturating_add(pair[0].saturating_mul(pair[1])));
-    rules.check(weights <= 1 << 25, "ppo.hidden", sizes, "have at most 2^25 weights between its layers");
+    rules.check(
+        sizes_fit,
+        "ppo.hidden",
+        &sizes,
+        "hold one to 64 sizes from 1 to 16384",
+    );
+    let weights = hidden.windows(2).fold(0_usize, |sum, pair| {
+        sum.saturating_add(pair[0].saturating_mul(pair[1]))
+    });
+    rules.check(
+        weights <= 1 << 25,
+        "ppo.hidden",
+        sizes,
+        "have at most 2^25 weights between its layers",
+    );
 }
 
 fn samples(config: &Config, rules: &mut Rules) {
     let ppo = &config.ppo;
     let horizon = ppo.horizon;
-    let whole = [horizon.from, horizon.to].iter().all(|steps| steps.fract() == 0.0);
+    let whole = [horizon.from, horizon.to]
+        .iter()
+        .all(|steps| steps.fract() == 0.0);
     let multiple = horizon.from < 1.0 || whole && horizon.to % horizon.from == 0.0;
-    rules.check(multiple, "ppo.horizon", horizon, "be a whole number, or a ramp that ends at a multiple of its start");
+    rules.check(
+        multiple,
+        "ppo.horizon",
+        horizon,
+        "be a whole number, or a ramp that ends at a multiple of its start",
+    );
     let most = config.env.num_envs as f64 * horizon.to;
-    rules.check(most <= (1 << 22).into(), "ppo.horizon", horizon, "give at most 2^22 samples (num_envs * horizon)");
+    rules.check(
+        most <= (1 << 22).into(),
+        "ppo.horizon",
+        horizon,
+        "give at most 2^22 samples (num_envs * horizon)",
+    );
     let samples = config.steps_per_iteration() as usize;
     let parts = ppo.minibatches;
     // A number of 0 is reported elsewhere.
     let divides = parts == 0 || samples.is_multiple_of(parts);
-    rules.check(divides, "ppo.minibatches", parts, format!("divide num_envs * horizon = {samples}"));
+    rules.check(
+        divides,
+        "ppo.minibatches",
+        parts,
+        format!("divide num_envs * horizon = {samples}"),
+    );
     let shards = config.run.shards;
-    let dealt = !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
+    let dealt =
+        !divides || parts == 0 || shards == 0 || shards.is_power_of_two() && config.divides(shards);
     let rule = "be 0, or a power of two that divides env.num_envs and the samples of a minibatch";
     rules.check(dealt, "run.shards", shards, rule);
 }
@@ -201,19 +323,39 @@ fn samples(config: &Config, rules: &mut Rules) {
 fn learning(ppo: &PpoConfig, rules: &mut Rules) {
     let computable = ppo.precision == Precision::F32 || ppo.backend == Backend::Fused;
     let precision = Value::try_from(ppo.precision).expect("a string");
-    rules.check(computable, "ppo.precision", precision, "be \"f32\" with ppo.backend = \"candle\"");
+    rules.check(
+        computable,
+        "ppo.precision",
+        precision,
+        "be \"f32\" with ppo.backend = \"candle\"",
+    );
     let [low, high] = ppo.learning_rate_range;
     let range = format!("[{low}, {high}]");
     let kl = ppo.desired_kl.0;
     let fixed = [kl.from, kl.to].contains(&0.0);
-    rules.check(!fixed || kl.from == kl.to, "ppo.desired_kl", kl, "be above 0 at both ends, or 0 throughout");
+    rules.check(
+        !fixed || kl.from == kl.to,
+        "ppo.desired_kl",
+        kl,
+        "be above 0 at both ends, or 0 throughout",
+    );
     let within = fixed || (low..=high).contains(&ppo.learning_rate);
     let rule = format!("lie in ppo.learning_rate_range = {range} unless ppo.desired_kl = 0");
     rules.check(within, "ppo.learning_rate", ppo.learning_rate, rule);
-    rules.check(0.0 < low && low <= high, "ppo.learning_rate_range", range, "be [low, high] with 0 < low <= high");
+    rules.check(
+        0.0 < low && low <= high,
+        "ppo.learning_rate_range",
+        range,
+        "be [low, high] with 0 < low <= high",
+    );
     let [near, far] = ppo.away_range;
     let range = format!("[{near}, {far}]");
-    rules.check(0.0 <= near && near < far, "ppo.away_range", range, "be [near, far] with 0 <= near < far");
+    rules.check(
+        0.0 <= near && near < far,
+        "ppo.away_range",
+        range,
+        "be [near, far] with 0 <= near < far",
+    );
 }
 
 /// The rules that were broken.
@@ -223,12 +365,22 @@ struct Rules(Vec<String>);
 impl Rules {
     fn check(&mut self, holds: bool, key: &str, value: impl Display, rule: impl Display) {
         if !holds {
-            self.0.push(format!("{} = {}: must {rule}", shortened(key), shortened(&value.to_string())));
+            self.0.push(format!(
+                "{} = {}: must {rule}",
+                shortened(key),
+                shortened(&value.to_string())
+            ));
         }
     }
 
     /// Checks a number, both ends of a ramp, or the numbers of all groups.
-    fn number(&mut self, table: &Table, key: &str, holds: impl Fn(f64) -> bool, rule: impl Display) {
+    fn number(
+        &mut self,
+        table: &Table,
+        key: &str,
+        holds: impl Fn(f64) -> bool,
+        rule: impl Display,
+    ) {
         let mut check = |name: &str, value: &Value| {
             let x = number(value).expect("a number");
             self.check(holds(x), name, brief(x), &rule);

@@ -87,7 +87,10 @@ impl<T> OfScene<T> {
     /// Takes the value of the scene, unless one is set.
     pub fn settle(&mut self, of_scene: T) {
         if !self.named {
-            *self = Self { value: of_scene, named: true };
+            *self = Self {
+                value: of_scene,
+                named: true,
+            };
         }
     }
 }
@@ -238,18 +241,29 @@ impl Config {
 
     /// The number of samples in a minibatch.
     pub fn samples_per_minibatch(&self) -> usize {
-        self.ppo.minibatch_of(self.steps_per_iteration() as usize, self.ppo.first_horizon())
+        self.ppo.minibatch_of(
+            self.steps_per_iteration() as usize,
+            self.ppo.first_horizon(),
+        )
     }
 
     /// The number of shards: the configured one or, if that is 0, the largest that fits, up to 16.
     pub fn shards(&self) -> usize {
-        let found = [16, 8, 4, 2].into_iter().find(|&shards| self.divides(shards)).unwrap_or(1);
-        if self.run.shards == 0 { found } else { self.run.shards }
+        let found = [16, 8, 4, 2]
+            .into_iter()
+            .find(|&shards| self.divides(shards))
+            .unwrap_or(1);
+        if self.run.shards == 0 {
+            found
+        } else {
+            self.run.shards
+        }
     }
 
     /// Whether environments and minibatches can be divided evenly into `shards`.
     pub(super) fn divides(&self, shards: usize) -> bool {
-        self.env.num_envs.is_multiple_of(shards) && self.samples_per_minibatch().is_multiple_of(shards)
+        self.env.num_envs.is_multiple_of(shards)
+            && self.samples_per_minibatch().is_multiple_of(shards)
     }
 }
 
@@ -275,7 +289,11 @@ impl PpoConfig {
 
     /// How far a value may move from its value at collection time, or infinity if `value_clip` is 0.
     pub fn value_clip(&self) -> f64 {
-        if self.value_clip == 0.0 { f64::INFINITY } else { self.value_clip }
+        if self.value_clip == 0.0 {
+            f64::INFINITY
+        } else {
+            self.value_clip
+        }
     }
 }
 
@@ -290,7 +308,10 @@ impl EnvConfig {
     /// The task after `env_steps` control steps of a run: actions are smoothed as much as training has come to smooth them.
     pub fn at(&self, env_steps: u64) -> Self {
         let act_moving_average = Ramp::constant(self.act_moving_average.at(env_steps));
-        Self { act_moving_average, ..self.clone() }
+        Self {
+            act_moving_average,
+            ..self.clone()
+        }
     }
 
     /// The number of physics steps in one control step.

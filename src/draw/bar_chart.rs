@@ -58,21 +58,50 @@ impl Picture for BarChart {
         Ok([WIDTH as u32, (TITLE + bars + GAP + map + GAP) as u32])
     }
 
-    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()> {
+    fn draw(
+        &self,
+        area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
+    ) -> Result<()> {
         area.fill(&WHITE)?;
-        draw_text(&area, &self.title, (WIDTH / 2, TITLE / 2), (HPos::Center, 16, BLACK))?;
+        draw_text(
+            &area,
+            &self.title,
+            (WIDTH / 2, TITLE / 2),
+            (HPos::Center, 16, BLACK),
+        )?;
         let bottom = TITLE + ROW * self.bars.len() as i32;
         for value in LINES {
-            area.draw(&PathElement::new([(along(value), TITLE), (along(value), bottom)], GRID))?;
-            draw_text(&area, &value.to_string(), (along(value), bottom + ROW / 2), (HPos::Center, 12, BLACK))?;
+            area.draw(&PathElement::new(
+                [(along(value), TITLE), (along(value), bottom)],
+                GRID,
+            ))?;
+            draw_text(
+                &area,
+                &value.to_string(),
+                (along(value), bottom + ROW / 2),
+                (HPos::Center, 12, BLACK),
+            )?;
         }
         for (bar, row) in self.bars.iter().zip(0..) {
             let middle = TITLE + ROW * row + ROW / 2;
-            draw_text(&area, &bar.name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
-            draw_text(&area, &bar.note, (WIDTH - NOTES + 8, middle), (HPos::Left, 12, BLACK))?;
+            draw_text(
+                &area,
+                &bar.name,
+                (NAMES - 8, middle),
+                (HPos::Right, 13, BLACK),
+            )?;
+            draw_text(
+                &area,
+                &bar.note,
+                (WIDTH - NOTES + 8, middle),
+                (HPos::Left, 12, BLACK),
+            )?;
             let corners = [(along(0.0), middle - 7), (along(bar.value), middle + 7)];
             area.draw(&Rectangle::new(corners, BAR.filled()))?;
-            area.draw(&PathElement::new(bar.interval.map(|value| (along(value), middle)), BLACK))?;
+            area.draw(&PathElement::new(
+                bar.interval.map(|value| (along(value), middle)),
+                BLACK,
+            ))?;
         }
         self.draw_map(&area, bottom + ROW + GAP)?;
         Ok(area.present()?)
@@ -85,22 +114,43 @@ fn along(value: f64) -> i32 {
 }
 
 impl BarChart {
-    fn draw_map(&self, area: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>, top: i32) -> Result<()> {
+    fn draw_map(
+        &self,
+        area: &DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
+        top: i32,
+    ) -> Result<()> {
         let width = (WIDTH - NAMES - NOTES) / self.columns.len() as i32;
         let left = |column: i32| NAMES + width * column;
         for (name, column) in self.columns.iter().zip(0..) {
-            draw_text(area, name, (left(column) + width / 2, top + CELL / 2), (HPos::Center, 13, BLACK))?;
+            draw_text(
+                area,
+                name,
+                (left(column) + width / 2, top + CELL / 2),
+                (HPos::Center, 13, BLACK),
+            )?;
         }
         for ((name, cells), row) in self.rows.iter().zip(&self.cells).zip(1..) {
             let upper = top + CELL * row;
             let middle = upper + CELL / 2;
             draw_text(area, name, (NAMES - 8, middle), (HPos::Right, 13, BLACK))?;
             for (&value, column) in cells.iter().zip(0..) {
-                let share = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
-                let corners = [(left(column), upper), (left(column + 1) - 2, upper + CELL - 2)];
+                let share = if value.is_nan() {
+                    0.0
+                } else {
+                    value.clamp(0.0, 1.0)
+                };
+                let corners = [
+                    (left(column), upper),
+                    (left(column + 1) - 2, upper + CELL - 2),
+                ];
                 area.draw(&Rectangle::new(corners, blended(share).filled()))?;
                 let colour = if share > 0.6 { WHITE } else { BLACK };
-                draw_text(area, &number(value, 2), (left(column) + width / 2, middle), (HPos::Center, 13, colour))?;
+                draw_text(
+                    area,
+                    &number(value, 2),
+                    (left(column) + width / 2, middle),
+                    (HPos::Center, 13, colour),
+                )?;
             }
         }
         Ok(())
@@ -121,7 +171,10 @@ mod tests {
 
     fn svg(chart: &BarChart) -> String {
         let place = tempfile::tempdir().unwrap();
-        let to = Destination { ending: "svg", path: place.path().join("bars.svg") };
+        let to = Destination {
+            ending: "svg",
+            path: place.path().join("bars.svg"),
+        };
         chart.write(PictureFile::create(&to).unwrap()).unwrap();
         crate::os::read_text(&to.path).unwrap()
     }
@@ -134,7 +187,11 @@ mod tests {
             interval: [value - 0.1, value + 0.1],
             note: "some".into(),
         };
-        let bars = vec![bar("whole", 1.0), bar("half", 0.5), bar("unknown", f64::NAN)];
+        let bars = vec![
+            bar("whole", 1.0),
+            bar("half", 0.5),
+            bar("unknown", f64::NAN),
+        ];
         let svg = svg(&BarChart {
             title: "title".into(),
             bars,
@@ -143,12 +200,26 @@ mod tests {
             cells: vec![vec![0.5]],
         });
         let colour = format!("fill=\"#{:02X}{:02X}{:02X}\"", BAR.0, BAR.1, BAR.2);
-        let width =
-            |line: &str| line.split("width=\"").nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();
-        let widths: Vec<f64> =
-            svg.lines().filter(|line| line.starts_with("<rect") && line.contains(&colour)).map(width).collect();
+        let width = |line: &str| {
+            line.split("width=\"")
+                .nth(1)
+                .unwrap()
+                .split('"')
+                .next()
+                .unwrap()
+                .parse::<f64>()
+                .unwrap()
+        };
+        let widths: Vec<f64> = svg
+            .lines()
+            .filter(|line| line.starts_with("<rect") && line.contains(&colour))
+            .map(width)
+            .collect();
         assert_eq!(widths.len(), 3, "{svg}");
-        assert!((widths[0] - 2.0 * widths[1]).abs() <= 2.0 && widths[2] <= 1.0, "{widths:?}");
+        assert!(
+            (widths[0] - 2.0 * widths[1]).abs() <= 2.0 && widths[2] <= 1.0,
+            "{widths:?}"
+        );
         for text in ["whole", "unknown", "0.50", "title"] {
             assert!(svg.contains(text), "{text}");
         }
@@ -157,9 +228,20 @@ mod tests {
     #[test]
     fn no_character_that_xml_does_not_allow_is_drawn() {
         let odd = || "a\u{1}\u{ffff}<".to_owned();
-        let bars = vec![NamedBar { name: odd(), value: 1.0, interval: [1.0; 2], note: odd() }];
+        let bars = vec![NamedBar {
+            name: odd(),
+            value: 1.0,
+            interval: [1.0; 2],
+            note: odd(),
+        }];
         let cells = vec![vec![0.5]];
-        let svg = svg(&BarChart { title: odd(), bars, columns: vec![odd()], rows: vec![odd()], cells });
+        let svg = svg(&BarChart {
+            title: odd(),
+            bars,
+            columns: vec![odd()],
+            rows: vec![odd()],
+            cells,
+        });
         assert_eq!(svg.matches("a\u{fffd}\u{fffd}&lt;").count(), 5, "{svg}");
     }
 }

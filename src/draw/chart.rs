@@ -65,7 +65,11 @@ const GAP: i32 = 3;
 /// The colour and dash length (pixels) of each curve in turn. Once all colours are used, they repeat with dashes.
 fn styles() -> impl Iterator<Item = (ShapeStyle, i32)> {
     let dashes = std::iter::once(i32::MAX).chain((1..).map(|round| 5 * round));
-    dashes.flat_map(|dash| COLOURS.iter().map(move |colour| (colour.stroke_width(2), dash)))
+    dashes.flat_map(|dash| {
+        COLOURS
+            .iter()
+            .map(move |colour| (colour.stroke_width(2), dash))
+    })
 }
 
 /// A picture that is drawn in the same way in each format.
@@ -80,7 +84,8 @@ pub trait Picture {
     ///
     /// # Errors
     /// Fails if the font cannot be used.
-    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()>;
+    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>)
+    -> Result<()>;
 
     /// Writes the picture.
     ///
@@ -89,13 +94,18 @@ pub trait Picture {
     fn write(&self, PictureFile { output, ending }: PictureFile) -> Result<()> {
         // With the feature `video`, text is measured for SVG too, which needs the font. A second call has no effect.
         #[cfg(feature = "video")]
-        let _ = plotters::style::register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
+        let _ = plotters::style::register_font(
+            "sans-serif",
+            FontStyle::Normal,
+            epaint_default_fonts::UBUNTU_LIGHT,
+        );
         let [width, height] = self.size()?;
         match ending {
             #[cfg(feature = "video")]
             "png" => {
                 let mut rgb = vec![0; 3 * width as usize * height as usize];
-                let area = BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area();
+                let area =
+                    BitMapBackend::with_buffer(&mut rgb, (width, height)).into_drawing_area();
                 self.draw(area).context("cannot draw the chart")?;
                 super::film::write_png(output, [width, height], &rgb)
             }
@@ -124,8 +134,13 @@ impl PictureFile {
     pub fn create(to: &Destination) -> Result<Self> {
         let path = to.path.display();
         match to.ending {
-            "png" if !cfg!(feature = "video") => bail!("{path}: PNG needs the cargo feature `video`; .svg does not"),
-            "svg" | "png" => Ok(Self { output: OutputFile::create(&to.path)?, ending: to.ending }),
+            "png" if !cfg!(feature = "video") => {
+                bail!("{path}: PNG needs the cargo feature `video`; .svg does not")
+            }
+            "svg" | "png" => Ok(Self {
+                output: OutputFile::create(&to.path)?,
+                ending: to.ending,
+            }),
             other => bail!("{path}: a chart is an .svg or a .png, not a .{other}"),
         }
     }
@@ -138,21 +153,34 @@ pub fn draw_text(
     at: (i32, i32),
     (across, size, colour): (HPos, i32, RGBColor),
 ) -> Result<()> {
-    let style = ("sans-serif", size).into_font().color(&colour).pos(Pos::new(across, VPos::Center));
+    let style = ("sans-serif", size)
+        .into_font()
+        .color(&colour)
+        .pos(Pos::new(across, VPos::Center));
     Ok(area.draw(&Text::new(printable(text), at, style))?)
 }
 
 /// A text without the characters that XML does not allow.
 fn printable(text: &str) -> String {
     let allowed = |c: char| !c.is_control() && !matches!(c, '\u{fffe}' | '\u{ffff}');
-    text.chars().map(|c| if allowed(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
+    text.chars()
+        .map(|c| {
+            if allowed(c) {
+                c
+            } else {
+                char::REPLACEMENT_CHARACTER
+            }
+        })
+        .collect()
 }
 
 impl Picture for Chart {
     fn size(&self) -> Result<[u32; 2]> {
         let panels = self.panels.len() as u32;
         let legend = |width| legend_height(&self.legend_rows(width));
-        let [width, height] = self.size.unwrap_or_else(|| [WIDTH, legend(WIDTH) + PANEL * panels]);
+        let [width, height] = self
+            .size
+            .unwrap_or_else(|| [WIDTH, legend(WIDTH) + PANEL * panels]);
         ensure!(
             legend(width) + LEAST_PANEL * panels <= height,
             "{panels} panels and the names of {} curves do not fit into {height} pixels",
@@ -161,20 +189,42 @@ impl Picture for Chart {
         Ok([width, height])
     }
 
-    fn draw(&self, area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>) -> Result<()> {
+    fn draw(
+        &self,
+        area: DrawingArea<impl DrawingBackend<ErrorType: 'static>, Shift>,
+    ) -> Result<()> {
         area.fill(&WHITE)?;
         let rows = self.legend_rows(area.dim_in_pixel().0);
         let (top, below) = area.split_vertically(legend_height(&rows));
         for (i, row) in rows.into_iter().enumerate() {
             let y = (MARGIN + ROW * i as u32 + ROW / 2) as i32;
             for (name, (colour, dash), left) in row {
-                top.draw(&DashedPathElement::new([(left, y), (left + LINE, y)], dash, GAP, colour))?;
-                draw_text(&top, name, (left + LINE + MARGIN as i32, y), (HPos::Left, LABEL, BLACK))?;
+                top.draw(&DashedPathElement::new(
+                    [(left, y), (left + LINE, y)],
+                    dash,
+                    GAP,
+                    colour,
+                ))?;
+                draw_text(
+                    &top,
+                    name,
+                    (left + LINE + MARGIN as i32, y),
+                    (HPos::Left, LABEL, BLACK),
+                )?;
             }
         }
         let last = self.panels.len() - 1;
-        let x = range(self.panels.iter().flat_map(|panel| panel.curves.iter().flat_map(Curve::along)));
-        for (i, (panel, part)) in self.panels.iter().zip(below.split_evenly((self.panels.len(), 1))).enumerate() {
+        let x = range(
+            self.panels
+                .iter()
+                .flat_map(|panel| panel.curves.iter().flat_map(Curve::along)),
+        );
+        for (i, (panel, part)) in self
+            .panels
+            .iter()
+            .zip(below.split_evenly((self.panels.len(), 1)))
+            .enumerate()
+        {
             panel.draw(&part, x.clone(), (i == last).then_some(&self.along[..]))?;
         }
         Ok(area.present()?)
@@ -213,14 +263,18 @@ impl Chart {
         let mut left = margin;
         for (name, style) in self.legend.iter().zip(styles()) {
             // Without a font, the width of a letter is a guess.
-            let text =
-                ("sans-serif", LABEL).into_font().box_size(name).map_or(7 * name.len() as u32, |(width, _)| width);
+            let text = ("sans-serif", LABEL)
+                .into_font()
+                .box_size(name)
+                .map_or(7 * name.len() as u32, |(width, _)| width);
             let length = LINE + MARGIN as i32 + text as i32 + SPACE;
             if left > margin && left + length - SPACE > width as i32 {
                 rows.push(Vec::new());
                 left = margin;
             }
-            rows.last_mut().expect("there is a row").push((&name[..], style, left));
+            rows.last_mut()
+                .expect("there is a row")
+                .push((&name[..], style, left));
             left += length;
         }
         rows
@@ -248,8 +302,16 @@ impl Subplot {
             .y_label_area_size(56)
             .build_cartesian_2d(x, y)?;
         let mut mesh = chart.configure_mesh();
-        mesh.max_light_lines(0).bold_line_style(GRID).label_style(("sans-serif", LABEL));
-        let small = |value: &f64| if value.abs() < 1e-6 * extent { "0".to_owned() } else { format!("{value:.1e}") };
+        mesh.max_light_lines(0)
+            .bold_line_style(GRID)
+            .label_style(("sans-serif", LABEL));
+        let small = |value: &f64| {
+            if value.abs() < 1e-6 * extent {
+                "0".to_owned()
+            } else {
+                format!("{value:.1e}")
+            }
+        };
         if extent < SMALL {
             mesh.y_label_formatter(&small);
         }
@@ -262,7 +324,12 @@ impl Subplot {
         }
         if self.curves.iter().all(|curve| curve.points.is_empty()) {
             let (width, height) = part.dim_in_pixel();
-            draw_text(part, &self.nothing, (width as i32 / 2, height as i32 / 2), (HPos::Center, 15, BLACK))?;
+            draw_text(
+                part,
+                &self.nothing,
+                (width as i32 / 2, height as i32 / 2),
+                (HPos::Center, 15, BLACK),
+            )?;
         }
         Ok(())
     }
@@ -275,17 +342,26 @@ impl Curve {
 
     /// All values, including the band.
     fn values(&self) -> impl Iterator<Item = f64> {
-        self.points.iter().map(|[_, y]| *y).chain(self.band.iter().flatten().copied())
+        self.points
+            .iter()
+            .map(|[_, y]| *y)
+            .chain(self.band.iter().flatten().copied())
     }
 
     fn draw(
         &self,
-        chart: &mut ChartContext<impl DrawingBackend<ErrorType: 'static>, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
+        chart: &mut ChartContext<
+            impl DrawingBackend<ErrorType: 'static>,
+            Cartesian2d<RangedCoordf64, RangedCoordf64>,
+        >,
         (colour, dash): (ShapeStyle, i32),
     ) -> Result<()> {
         let points = || self.points.iter().map(|&[x, y]| (x, y));
         if !self.band.is_empty() {
-            let edge = |side: usize| self.along().zip(self.band.iter().map(move |band| band[side]));
+            let edge = |side: usize| {
+                self.along()
+                    .zip(self.band.iter().map(move |band| band[side]))
+            };
             let upper: Vec<_> = edge(1).collect();
             let outline: Vec<_> = edge(0).chain(upper.into_iter().rev()).collect();
             // Opaque and below the line, since not every SVG viewer supports opacity.
@@ -304,8 +380,14 @@ impl Curve {
 
 /// The range of the values and zero, with a margin at the top. It is never empty.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
-    let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| (low.min(value), high.max(value)));
-    if low < high { low..high + 0.05 * (high - low) } else { 0.0..1.0 }
+    let (low, high) = values.fold((0.0_f64, 0.0_f64), |(low, high), value| {
+        (low.min(value), high.max(value))
+    });
+    if low < high {
+        low..high + 0.05 * (high - low)
+    } else {
+        0.0..1.0
+    }
 }
 
 #[cfg(test)]
@@ -313,20 +395,35 @@ mod tests {
     use super::*;
 
     fn panel(title: &str, curves: Vec<Curve>) -> Subplot {
-        Subplot { title: title.into(), curves, nothing: "nothing yet".into() }
+        Subplot {
+            title: title.into(),
+            curves,
+            nothing: "nothing yet".into(),
+        }
     }
 
     fn line(points: &[[f64; 2]]) -> Curve {
-        Curve { points: points.to_vec(), ..Curve::default() }
+        Curve {
+            points: points.to_vec(),
+            ..Curve::default()
+        }
     }
 
     fn svg(panels: Vec<Subplot>) -> String {
         let curves = panels.iter().map(|panel| panel.curves.len()).max().unwrap();
         let legend = (1..=curves).map(|i| format!("run {i}")).collect();
-        let chart = Chart { legend, along: "steps".into(), panels, size: None };
+        let chart = Chart {
+            legend,
+            along: "steps".into(),
+            panels,
+            size: None,
+        };
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("chart.svg");
-        let to = Destination { ending: "svg", path: path.clone() };
+        let to = Destination {
+            ending: "svg",
+            path: path.clone(),
+        };
         chart.write(PictureFile::create(&to).unwrap()).unwrap();
         crate::os::read_text(&path).unwrap()
     }
@@ -337,8 +434,13 @@ mod tests {
         let svg = svg(vec![panel("a", (1..=8).map(curve).collect())]);
         // The first and the eighth share a colour: two solid lines, one of them in the legend, and the eighth's dashes.
         let lines = |colour: RGBColor| {
-            let stroke = format!("stroke=\"#{:02X}{:02X}{:02X}\"", colour.0, colour.1, colour.2);
-            svg.lines().filter(|line| line.starts_with("<polyline") && line.contains(&stroke)).count()
+            let stroke = format!(
+                "stroke=\"#{:02X}{:02X}{:02X}\"",
+                colour.0, colour.1, colour.2
+            );
+            svg.lines()
+                .filter(|line| line.starts_with("<polyline") && line.contains(&stroke))
+                .count()
         };
         assert_eq!(lines(COLOURS[1]), 2, "{svg}");
         assert!(lines(COLOURS[0]) > 20, "{svg}");
@@ -346,11 +448,17 @@ mod tests {
 
     #[test]
     fn an_axis_of_very_small_values_has_labels_that_differ() {
-        for (low, labels) in
-            [(0.0, ["0", "5.0e-7", "1.5e-6", "3.0e-6"]), (-1.3e-5, ["0", "2.0e-6", "-2.0e-6", "-1.2e-5"])]
-        {
+        for (low, labels) in [
+            (0.0, ["0", "5.0e-7", "1.5e-6", "3.0e-6"]),
+            (-1.3e-5, ["0", "2.0e-6", "-2.0e-6", "-1.2e-5"]),
+        ] {
             let svg = svg(vec![panel("a", vec![line(&[[0.0, low], [1.0, 3e-6]])])]);
-            assert!(labels.iter().all(|label| svg.lines().any(|line| line.trim() == *label)), "{svg}");
+            assert!(
+                labels
+                    .iter()
+                    .all(|label| svg.lines().any(|line| line.trim() == *label)),
+                "{svg}"
+            );
         }
     }
 
@@ -358,7 +466,11 @@ mod tests {
     fn all_panels_have_the_same_axis() {
         let until = |end| vec![line(&[[1.0, 0.5], [end, 0.7]])];
         let svg = svg(vec![panel("a", until(5.0)), panel("b", until(20.0))]);
-        assert_eq!(svg.lines().filter(|line| line.trim() == "20.0").count(), 2, "{svg}");
+        assert_eq!(
+            svg.lines().filter(|line| line.trim() == "20.0").count(),
+            2,
+            "{svg}"
+        );
     }
 
     #[test]
@@ -367,9 +479,22 @@ mod tests {
         let svg = svg(vec![panel("the panel", (1..=30).map(long).collect())]);
         let height = |text: &str| {
             let lines: Vec<&str> = svg.lines().collect();
-            let place = lines.iter().position(|line| line.trim() == text).expect(text);
-            let tag = lines[..place].iter().rfind(|line| line.starts_with("<text")).unwrap();
-            tag.split(" y=\"").nth(1).unwrap().split('"').next().unwrap().parse::<i32>().unwrap()
+            let place = lines
+                .iter()
+                .position(|line| line.trim() == text)
+                .expect(text);
+            let tag = lines[..place]
+                .iter()
+                .rfind(|line| line.starts_with("<text"))
+                .unwrap();
+            tag.split(" y=\"")
+                .nth(1)
+                .unwrap()
+                .split('"')
+                .next()
+                .unwrap()
+                .parse::<i32>()
+                .unwrap()
         };
         assert!(height("run 1") < height("run 30"), "several rows");
         assert!(height("run 30") < height("the panel"), "{svg}");
@@ -377,8 +502,16 @@ mod tests {
 
     #[test]
     fn a_single_point_is_a_dot_a_band_is_a_surface_and_an_empty_panel_says_so() {
-        let band = Curve { points: vec![[1.0, 0.5], [2.0, 0.5]], band: vec![[0.2, 0.9]; 2], dots: false };
-        let svg = svg(vec![panel("dot", vec![line(&[[1.0, 0.5]])]), panel("band", vec![band]), panel("none", vec![])]);
+        let band = Curve {
+            points: vec![[1.0, 0.5], [2.0, 0.5]],
+            band: vec![[0.2, 0.9]; 2],
+            dots: false,
+        };
+        let svg = svg(vec![
+            panel("dot", vec![line(&[[1.0, 0.5]])]),
+            panel("band", vec![band]),
+            panel("none", vec![]),
+        ]);
         for (part, count) in [("<circle", 1), ("<polygon", 1), ("\nnothing yet", 1)] {
             assert_eq!(svg.matches(part).count(), count, "{part}: {svg}");
         }

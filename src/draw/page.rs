@@ -60,7 +60,8 @@ impl Page {
         if is_live {
             self.meta["key"] = self.key().into();
         }
-        let (lists, meshes): (Vec<Value>, Vec<Vec<u8>>) = self.meshes.iter().map(packed_mesh).unzip();
+        let (lists, meshes): (Vec<Value>, Vec<Vec<u8>>) =
+            self.meshes.iter().map(packed_mesh).unzip();
         self.scene["meshes"] = lists.into();
         let (scale, rows) = packed_rows(&self.rows, &self.counts);
         self.meta["rows"] = self.rows.len().into();
@@ -83,14 +84,21 @@ impl Page {
             ("MESHES", packed(&meshes.concat())),
             ("META", self.meta.to_string().replace('<', "\\u003c")),
         ];
-        values.iter().fold(PAGE.to_owned(), |page, (name, value)| page.replace(&format!("{{{{{name}}}}}"), value))
+        values.iter().fold(PAGE.to_owned(), |page, (name, value)| {
+            page.replace(&format!("{{{{{name}}}}}"), value)
+        })
     }
 }
 
 /// A text without indents, empty lines and lines of comment.
 fn lean(text: &str) -> String {
-    let is_code = |line: &&str| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*");
-    text.lines().map(str::trim).filter(is_code).map(|line| format!("{line}\n")).collect()
+    let is_code =
+        |line: &&str| !line.is_empty() && !line.starts_with("//") && !line.starts_with("/*");
+    text.lines()
+        .map(str::trim)
+        .filter(is_code)
+        .map(|line| format!("{line}\n"))
+        .collect()
 }
 
 /// The hash by which a content security policy names a text.
@@ -122,10 +130,21 @@ fn table(rows: usize, columns: usize, value: impl Fn(usize, usize) -> i64) -> Ve
 /// The factor of each column, and the rows as a table of integers.
 fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
     let columns = rows.first().map_or(0, Vec::len);
-    let largest = |column: usize| rows.iter().fold(1e-9, |most: f64, row| most.max(row[column].abs()));
-    let scale = |column| if counts.contains(&column) { 1.0 } else { largest(column) / LARGEST };
+    let largest = |column: usize| {
+        rows.iter()
+            .fold(1e-9, |most: f64, row| most.max(row[column].abs()))
+    };
+    let scale = |column| {
+        if counts.contains(&column) {
+            1.0
+        } else {
+            largest(column) / LARGEST
+        }
+    };
     let scale: Vec<f64> = (0..columns).map(scale).collect();
-    let packed = table(rows.len(), columns, |row, column| (rows[row][column] / scale[column]).round() as i64);
+    let packed = table(rows.len(), columns, |row, column| {
+        (rows[row][column] / scale[column]).round() as i64
+    });
     (scale, packed)
 }
 
@@ -133,7 +152,11 @@ fn packed_rows(rows: &[Vec<f64>], counts: &[usize]) -> (Vec<f64>, Vec<u8>) {
 /// triangles.
 fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
     let bounds = |pick: fn(f32, f32) -> f32, start: f32| {
-        [0, 1, 2].map(|axis| corners.iter().fold(start, |bound, (point, _)| pick(bound, point[axis])))
+        [0, 1, 2].map(|axis| {
+            corners
+                .iter()
+                .fold(start, |bound, (point, _)| pick(bound, point[axis]))
+        })
     };
     let low = bounds(f32::min, f32::INFINITY);
     let high = bounds(f32::max, f32::NEG_INFINITY);
@@ -142,10 +165,19 @@ fn packed_mesh((corners, triangles): &Mesh) -> (Value, Vec<u8>) {
         (f64::from(corners[corner].0[axis] - low[axis]) / step[axis]).round() as i64 - 32768
     };
     let mut bytes = table(corners.len(), 3, point);
-    let normal = |axis: usize| corners.iter().map(move |(_, normal)| (normal[axis] * 127.0).round() as i8 as u8);
+    let normal = |axis: usize| {
+        corners
+            .iter()
+            .map(move |(_, normal)| (normal[axis] * 127.0).round() as i8 as u8)
+    };
     bytes.extend((0..3).flat_map(normal));
-    bytes.extend(table(3 * triangles.len(), 1, |place, _| triangles[place / 3][place % 3] as i64));
-    (json!({ "points": corners.len(), "triangles": triangles.len(), "low": low, "step": step }), bytes)
+    bytes.extend(table(3 * triangles.len(), 1, |place, _| {
+        triangles[place / 3][place % 3] as i64
+    }));
+    (
+        json!({ "points": corners.len(), "triangles": triangles.len(), "low": low, "step": step }),
+        bytes,
+    )
 }
 
 #[cfg(test)]
@@ -155,11 +187,23 @@ mod tests {
     #[test]
     fn the_page_is_ascii_but_for_its_data_and_names_no_other_place() {
         for text in CODE.into_iter().chain([STYLE, PAGE]) {
-            assert!(text.is_ascii(), "{:?}", text.chars().find(|c| !c.is_ascii()));
-            assert!(!text.contains("://") && !text.contains("src="), "it loads something");
+            assert!(
+                text.is_ascii(),
+                "{:?}",
+                text.chars().find(|c| !c.is_ascii())
+            );
+            assert!(
+                !text.contains("://") && !text.contains("src="),
+                "it loads something"
+            );
         }
         for text in CODE.into_iter().chain([STYLE]) {
-            assert!(!["</script", "</style", "<!--"].iter().any(|end| text.contains(end)), "it would end early");
+            assert!(
+                !["</script", "</style", "<!--"]
+                    .iter()
+                    .any(|end| text.contains(end)),
+                "it would end early"
+            );
         }
     }
 
@@ -167,7 +211,10 @@ mod tests {
     fn the_example_in_the_documents_has_the_code_and_the_style_of_today() {
         let example = include_str!("../../docs/hand.html");
         for text in CODE.into_iter().chain([STYLE]) {
-            assert!(example.contains(&lean(text)), "write it anew, as CONTRIBUTING.md says");
+            assert!(
+                example.contains(&lean(text)),
+                "write it anew, as CONTRIBUTING.md says"
+            );
         }
     }
 
@@ -189,9 +236,18 @@ mod tests {
     #[test]
     fn what_ends_a_script_does_not_end_the_data() {
         let meta = json!({ "policy": "</script><script>alert(1)</script>" });
-        let page =
-            Page { meta, scene: json!({}), meshes: Vec::new(), rows: vec![vec![1.0]], counts: Vec::new() }.html();
-        assert_eq!(page.matches("</script>").count(), PAGE.matches("</script>").count());
+        let page = Page {
+            meta,
+            scene: json!({}),
+            meshes: Vec::new(),
+            rows: vec![vec![1.0]],
+            counts: Vec::new(),
+        }
+        .html();
+        assert_eq!(
+            page.matches("</script>").count(),
+            PAGE.matches("</script>").count()
+        );
         assert!(!page.contains("alert(1)</script>") && page.contains("\\u003c/script>"));
     }
 }

@@ -96,7 +96,12 @@ impl<E: Env> EnvPool<E> {
             spaces,
             finished: Vec::new(),
         };
-        Self { blocks: (first_block..).zip(sizes.repeat(shards.len())).map(block).collect() }
+        Self {
+            blocks: (first_block..)
+                .zip(sizes.repeat(shards.len()))
+                .map(block)
+                .collect(),
+        }
     }
 
     /// The description of observations and actions.
@@ -111,17 +116,27 @@ impl<E: Env> EnvPool<E> {
 
     /// The number of environments in each block.
     pub fn block_sizes(&self) -> Vec<usize> {
-        self.blocks.iter().map(|block| block.members.len()).collect()
+        self.blocks
+            .iter()
+            .map(|block| block.members.len())
+            .collect()
     }
 
     /// Starts the first episode of every environment, and writes the `observations` `[n, O]` of each block. Ages are
     /// random, so that the episodes do not all end together.
     pub fn reset(&mut self, observations: Vec<&mut [f32]>) {
         let size = self.spaces().observation_size;
-        self.blocks.par_iter_mut().zip_eq(observations).for_each(|(block, rows)| {
-            let rows = rows.chunks_exact_mut(size);
-            block.members.iter_mut().zip(rows).for_each(|(member, row)| member.restart(true, row));
-        });
+        self.blocks
+            .par_iter_mut()
+            .zip_eq(observations)
+            .for_each(|(block, rows)| {
+                let rows = rows.chunks_exact_mut(size);
+                block
+                    .members
+                    .iter_mut()
+                    .zip(rows)
+                    .for_each(|(member, row)| member.restart(true, row));
+            });
     }
 
     /// Makes the first episodes of `seed` start next.
@@ -137,8 +152,13 @@ impl<E: Env> EnvPool<E> {
     pub fn restart(&mut self, marked: &[bool], aged: bool, observations: &mut [f32]) {
         let rows = observations.chunks_exact_mut(self.spaces().observation_size);
         let members = self.members_mut().zip(rows).zip(marked);
-        let chosen: Vec<_> = members.filter(|(_, marked)| **marked).map(|(member, _)| member).collect();
-        chosen.into_par_iter().for_each(|(member, row)| member.restart(aged, row));
+        let chosen: Vec<_> = members
+            .filter(|(_, marked)| **marked)
+            .map(|(member, _)| member)
+            .collect();
+        chosen
+            .into_par_iter()
+            .for_each(|(member, row)| member.restart(aged, row));
     }
 
     /// Steps every environment with its row of `actions` `[N, A]`. Writes `rewards` `[N]` and `observations` `[N, O]`, and to the
@@ -157,11 +177,19 @@ impl<E: Env> EnvPool<E> {
     ) -> Result<Vec<(usize, E::Episode)>> {
         let rows = rows(self.spaces(), self.count(), actions, rewards, observations);
         let members: Vec<_> = self.members_mut().zip(rows).collect();
-        let ended = members.into_par_iter().enumerate().with_max_len(MOST_AT_ONCE).map(|(place, (member, row))| {
-            let episode = member.step(autoreset, row)?;
-            Ok(episode.map(|episode| (place, episode)))
-        });
-        Ok(ended.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
+        let ended = members
+            .into_par_iter()
+            .enumerate()
+            .with_max_len(MOST_AT_ONCE)
+            .map(|(place, (member, row))| {
+                let episode = member.step(autoreset, row)?;
+                Ok(episode.map(|episode| (place, episode)))
+            });
+        Ok(ended
+            .collect::<Result<Vec<_>>>()?
+            .into_iter()
+            .flatten()
+            .collect())
     }
 
     /// Switches all environments to `lesson` from the next step on.
@@ -171,7 +199,10 @@ impl<E: Env> EnvPool<E> {
 
     /// The episodes that ended since the last call, ordered by block, then step, then environment.
     pub fn take_finished(&mut self) -> Vec<E::Episode> {
-        self.blocks.iter_mut().flat_map(|block| block.finished.drain(..)).collect()
+        self.blocks
+            .iter_mut()
+            .flat_map(|block| block.finished.drain(..))
+            .collect()
     }
 
     /// The environments in order.
@@ -205,19 +236,27 @@ impl<E: Resumable> EnvPool<E> {
         let size = self.spaces().observation_size;
         let first = &self.blocks[0].members[0];
         let states = state.rows(first.stride as usize)?.skip(first.number);
-        let rows = observations.into_iter().flat_map(|rows| rows.chunks_exact_mut(size));
+        let rows = observations
+            .into_iter()
+            .flat_map(|rows| rows.chunks_exact_mut(size));
         for (member, (row, mut state)) in self.members_mut().zip(rows.zip(states)) {
             let number = member.number;
             let restore = || {
                 let [next_episode] = state.counters()?;
-                ensure!(next_episode < 1 << 60, "episode number {next_episode} is out of range");
+                ensure!(
+                    next_episode < 1 << 60,
+                    "episode number {next_episode} is out of range"
+                );
                 member.next_episode = next_episode;
                 member.env.restore(&mut state, row)?;
                 state.finish()
             };
-            stepping("environment", number, restore).with_context(|| format!("environment {number}"))?;
+            stepping("environment", number, restore)
+                .with_context(|| format!("environment {number}"))?;
         }
-        self.blocks.iter_mut().for_each(|block| block.finished.clear());
+        self.blocks
+            .iter_mut()
+            .for_each(|block| block.finished.clear());
         Ok(())
     }
 }
@@ -229,8 +268,19 @@ impl<E: Env> EnvBlock<E> {
     ///
     /// # Errors
     /// Fails with the environment's number if an environment panics. The pool must not be stepped again.
-    pub fn step(&mut self, actions: &[f32], rewards: &mut [f32], observations: &mut [f32]) -> Result<()> {
-        let rows = rows(self.spaces, self.members.len(), actions, rewards, observations);
+    pub fn step(
+        &mut self,
+        actions: &[f32],
+        rewards: &mut [f32],
+        observations: &mut [f32],
+    ) -> Result<()> {
+        let rows = rows(
+            self.spaces,
+            self.members.len(),
+            actions,
+            rewards,
+            observations,
+        );
         for (member, row) in self.members.iter_mut().zip(rows) {
             self.finished.extend(member.step(Autoreset::SameStep, row)?);
         }
@@ -246,15 +296,26 @@ type Row<'a> = ((&'a [f32], &'a mut f32), &'a mut [f32]);
 /// # Panics
 /// Panics if the arrays have other lengths.
 fn rows<'a>(
-    Spaces { observation_size, action_size, .. }: Spaces,
+    Spaces {
+        observation_size,
+        action_size,
+        ..
+    }: Spaces,
     n: usize,
     actions: &'a [f32],
     rewards: &'a mut [f32],
     observations: &'a mut [f32],
 ) -> impl Iterator<Item = Row<'a>> {
     let found = [actions.len(), rewards.len(), observations.len()];
-    assert_eq!(found, [n * action_size, n, n * observation_size], "lengths of the actions, rewards and observations");
-    actions.chunks_exact(action_size).zip(rewards).zip(observations.chunks_exact_mut(observation_size))
+    assert_eq!(
+        found,
+        [n * action_size, n, n * observation_size],
+        "lengths of the actions, rewards and observations"
+    );
+    actions
+        .chunks_exact(action_size)
+        .zip(rewards)
+        .zip(observations.chunks_exact_mut(observation_size))
 }
 
 impl<E: Env> Member<E> {
@@ -271,7 +332,10 @@ impl<E: Env> Member<E> {
 
     fn start(&mut self, observation: &mut [f32]) {
         self.end = None;
-        self.env.reset(rng::stream(self.seed, "episode", self.next_episode), observation);
+        self.env.reset(
+            rng::stream(self.seed, "episode", self.next_episode),
+            observation,
+        );
         self.next_episode += self.stride;
     }
 
@@ -280,7 +344,11 @@ impl<E: Env> Member<E> {
     ///
     /// # Errors
     /// Fails with the environment's number if it panics.
-    fn step(&mut self, autoreset: Autoreset, ((action, reward), observation): Row) -> Result<Option<E::Episode>> {
+    fn step(
+        &mut self,
+        autoreset: Autoreset,
+        ((action, reward), observation): Row,
+    ) -> Result<Option<E::Episode>> {
         let number = self.number;
         let step = || {
             let is_over = |end| matches!(end, Some(End::Truncated | End::Terminated));

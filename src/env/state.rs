@@ -46,10 +46,18 @@ impl EnvState {
     pub fn rows(&self, count: usize) -> Result<impl Iterator<Item = SavedEnv<'_>>> {
         let numbers = self.numbers.len();
         let counters = self.counters.len();
-        let even =
-            numbers.is_multiple_of(count) && counters.is_multiple_of(count) && numbers >= count && counters >= count;
-        ensure!(even, "{numbers} numbers and {counters} counters are not the states of {count} environments");
-        let rows = self.numbers.chunks_exact(numbers / count).zip(self.counters.chunks_exact(counters / count));
+        let even = numbers.is_multiple_of(count)
+            && counters.is_multiple_of(count)
+            && numbers >= count
+            && counters >= count;
+        ensure!(
+            even,
+            "{numbers} numbers and {counters} counters are not the states of {count} environments"
+        );
+        let rows = self
+            .numbers
+            .chunks_exact(numbers / count)
+            .zip(self.counters.chunks_exact(counters / count));
         Ok(rows.map(|(numbers, counters)| SavedEnv { numbers, counters }))
     }
 }
@@ -60,7 +68,10 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn numbers<const N: usize>(&mut self) -> Result<[f64; N]> {
-        let next = self.numbers.split_off(..N).and_then(|next| next.first_chunk().copied());
+        let next = self
+            .numbers
+            .split_off(..N)
+            .and_then(|next| next.first_chunk().copied());
         next.context("the state has too few numbers")
     }
 
@@ -69,7 +80,9 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn next(&mut self, count: usize) -> Result<&'a [f64]> {
-        self.numbers.split_off(..count).context("the state has too few numbers")
+        self.numbers
+            .split_off(..count)
+            .context("the state has too few numbers")
     }
 
     /// Reads the next list that [`EnvState::put_list`] has added.
@@ -86,7 +99,10 @@ impl<'a> SavedEnv<'a> {
     /// # Errors
     /// Fails if fewer are left.
     pub fn counters<const N: usize>(&mut self) -> Result<[u64; N]> {
-        let next = self.counters.split_off(..N).and_then(|next| next.first_chunk().copied());
+        let next = self
+            .counters
+            .split_off(..N)
+            .and_then(|next| next.first_chunk().copied());
         next.context("the state has too few counters")
     }
 

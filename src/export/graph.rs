@@ -10,8 +10,17 @@ use crate::spaces::{ObjectAndGoal, Spaces};
 ///
 /// Before anything else, observations are multiplied from the right by a `mirror` `[O, O]`, if there is one.
 pub fn policy_graph(policy: &Policy, mirror: Option<&[f32]>) -> Graph {
-    let Spaces { observation_size: size, action_size, .. } = policy.spaces;
-    let Perception { object_and_goal, rotations, mean, factor } = policy.perception();
+    let Spaces {
+        observation_size: size,
+        action_size,
+        ..
+    } = policy.spaces;
+    let Perception {
+        object_and_goal,
+        rotations,
+        mean,
+        factor,
+    } = policy.perception();
     let mut graph = Graph::new("policy", ("obs", size), ("actions", action_size));
     let seen = match mirror {
         Some(matrix) => {
@@ -39,9 +48,22 @@ fn actor(graph: &mut Graph, policy: &Policy, mut row: String) -> String {
     for (i, layer) in policy.layout.actor.iter().enumerate() {
         let weight = format!("actor.{i}.weight");
         let bias = format!("actor.{i}.bias");
-        graph.floats(&weight, &[layer.outputs, layer.inputs], &policy.parameters[layer.weight.clone()]);
-        graph.floats(&bias, &[layer.outputs], &policy.parameters[layer.bias.clone()]);
-        row = graph.node("Gemm", &[&row, &weight, &bias], &format!("layer{i}"), &[("transB", Int(1))]);
+        graph.floats(
+            &weight,
+            &[layer.outputs, layer.inputs],
+            &policy.parameters[layer.weight.clone()],
+        );
+        graph.floats(
+            &bias,
+            &[layer.outputs],
+            &policy.parameters[layer.bias.clone()],
+        );
+        row = graph.node(
+            "Gemm",
+            &[&row, &weight, &bias],
+            &format!("layer{i}"),
+            &[("transB", Int(1))],
+        );
         if i + 1 < policy.layout.actor.len() {
             let name = format!("hidden{i}");
             row = match policy.activation {
@@ -87,10 +109,25 @@ fn canonicalize(
     let near = graph.node("MatMul", &["cube", "cosines"], "near", &[]);
     let nearness = graph.node("Abs", &[&near], "nearness", &[]);
     // The first of equals, as in `ppo::perception`.
-    let nearest = graph.node("ArgMax", &[&nearness], "nearest", &[("axis", Int(1)), ("keepdims", Int(0))]);
-    let product = graph.node("Gather", &["products", &nearest], "product", &[("axis", Int(0))]);
+    let nearest = graph.node(
+        "ArgMax",
+        &[&nearness],
+        "nearest",
+        &[("axis", Int(1)), ("keepdims", Int(0))],
+    );
+    let product = graph.node(
+        "Gather",
+        &["products", &nearest],
+        "product",
+        &[("axis", Int(0))],
+    );
     let [object, goal] = ["cube", "goal"].map(|quaternion| rotated(graph, quaternion, &product));
-    graph.node("Concat", &["before", &object, "between", &goal, "after"], "seen", &[("axis", Int(1))])
+    graph.node(
+        "Concat",
+        &["before", &object, "between", &goal, "after"],
+        "seen",
+        &[("axis", Int(1))],
+    )
 }
 
 /// Adds what finds the nearest of these rotations, and what multiplies by it.

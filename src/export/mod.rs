@@ -24,20 +24,35 @@ use graph::policy_graph;
 pub fn export(args: &ExportArgs) -> Result<()> {
     expect_used(&args.set, "export")?;
     let loaded = Loaded::find(args.ckpt.as_deref(), &args.set)?;
-    let task = loaded.task(&args.set).context("the file needs the actuator ranges of the scene")?;
-    task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
+    let task = loaded
+        .task(&args.set)
+        .context("the file needs the actuator ranges of the scene")?;
+    task.warnings
+        .iter()
+        .for_each(|warning| say!("warning: {warning}"));
     task.notes().iter().for_each(|note| say!("note: {note}"));
-    expect_finite_actions(&task, &loaded.policy).with_context(|| format!("cannot export {}", loaded.origin))?;
+    expect_finite_actions(&task, &loaded.policy)
+        .with_context(|| format!("cannot export {}", loaded.origin))?;
     run::expect_output(&args.out, loaded.origin.file(), task.config.model_file())?;
     let parts = &task.hand.parts;
-    let mut names = [&parts.joints, &parts.actuators, &parts.fingertips].into_iter().flatten();
+    let mut names = [&parts.joints, &parts.actuators, &parts.fingertips]
+        .into_iter()
+        .flatten();
     if let Some(name) = names.find(|name| name.contains(',')) {
-        bail!("`{name}`: an exported file separates names by commas, so a name must not contain one");
+        bail!(
+            "`{name}`: an exported file separates names by commas, so a name must not contain one"
+        );
     }
     let output = os::OutputFile::create(&args.out)?;
-    let bytes = policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, &task));
+    let bytes =
+        policy_graph(&loaded.policy, task.mirror().as_deref()).file(metadata(&loaded, &task));
     output.finish(&bytes)?;
-    say!("{}: {}, {} bytes", args.out.display(), loaded.name, bytes.len());
+    say!(
+        "{}: {}, {} bytes",
+        args.out.display(),
+        loaded.name,
+        bytes.len()
+    );
     Ok(())
 }
 
@@ -54,7 +69,10 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
     let offsets = list(ranges().map(|[low, high]| (low + high) / 2.0));
     let mut facts = vec![
         ("action_offset", offsets.clone()),
-        ("action_scale", list(ranges().map(|[low, high]| (high - low) / 2.0))),
+        (
+            "action_scale",
+            list(ranges().map(|[low, high]| (high - low) / 2.0)),
+        ),
         ("actions_clipped", "true".into()),
         ("commit", env!("SHADOW_REPOSE_COMMIT").into()),
         ("config", settings(loaded, config)),
@@ -69,9 +87,19 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("object_name", parts.object.clone()),
         ("observation_names", list(groups.map(|group| group.name))),
         ("observation_sizes", list(groups.map(|group| group.length))),
-        ("program", concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into()),
-        ("quaternion_order", "wxyz, w >= 0 but for the fingertips".into()),
-        ("start_keyframe", hand.keyframe.map_or(String::new(), |keyframe| keyframe.to_string())),
+        (
+            "program",
+            concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into(),
+        ),
+        (
+            "quaternion_order",
+            "wxyz, w >= 0 but for the fingertips".into(),
+        ),
+        (
+            "start_keyframe",
+            hand.keyframe
+                .map_or(String::new(), |keyframe| keyframe.to_string()),
+        ),
         ("vel_obs_scale", config.vel_obs_scale.to_string()),
     ];
     add_training(&mut facts, &loaded.checkpoint);
@@ -82,8 +110,17 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
 fn add_training(facts: &mut Vec<(&'static str, String)>, checkpoint: &Checkpoint) {
     let progress = &checkpoint.progress;
     facts.extend((progress.env_steps > 0).then(|| ("env_steps", progress.env_steps.to_string())));
-    facts.extend(progress.best.map(|[goals, _]| ("goals_per_episode", goals.to_string())));
-    facts.extend(checkpoint.provenance.clone().map(|text| ("provenance", text)));
+    facts.extend(
+        progress
+            .best
+            .map(|[goals, _]| ("goals_per_episode", goals.to_string())),
+    );
+    facts.extend(
+        checkpoint
+            .provenance
+            .clone()
+            .map(|text| ("provenance", text)),
+    );
 }
 
 fn described(hand: &Hand) -> String {
@@ -92,16 +129,31 @@ fn described(hand: &Hand) -> String {
         Some("lh_") => "left Shadow Hand",
         _ => "own hand",
     };
-    format!("{kind}, {} joints, {} actuators", hand.joints.len(), hand.actuators.len())
+    format!(
+        "{kind}, {} joints, {} actuators",
+        hand.joints.len(),
+        hand.actuators.len()
+    )
 }
 
 /// All settings of the training run as TOML, with the task as it is exported.
 fn settings(loaded: &Loaded, config: &EnvConfig) -> String {
-    let mut table: Table = loaded.checkpoint.config.parse().expect("it was read when the policy was loaded");
-    table.insert("env".into(), Value::try_from(config).expect("settings are a table"));
+    let mut table: Table = loaded
+        .checkpoint
+        .config
+        .parse()
+        .expect("it was read when the policy was loaded");
+    table.insert(
+        "env".into(),
+        Value::try_from(config).expect("settings are a table"),
+    );
     table.to_string()
 }
 
 fn list<T: ToString>(values: impl IntoIterator<Item = T>) -> String {
-    values.into_iter().map(|value| value.to_string()).collect::<Vec<_>>().join(",")
+    values
+        .into_iter()
+        .map(|value| value.to_string())
+        .collect::<Vec<_>>()
+        .join(",")
 }

@@ -22,12 +22,25 @@ pub struct Graph(Message);
 impl Graph {
     /// Begins a graph that computes `output` `[batch, out]` from `input` `[batch, in]`.
     pub fn new(name: &str, input: (&str, usize), output: (&str, usize)) -> Self {
-        Self(Message::default().text(2, name).message(11, &rows_of(input)).message(12, &rows_of(output)))
+        Self(
+            Message::default()
+                .text(2, name)
+                .message(11, &rows_of(input))
+                .message(12, &rows_of(output)),
+        )
     }
 
     /// Adds an operation and returns the name of its result.
-    pub fn node(&mut self, operation: &str, inputs: &[&str], output: &str, attributes: &[(&str, Attribute)]) -> String {
-        let node = inputs.iter().fold(Message::default(), |node, input| node.text(1, input));
+    pub fn node(
+        &mut self,
+        operation: &str,
+        inputs: &[&str],
+        output: &str,
+        attributes: &[(&str, Attribute)],
+    ) -> String {
+        let node = inputs
+            .iter()
+            .fold(Message::default(), |node, input| node.text(1, input));
         let node = node.text(2, output).text(3, output).text(4, operation);
         let node = attributes.iter().fold(node, |node, (name, value)| {
             let attribute = Message::default().text(1, name);
@@ -44,7 +57,15 @@ impl Graph {
     /// Adds a constant of floats with these dimensions. There are none for a single number.
     pub fn floats(&mut self, name: &str, dimensions: &[usize], values: &[f32]) {
         assert_eq!(dimensions.iter().product::<usize>(), values.len(), "{name}");
-        self.constant(name, dimensions, FLOAT, values.iter().flat_map(|value| value.to_le_bytes()).collect());
+        self.constant(
+            name,
+            dimensions,
+            FLOAT,
+            values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect(),
+        );
     }
 
     /// Adds a constant list of one integer.
@@ -53,7 +74,9 @@ impl Graph {
     }
 
     fn constant(&mut self, name: &str, dimensions: &[usize], kind: i64, bytes: Vec<u8>) {
-        let tensor = dimensions.iter().fold(Message::default(), |tensor, &size| tensor.int(1, size as i64));
+        let tensor = dimensions.iter().fold(Message::default(), |tensor, &size| {
+            tensor.int(1, size as i64)
+        });
         self.add(5, &tensor.int(2, kind).text(8, name).bytes(9, &bytes));
     }
 
@@ -71,14 +94,22 @@ impl Graph {
             .message(7, &self.0)
             .message(8, &Message::default().text(1, "").int(2, OPSET));
         let entry = |(key, value): &(&str, String)| Message::default().text(1, key).text(2, value);
-        metadata.iter().fold(model, |model, text| model.message(14, &entry(text))).0
+        metadata
+            .iter()
+            .fold(model, |model, text| model.message(14, &entry(text)))
+            .0
     }
 }
 
 /// Describes a value `[batch, size]` of floats.
 fn rows_of((name, size): (&str, usize)) -> Message {
-    let dimensions = [Message::default().text(2, "batch"), Message::default().int(1, size as i64)];
-    let shape = dimensions.iter().fold(Message::default(), |shape, size| shape.message(1, size));
+    let dimensions = [
+        Message::default().text(2, "batch"),
+        Message::default().int(1, size as i64),
+    ];
+    let shape = dimensions
+        .iter()
+        .fold(Message::default(), |shape, size| shape.message(1, size));
     let kind = Message::default().message(1, &Message::default().int(1, FLOAT).message(2, &shape));
     Message::default().text(1, name).message(2, &kind)
 }
@@ -110,7 +141,9 @@ impl Message {
 
     fn put(mut self, write: impl FnOnce(&mut CodedOutputStream) -> ProtobufResult<()>) -> Self {
         let mut out = CodedOutputStream::vec(&mut self.0);
-        write(&mut out).and_then(|()| out.flush()).expect("a vector takes everything");
+        write(&mut out)
+            .and_then(|()| out.flush())
+            .expect("a vector takes everything");
         drop(out);
         self
     }

@@ -18,18 +18,34 @@ impl Destination {
     /// # Errors
     /// Fails with the endings if it has another.
     pub fn parse(name: OsString, endings: &[&'static str]) -> Result<Self, String> {
-        let known = |text: &str| endings.iter().copied().find(|ending| ending.eq_ignore_ascii_case(text));
+        let known = |text: &str| {
+            endings
+                .iter()
+                .copied()
+                .find(|ending| ending.eq_ignore_ascii_case(text))
+        };
         if let Some((begin, path)) = name.to_str().and_then(|name| name.split_once(':'))
             && let Some(ending) = known(begin)
         {
-            return Ok(Self { ending, path: path.into() });
+            return Ok(Self {
+                ending,
+                path: path.into(),
+            });
         }
-        let extension = Path::new(&name).extension().and_then(|extension| extension.to_str());
+        let extension = Path::new(&name)
+            .extension()
+            .and_then(|extension| extension.to_str());
         match extension.and_then(known) {
-            Some(ending) => Ok(Self { ending, path: name.into() }),
+            Some(ending) => Ok(Self {
+                ending,
+                path: name.into(),
+            }),
             None => {
                 let all = endings.join(" or .");
-                Err(format!("it must end in .{all}; {}:FILE names the kind of a file without an ending", endings[0]))
+                Err(format!(
+                    "it must end in .{all}; {}:FILE names the kind of a file without an ending",
+                    endings[0]
+                ))
             }
         }
     }
@@ -42,7 +58,11 @@ mod tests {
     #[test]
     fn a_name_says_what_the_file_is_by_its_ending_or_in_front_of_a_colon() {
         let parse = |name: &str| Destination::parse(name.into(), &["html", "jsonl"]);
-        let found = |name: &str| parse(name).map(|to| (to.ending, to.path.display().to_string())).unwrap();
+        let found = |name: &str| {
+            parse(name)
+                .map(|to| (to.ending, to.path.display().to_string()))
+                .unwrap()
+        };
         assert_eq!(found("a/b.HTML"), ("html", "a/b.HTML".into()));
         assert_eq!(found("jsonl:/dev/stdout"), ("jsonl", "/dev/stdout".into()));
         assert_eq!(found("./jsonl:x.html"), ("html", "./jsonl:x.html".into()));

@@ -36,8 +36,14 @@ impl<T> Cannot<T> for io::Result<T> {
 pub fn read_text(path: &Path) -> Result<String> {
     let mut text = String::new();
     let file = File::open(path).cannot("read", path)?;
-    file.take(LARGEST_TEXT + 1).read_to_string(&mut text).cannot("read", path)?;
-    ensure!(text.len() as u64 <= LARGEST_TEXT, "{}: larger than {LARGEST_TEXT} bytes", path.display());
+    file.take(LARGEST_TEXT + 1)
+        .read_to_string(&mut text)
+        .cannot("read", path)?;
+    ensure!(
+        text.len() as u64 <= LARGEST_TEXT,
+        "{}: larger than {LARGEST_TEXT} bytes",
+        path.display()
+    );
     Ok(text)
 }
 
@@ -47,13 +53,28 @@ pub fn read_text(path: &Path) -> Result<String> {
 /// Fails if the file cannot be read, is not a regular file, or is larger than any file of this program.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     let facts = fs::metadata(path).cannot("read", path)?;
-    ensure!(facts.is_file(), "cannot read {}: not a regular file", path.display());
+    ensure!(
+        facts.is_file(),
+        "cannot read {}: not a regular file",
+        path.display()
+    );
     let size = facts.len();
-    ensure!(size <= LARGEST_BYTES, "{}: {size} bytes is larger than any file of this program", path.display());
+    ensure!(
+        size <= LARGEST_BYTES,
+        "{}: {size} bytes is larger than any file of this program",
+        path.display()
+    );
     let mut bytes = Vec::new();
     let room = bytes.try_reserve_exact(size as usize);
-    room.with_context(|| format!("{}: there is no memory for its {size} bytes", path.display()))?;
-    File::open(path).and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes)).cannot("read", path)?;
+    room.with_context(|| {
+        format!(
+            "{}: there is no memory for its {size} bytes",
+            path.display()
+        )
+    })?;
+    File::open(path)
+        .and_then(|file| file.take(LARGEST_BYTES).read_to_end(&mut bytes))
+        .cannot("read", path)?;
     Ok(bytes)
 }
 
@@ -73,7 +94,11 @@ pub fn stamp(path: &Path) -> Option<Stamp> {
 pub fn expect_named(path: &Path, file: &File) -> Result<()> {
     let named = fs::metadata(path).cannot("find", path)?;
     let held = file.metadata().cannot("find", path)?;
-    ensure!(identity(&named) == identity(&held), "{} has been replaced", path.display());
+    ensure!(
+        identity(&named) == identity(&held),
+        "{} has been replaced",
+        path.display()
+    );
     Ok(())
 }
 
@@ -97,9 +122,29 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("sparse");
         File::create(&path).unwrap().set_len(1 << 40).unwrap();
-        assert!(read_bytes(&path).unwrap_err().to_string().contains("larger than any file"));
-        assert!(read_text(&path).unwrap_err().to_string().contains("larger than"));
-        assert!(read_bytes(Path::new("/dev/zero")).unwrap_err().to_string().contains("not a regular file"));
-        assert!(read_text(Path::new("/dev/zero")).unwrap_err().to_string().contains("larger than"));
+        assert!(
+            read_bytes(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("larger than any file")
+        );
+        assert!(
+            read_text(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("larger than")
+        );
+        assert!(
+            read_bytes(Path::new("/dev/zero"))
+                .unwrap_err()
+                .to_string()
+                .contains("not a regular file")
+        );
+        assert!(
+            read_text(Path::new("/dev/zero"))
+                .unwrap_err()
+                .to_string()
+                .contains("larger than")
+        );
     }
 }

@@ -43,7 +43,10 @@ impl Request {
                 break end + 4;
             }
             if bytes.len() >= LONGEST_HEAD {
-                return Err(("431 Request Header Fields Too Large", "The request is too long."));
+                return Err((
+                    "431 Request Header Fields Too Large",
+                    "The request is too long.",
+                ));
             }
         };
         let body = bytes.split_off(end);
@@ -60,7 +63,10 @@ impl Request {
     }
 
     fn parse(head: &[u8]) -> Option<Self> {
-        let mut lines = std::str::from_utf8(head).ok()?.trim_end_matches("\r\n").split("\r\n");
+        let mut lines = std::str::from_utf8(head)
+            .ok()?
+            .trim_end_matches("\r\n")
+            .split("\r\n");
         let [method, target, version] = Vec::from_iter(lines.next()?.split(' ')).try_into().ok()?;
         let path = target.split('?').next()?;
         let header = |line: &str| {
@@ -70,7 +76,12 @@ impl Request {
         };
         let headers = lines.map(header).collect::<Option<_>>()?;
         let fits = path.starts_with('/') && version.starts_with("HTTP/1.");
-        fits.then(|| Self { method: method.into(), path: path.into(), headers, body: Vec::new() })
+        fits.then(|| Self {
+            method: method.into(),
+            path: path.into(),
+            headers,
+            body: Vec::new(),
+        })
     }
 
     /// The value of a header, unless it is there more than once.
@@ -82,11 +93,16 @@ impl Request {
 
     /// The length of the body in bytes.
     fn length(&self) -> Result<usize, Refusal> {
-        let length = self.header("content-length").filter(|_| self.header("transfer-encoding").is_none());
+        let length = self
+            .header("content-length")
+            .filter(|_| self.header("transfer-encoding").is_none());
         match length.map(str::parse) {
             Some(Ok(length @ ..=LONGEST_BODY)) => Ok(length),
             Some(Ok(_)) => Err(("413 Content Too Large", "The body is too long.")),
-            _ => Err(("411 Length Required", "The length of the body is not given.")),
+            _ => Err((
+                "411 Length Required",
+                "The length of the body is not given.",
+            )),
         }
     }
 
@@ -100,7 +116,9 @@ impl Request {
             Some((name, port)) if port.bytes().all(|c| c.is_ascii_digit()) => name,
             _ => host,
         };
-        let is_local = ["localhost", "127.0.0.1", "[::1]"].iter().any(|local| name.eq_ignore_ascii_case(local));
+        let is_local = ["localhost", "127.0.0.1", "[::1]"]
+            .iter()
+            .any(|local| name.eq_ignore_ascii_case(local));
         let sentence = "Only requests to localhost, 127.0.0.1 and [::1] are answered: use one of these in the address.";
         is_local.then_some(()).ok_or(("403 Forbidden", sentence))
     }
@@ -111,14 +129,21 @@ impl Request {
     /// Fails with the answer to send.
     pub fn expect_own(&self) -> Result<(), Refusal> {
         // This content type makes a browser ask before it sends the request from another origin. Such a question is not answered.
-        let is_json =
-            self.header("content-type").is_some_and(|kind| kind.split(';').next() == Some("application/json"));
-        let is_own = match (self.header("sec-fetch-site"), self.header("origin"), self.header("host")) {
+        let is_json = self
+            .header("content-type")
+            .is_some_and(|kind| kind.split(';').next() == Some("application/json"));
+        let is_own = match (
+            self.header("sec-fetch-site"),
+            self.header("origin"),
+            self.header("host"),
+        ) {
             (Some(site), _, _) => site == "same-origin",
             (None, Some(origin), Some(host)) => origin.strip_prefix("http://") == Some(host),
             _ => false,
         };
-        (is_json && is_own).then_some(()).ok_or(("403 Forbidden", "Only the page itself may send this."))
+        (is_json && is_own)
+            .then_some(())
+            .ok_or(("403 Forbidden", "Only the page itself may send this."))
     }
 }
 
@@ -126,7 +151,12 @@ impl Request {
 ///
 /// # Errors
 /// Fails with the answer to send if nothing arrives any more.
-fn read_some(stream: &mut TcpStream, bytes: &mut Vec<u8>, most: usize, deadline: Instant) -> Result<(), Refusal> {
+fn read_some(
+    stream: &mut TcpStream,
+    bytes: &mut Vec<u8>,
+    most: usize,
+    deadline: Instant,
+) -> Result<(), Refusal> {
     let late = ("408 Request Timeout", "The request took too long.");
     let left = deadline.saturating_duration_since(Instant::now());
     if left.is_zero() || stream.set_read_timeout(Some(left)).is_err() {
@@ -153,7 +183,10 @@ pub fn head(status: &str, more: &[&str]) -> String {
         "Referrer-Policy: no-referrer",
         "Connection: close",
     ];
-    format!("HTTP/1.1 {status}\r\n{}\r\n\r\n", [&always, more].concat().join("\r\n"))
+    format!(
+        "HTTP/1.1 {status}\r\n{}\r\n\r\n",
+        [&always, more].concat().join("\r\n")
+    )
 }
 
 /// Answers with a text of this type.
@@ -161,7 +194,10 @@ pub fn head(status: &str, more: &[&str]) -> String {
 /// # Errors
 /// Fails if the other side does not read it.
 pub fn answer(stream: &mut TcpStream, status: &str, kind: &str, text: &str) -> io::Result<()> {
-    let about = [format!("Content-Length: {}", text.len()), format!("Content-Type: {kind}; charset=utf-8")];
+    let about = [
+        format!("Content-Length: {}", text.len()),
+        format!("Content-Type: {kind}; charset=utf-8"),
+    ];
     stream.write_all((head(status, &about.each_ref().map(String::as_str)) + text).as_bytes())
 }
 
@@ -171,7 +207,9 @@ pub fn refuse(stream: &mut TcpStream, (status, sentence): Refusal) {
     if sent.and_then(|()| stream.shutdown(Shutdown::Write)).is_ok() {
         let deadline = Instant::now() + LINGER;
         let mut rest = Vec::new();
-        while rest.len() < MOST_LINGERED && read_some(stream, &mut rest, MOST_LINGERED, deadline).is_ok() {}
+        while rest.len() < MOST_LINGERED
+            && read_some(stream, &mut rest, MOST_LINGERED, deadline).is_ok()
+        {}
     }
 }
 
@@ -197,23 +235,47 @@ mod tests {
         ] {
             assert!(request(lines).is_none(), "{lines:?}");
         }
-        assert_eq!(request(&["GET /events?again=1 HTTP/1.1"]).unwrap().path, "/events");
+        assert_eq!(
+            request(&["GET /events?again=1 HTTP/1.1"]).unwrap().path,
+            "/events"
+        );
     }
 
     #[test]
     fn only_names_of_this_machine_are_answered() {
         let allowed = |hosts: &[&str]| {
             let hosts = hosts.iter().map(|host| format!("Host: {host}"));
-            let lines: Vec<String> = std::iter::once("GET / HTTP/1.1".to_owned()).chain(hosts).collect();
-            request(&lines.iter().map(String::as_str).collect::<Vec<_>>()).unwrap().expect_local().is_ok()
+            let lines: Vec<String> = std::iter::once("GET / HTTP/1.1".to_owned())
+                .chain(hosts)
+                .collect();
+            request(&lines.iter().map(String::as_str).collect::<Vec<_>>())
+                .unwrap()
+                .expect_local()
+                .is_ok()
         };
-        for host in ["localhost", "LocalHost:80", "127.0.0.1:7070", "[::1]:7070", "[::1]"] {
+        for host in [
+            "localhost",
+            "LocalHost:80",
+            "127.0.0.1:7070",
+            "[::1]:7070",
+            "[::1]",
+        ] {
             assert!(allowed(&[host]), "{host}");
         }
-        for host in ["evil.example", "localhost.evil.example", "evil.example:localhost", "127.0.0.1.evil.example", ""] {
+        for host in [
+            "evil.example",
+            "localhost.evil.example",
+            "evil.example:localhost",
+            "127.0.0.1.evil.example",
+            "",
+        ] {
             assert!(!allowed(&[host]), "{host}");
         }
-        assert!(!allowed(&[]) && !allowed(&["localhost", "evil.example"]) && !allowed(&["localhost", "localhost"]));
+        assert!(
+            !allowed(&[])
+                && !allowed(&["localhost", "evil.example"])
+                && !allowed(&["localhost", "localhost"])
+        );
     }
 
     #[test]
@@ -224,15 +286,27 @@ mod tests {
         };
         let json = "Content-Type: application/json";
         assert!(allowed(&[json, "Origin: http://localhost:1"]));
-        assert!(allowed(&[json, "Origin: https://hub.example", "Sec-Fetch-Site: same-origin"]));
+        assert!(allowed(&[
+            json,
+            "Origin: https://hub.example",
+            "Sec-Fetch-Site: same-origin"
+        ]));
         for lines in [
             &[json][..],
             &["Content-Type: text/plain", "Origin: http://localhost:1"],
             &["Origin: http://localhost:1"],
             &[json, "Origin: http://localhost:2"],
             &[json, "Origin: http://evil.example"],
-            &[json, "Origin: http://localhost:1", "Sec-Fetch-Site: cross-site"],
-            &[json, "Origin: http://localhost:1", "Sec-Fetch-Site: same-site"],
+            &[
+                json,
+                "Origin: http://localhost:1",
+                "Sec-Fetch-Site: cross-site",
+            ],
+            &[
+                json,
+                "Origin: http://localhost:1",
+                "Sec-Fetch-Site: same-site",
+            ],
             &[json, "Origin: null"],
         ] {
             assert!(!allowed(lines), "{lines:?}");

@@ -41,7 +41,13 @@ impl Requests {
     /// Requests that never arrive.
     pub fn none() -> Self {
         let (patient, stop, signal, save) = Default::default();
-        Self { since: Instant::now(), patient, stop, signal, save }
+        Self {
+            since: Instant::now(),
+            patient,
+            stop,
+            signal,
+            save,
+        }
     }
 
     /// Catches SIGINT, SIGTERM and SIGHUP from now on, and, if the program `saves`, SIGUSR1 as a request to save. Signals that
@@ -54,13 +60,17 @@ impl Requests {
         let requests = Self::none();
         // The bits of the signals that were ignored when the program started.
         let ignored = u64::from_str_radix(&process_status("SigIgn:"), 16).unwrap_or(0);
-        let caught = [SIGINT, SIGTERM, SIGHUP].into_iter().chain(saves.then_some(SIGUSR1));
+        let caught = [SIGINT, SIGTERM, SIGHUP]
+            .into_iter()
+            .chain(saves.then_some(SIGUSR1));
         let caught = caught.filter(|signal| ignored >> (signal - 1) & 1 == 0);
         signal_hook::flag::register(SIGXFSZ, Arc::default()).context("cannot catch signals")?;
         let mut signals = Signals::new(caught).context("cannot catch signals")?;
         let shared = requests.clone();
         let listen = move || shared.listen_loop(&mut signals, saves);
-        thread::Builder::new().spawn(listen).context("cannot start a thread for signals")?;
+        thread::Builder::new()
+            .spawn(listen)
+            .context("cannot start a thread for signals")?;
         Ok(requests)
     }
 
@@ -76,7 +86,11 @@ impl Requests {
                 self.save.store(true, Ordering::Relaxed);
                 continue;
             }
-            let together = if signal == SIGINT { ONE_KEY } else { ONE_REQUEST };
+            let together = if signal == SIGINT {
+                ONE_KEY
+            } else {
+                ONE_REQUEST
+            };
             let again = first.is_some_and(|first| first.elapsed() > together);
             if again || !self.patient.load(Ordering::Relaxed) {
                 pip::stop();
@@ -112,7 +126,9 @@ impl Requests {
             thread::sleep(left);
             stop.store(true, Ordering::Relaxed);
         });
-        clock.map(drop).context("cannot start a thread for the time limit")
+        clock
+            .map(drop)
+            .context("cannot start a thread for the time limit")
     }
 
     /// Whether a save was requested since the last call.
@@ -123,5 +139,9 @@ impl Requests {
 
 /// The exit code for a stop that this signal requested: 128 plus its number, or 0 for no signal.
 pub fn exit_code(signal: i32) -> ExitCode {
-    if signal == 0 { ExitCode::SUCCESS } else { ExitCode::from(128 + signal as u8) }
+    if signal == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::from(128 + signal as u8)
+    }
 }

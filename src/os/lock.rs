@@ -53,8 +53,17 @@ impl Locked {
     /// Fails if another training process uses the folder, or if it cannot be written to.
     pub fn acquire(folder: &Path) -> Result<Self> {
         let path = folder.join(LOCK);
-        let open = |()| OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
-        let file = fs::create_dir_all(folder).and_then(open).cannot("write", &path)?;
+        let open = |()| {
+            OpenOptions::new()
+                .read(true)
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .open(&path)
+        };
+        let file = fs::create_dir_all(folder)
+            .and_then(open)
+            .cannot("write", &path)?;
         let mut pauses = 0..PAUSES;
         let renewal = loop {
             match file.try_lock() {
@@ -65,7 +74,11 @@ impl Locked {
                 Err(TryLockError::Error(_)) => break Some(renew(folder, &path)?),
             }
         };
-        Ok(Self { path, file, renewal })
+        Ok(Self {
+            path,
+            file,
+            renewal,
+        })
     }
 
     /// Writes the process id into the lock file. A lock file that has other hard links, e.g. in a copied folder, is first
@@ -83,7 +96,10 @@ impl Locked {
         }
         // Best effort: shows others who holds the lock. Where there are no locks, a file without a name does not count as one.
         let said = name();
-        let _ = self.file.set_len(0).and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
+        let _ = self
+            .file
+            .set_len(0)
+            .and_then(|()| self.file.write_all_at(said.as_bytes(), 0));
         Ok(self)
     }
 
@@ -104,7 +120,10 @@ impl Locked {
     pub fn watch(&self) -> impl Fn() -> bool + Send + use<> {
         let path = self.path.clone();
         let file = self.file.try_clone();
-        move || file.as_ref().is_ok_and(|file| expect_named(&path, file).is_ok())
+        move || {
+            file.as_ref()
+                .is_ok_and(|file| expect_named(&path, file).is_ok())
+        }
     }
 }
 
@@ -123,7 +142,9 @@ impl Drop for Locked {
 /// # Errors
 /// Fails if the file has another name and was renewed a short time ago, or if it cannot be written to.
 fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
-    let renewed = fs::metadata(path).and_then(|facts| facts.modified()).cannot("read", path)?;
+    let renewed = fs::metadata(path)
+        .and_then(|facts| facts.modified())
+        .cannot("read", path)?;
     let age = renewed.elapsed().unwrap_or_default();
     ensure!(
         holder(path).is_empty() || age > LAPSED,
@@ -135,7 +156,10 @@ fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
     fs::write(path, &own).cannot("write", path)?;
     thread::sleep(SETTLED);
     ensure!(holder(path) == own, in_use(folder, path));
-    say!("note: there are no file locks in {}; {LOCK} is renewed instead", folder.display());
+    say!(
+        "note: there are no file locks in {}; {LOCK} is renewed instead",
+        folder.display()
+    );
     let file = path.to_owned();
     let lives = Arc::new(());
     let alive = Arc::downgrade(&lives);
@@ -145,7 +169,9 @@ fn renew(folder: &Path, path: &Path) -> Result<Arc<()>> {
             thread::sleep(RENEWED_EVERY);
         }
     };
-    thread::Builder::new().spawn(renew).context("cannot start a thread for the lock")?;
+    thread::Builder::new()
+        .spawn(renew)
+        .context("cannot start a thread for the lock")?;
     Ok(lives)
 }
 
@@ -167,8 +193,17 @@ impl Hold {
     pub fn of(folder: &Path) -> Self {
         let path = folder.join(LOCK);
         // Neither a link nor a pipe: opening a pipe would wait.
-        let Some(facts) = fs::symlink_metadata(&path).ok().filter(fs::Metadata::is_file) else { return Self::Released };
-        let is_renewed = || facts.modified().is_ok_and(|time| time.elapsed().unwrap_or_default() <= LAPSED);
+        let Some(facts) = fs::symlink_metadata(&path)
+            .ok()
+            .filter(fs::Metadata::is_file)
+        else {
+            return Self::Released;
+        };
+        let is_renewed = || {
+            facts
+                .modified()
+                .is_ok_and(|time| time.elapsed().unwrap_or_default() <= LAPSED)
+        };
         let signed = holder(&path);
         match File::open(&path).map(|file| file.try_lock_shared()) {
             Ok(Err(TryLockError::WouldBlock)) => Self::Held,
@@ -181,11 +216,18 @@ impl Hold {
 }
 
 fn set_time(path: &Path, time: SystemTime) {
-    let _ = File::options().write(true).open(path).and_then(|file| file.set_modified(time));
+    let _ = File::options()
+        .write(true)
+        .open(path)
+        .and_then(|file| file.set_modified(time));
 }
 
 fn in_use(folder: &Path, lock: &Path) -> String {
-    format!("{} is in use by another program{}", folder.display(), holder(lock))
+    format!(
+        "{} is in use by another program{}",
+        folder.display(),
+        holder(lock)
+    )
 }
 
 /// Who holds the lock file, as it was signed.
@@ -197,7 +239,11 @@ fn holder(path: &Path) -> String {
 
 /// The name of this program, as lock files are signed with it.
 fn name() -> String {
-    format!(": process {} on {}", std::process::id(), Machine::this().name)
+    format!(
+        ": process {} on {}",
+        std::process::id(),
+        Machine::this().name
+    )
 }
 
 #[cfg(test)]
@@ -209,7 +255,13 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let first = Locked::acquire(place.path()).unwrap().sign().unwrap();
         let refusal = Locked::acquire(place.path()).unwrap_err().to_string();
-        assert!(refusal.contains(&format!("another program: process {} on ", std::process::id())), "{refusal}");
+        assert!(
+            refusal.contains(&format!(
+                "another program: process {} on ",
+                std::process::id()
+            )),
+            "{refusal}"
+        );
         drop(first.sign().unwrap());
         Locked::acquire(place.path()).unwrap();
     }
@@ -225,7 +277,11 @@ mod tests {
         assert_eq!(look(), Hold::Held);
         drop(lock);
         assert_eq!(look(), Hold::Left);
-        Locked::acquire(place.path()).unwrap().sign().unwrap().release();
+        Locked::acquire(place.path())
+            .unwrap()
+            .sign()
+            .unwrap()
+            .release();
         assert_eq!(look(), Hold::Released);
         fs::write(place.path().join(LOCK), ": process 1 on another").unwrap();
         assert_eq!(look(), Hold::Elsewhere);
@@ -246,16 +302,36 @@ mod tests {
         let path = place.path().join(LOCK);
         fs::write(&path, "").unwrap();
         fs::hard_link(&path, place.path().join("copy")).unwrap();
-        let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .open(&path)
+            .unwrap();
         let renewal = Some(renew(place.path(), &path).unwrap());
-        let lock = Locked { path: path.clone(), file, renewal }.sign().unwrap();
+        let lock = Locked {
+            path: path.clone(),
+            file,
+            renewal,
+        }
+        .sign()
+        .unwrap();
         assert_eq!(holder(&path), name());
         drop(lock);
         assert_eq!(holder(&path), name(), "it has failed");
         // The next one need not wait.
-        let file = OpenOptions::new().read(true).write(true).open(&path).unwrap();
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .open(&path)
+            .unwrap();
         let renewal = Some(renew(place.path(), &path).unwrap());
-        let lock = Locked { path: path.clone(), file, renewal }.sign().unwrap();
+        let lock = Locked {
+            path: path.clone(),
+            file,
+            renewal,
+        }
+        .sign()
+        .unwrap();
         fs::write(&path, ": process 1 on another").unwrap();
         drop(lock);
         assert_eq!(holder(&path), ": process 1 on another");

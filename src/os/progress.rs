@@ -49,7 +49,9 @@ impl StatusLine {
     /// Creates the line of a training run that has made `env_steps` of its steps. If `quiet`, no progress is shown.
     pub fn new(env_steps: u64, total_steps: u64, quiet: bool) -> Self {
         // A line can be redrawn in place on a terminal that is wide enough.
-        let wide = Term::stderr().size_checked().is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
+        let wide = Term::stderr()
+            .size_checked()
+            .is_some_and(|(_, columns)| usize::from(columns) >= NARROWEST);
         let bar = (!quiet && is_terminal() && !is_dumb() && wide).then(|| {
             // Cuts off what does not fit, even after the terminal is resized.
             let style = ProgressStyle::with_template("{wide_msg}").expect("the template is valid");
@@ -58,8 +60,22 @@ impl StatusLine {
             bar
         });
         let unknown = f64::NAN;
-        let shown = Status { env_steps, steps_per_s: unknown, goals: unknown, drop_rate: unknown, evaluation: unknown };
-        Self { bar, quiet, last_line: None, shown, total_steps, begun: Instant::now(), steps_before: env_steps }
+        let shown = Status {
+            env_steps,
+            steps_per_s: unknown,
+            goals: unknown,
+            drop_rate: unknown,
+            evaluation: unknown,
+        };
+        Self {
+            bar,
+            quiet,
+            last_line: None,
+            shown,
+            total_steps,
+            begun: Instant::now(),
+            steps_before: env_steps,
+        }
     }
 
     /// Shows the values of an iteration.
@@ -70,17 +86,28 @@ impl StatusLine {
             let width = usize::from(Term::stderr().size().1).saturating_sub(1);
             bar.set_message(self.shown.line(self.total_steps, left, width));
         } else if !self.quiet
-            && (self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY) || status.env_steps >= self.total_steps)
+            && (self
+                .last_line
+                .is_none_or(|last| last.elapsed() >= LINE_EVERY)
+                || status.env_steps >= self.total_steps)
         {
             self.last_line = Some(Instant::now());
             let parts = self.shown.parts(left).join("  ");
-            say!("{} of {} steps  {parts}", status.env_steps, self.total_steps);
+            say!(
+                "{} of {} steps  {parts}",
+                status.env_steps,
+                self.total_steps
+            );
         }
     }
 
     /// Estimates the time left at the pace of this session, including evaluations.
     fn time_left(&self) -> Duration {
-        let made = self.shown.env_steps.saturating_sub(self.steps_before).max(1);
+        let made = self
+            .shown
+            .env_steps
+            .saturating_sub(self.steps_before)
+            .max(1);
         let pace = self.begun.elapsed().as_secs_f64() / made as f64;
         let left = pace * self.total_steps.saturating_sub(self.shown.env_steps) as f64;
         Duration::try_from_secs_f64(left).unwrap_or(Duration::MAX)
@@ -130,8 +157,11 @@ impl Status {
 
     /// The parts of the line, the most important first.
     fn parts(&self, left: Duration) -> Vec<String> {
-        let evaluated =
-            if self.evaluation.is_nan() { String::new() } else { format!(" (eval {:.2})", self.evaluation) };
+        let evaluated = if self.evaluation.is_nan() {
+            String::new()
+        } else {
+            format!(" (eval {:.2})", self.evaluation)
+        };
         let per_cent = if self.drop_rate.is_nan() { "" } else { "%" };
         vec![
             format!("{:.0} steps/s", self.steps_per_s),
@@ -161,14 +191,23 @@ pub fn steps_of_all(env_steps: u64, total_steps: u64) -> String {
         10_000..1_000_000 => (1, 1e3, "k"),
         _ => (2, 1e6, "M"),
     };
-    let [made, total] = [env_steps, total_steps].map(|steps| format!("{:.digits$}", steps as f64 / unit));
-    format!("{made}/{}{name}", total.trim_end_matches('0').trim_end_matches('.'))
+    let [made, total] =
+        [env_steps, total_steps].map(|steps| format!("{:.digits$}", steps as f64 / unit));
+    format!(
+        "{made}/{}{name}",
+        total.trim_end_matches('0').trim_end_matches('.')
+    )
 }
 
 /// A time as hours, minutes and seconds, e.g. `2:05:33`.
 pub fn clock(time: Duration) -> String {
     let seconds = time.as_secs();
-    format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
+    format!(
+        "{}:{:02}:{:02}",
+        seconds / 3600,
+        seconds / 60 % 60,
+        seconds % 60
+    )
 }
 
 /// Whether nothing can be redrawn on the terminal.
@@ -182,9 +221,15 @@ pub type Bar = ProgressBar;
 /// The progress bar of a job, at zero of `total` items, e.g. frames. It is shown on a terminal only, until it is dropped.
 /// `job` distinguishes several jobs, e.g. by the policy that plays.
 pub fn progress_bar(total: u64, items: &str, job: &str) -> Bar {
-    let style = format!("{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}");
-    let style = ProgressStyle::with_template(&style).expect("the template is valid").progress_chars("=> ");
-    ProgressBar::new(total).with_style(style).with_finish(ProgressFinish::AndClear)
+    let style = format!(
+        "{job:<12} [{{bar:12}}] {{human_pos}}/{{human_len}} {items}, ETA {{eta}}  {{wide_msg}}"
+    );
+    let style = ProgressStyle::with_template(&style)
+        .expect("the template is valid")
+        .progress_chars("=> ");
+    ProgressBar::new(total)
+        .with_style(style)
+        .with_finish(ProgressFinish::AndClear)
 }
 
 #[cfg(test)]
@@ -193,18 +238,40 @@ mod tests {
 
     #[test]
     fn the_line_has_what_fits_into_63_and_80_columns() {
-        let status =
-            Status { env_steps: 10_012_345, steps_per_s: 12_345.6, goals: 0.24, drop_rate: 0.335, evaluation: 5.75 };
+        let status = Status {
+            env_steps: 10_012_345,
+            steps_per_s: 12_345.6,
+            goals: 0.24,
+            drop_rate: 0.335,
+            evaluation: 5.75,
+        };
         let line = |width| status.line(100_000_000, Duration::from_secs(7533), width);
         let short = "10.01/100M  12346 steps/s  ETA 2:05:33  goals 0.24 (eval 5.75)";
         assert_eq!(line(62), short);
         assert_eq!(line(79), format!("{short}  drops 34%"));
-        let k = Status { env_steps: 12_544, goals: 0.0, drop_rate: 1.0, evaluation: 0.0, ..status };
+        let k = Status {
+            env_steps: 12_544,
+            goals: 0.0,
+            drop_rate: 1.0,
+            evaluation: 0.0,
+            ..status
+        };
         let expected = "12.5/25.6k  12346 steps/s  ETA 0:00:00  goals 0.00 (eval 0.00)  drops 100%";
         assert_eq!(k.line(25_600, Duration::ZERO, 79), expected);
         let total = |steps| steps_of_all(steps, steps);
-        assert_eq!([2_500_000, 999_999].map(total), ["2.50/2.5M", "1000.0/1000k"]);
-        let few = Status { env_steps: 256, evaluation: f64::NAN, goals: f64::NAN, ..status };
-        assert!(few.line(1280, Duration::ZERO, 79).starts_with("256/1280  12346 steps/s  ETA 0:00:00  goals -  drops"));
+        assert_eq!(
+            [2_500_000, 999_999].map(total),
+            ["2.50/2.5M", "1000.0/1000k"]
+        );
+        let few = Status {
+            env_steps: 256,
+            evaluation: f64::NAN,
+            goals: f64::NAN,
+            ..status
+        };
+        assert!(
+            few.line(1280, Duration::ZERO, 79)
+                .starts_with("256/1280  12346 steps/s  ETA 0:00:00  goals -  drops")
+        );
     }
 }

@@ -39,8 +39,14 @@ impl Screen {
 
 /// Lines as a text, cut to the width of the terminal on which it is printed, if there is one.
 pub fn text_of(lines: &[String]) -> String {
-    let width = Term::stdout().size_checked().map(|(_, columns)| usize::from(columns));
-    let cut = |line: &String| width.map_or(line.clone(), |width| truncate_str(line, width, "…").into_owned());
+    let width = Term::stdout()
+        .size_checked()
+        .map(|(_, columns)| usize::from(columns));
+    let cut = |line: &String| {
+        width.map_or(line.clone(), |width| {
+            truncate_str(line, width, "…").into_owned()
+        })
+    };
     lines.iter().map(|line| cut(line) + "\n").collect()
 }
 
@@ -48,9 +54,15 @@ pub fn text_of(lines: &[String]) -> String {
 /// last one stays as it is.
 pub fn aligned(rows: &[Vec<String>], words: usize) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width =
-        |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| measure_text_width(cell)).max();
-    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
+    let width = |column: usize| {
+        rows.iter()
+            .filter_map(|row| row.get(column))
+            .map(|cell| measure_text_width(cell))
+            .max()
+    };
+    let widths: Vec<usize> = (0..columns)
+        .map(|column| width(column).unwrap_or(0))
+        .collect();
     let cell = |(column, text): (usize, &String)| -> String {
         let room = " ".repeat(widths[column] - measure_text_width(text));
         match column {
@@ -59,8 +71,15 @@ pub fn aligned(rows: &[Vec<String>], words: usize) -> Vec<String> {
             _ => room + text,
         }
     };
-    let line =
-        |row: &Vec<String>| row.iter().enumerate().map(cell).collect::<Vec<_>>().join("  ").trim_end().to_owned();
+    let line = |row: &Vec<String>| {
+        row.iter()
+            .enumerate()
+            .map(cell)
+            .collect::<Vec<_>>()
+            .join("  ")
+            .trim_end()
+            .to_owned()
+    };
     rows.iter().map(line).collect()
 }
 
@@ -70,9 +89,19 @@ mod tests {
 
     #[test]
     fn words_stand_to_the_left_and_numbers_to_the_right_of_their_columns() {
-        let rows = [["run", "steps", "settings"], ["long name", "7", ""], ["手", "1000000", "a=1"]];
+        let rows = [
+            ["run", "steps", "settings"],
+            ["long name", "7", ""],
+            ["手", "1000000", "a=1"],
+        ];
         let lines = aligned(&rows.map(|row| row.map(String::from).to_vec()), 1);
-        assert_eq!(lines[..2], ["run          steps  settings", "long name        7"]);
-        assert_eq!(measure_text_width(&lines[2]), measure_text_width(&lines[0]) - "settings".len() + "a=1".len());
+        assert_eq!(
+            lines[..2],
+            ["run          steps  settings", "long name        7"]
+        );
+        assert_eq!(
+            measure_text_width(&lines[2]),
+            measure_text_width(&lines[0]) - "settings".len() + "a=1".len()
+        );
     }
 }

@@ -62,16 +62,37 @@ impl Server {
     ///
     /// # Errors
     /// Fails if the port cannot be opened, or if the system refuses a thread.
-    pub fn open(port: u16, page: String, hello: &str, on_post: Option<OnPost>) -> Result<Arc<Self>> {
-        let cannot =
-            |error| anyhow!("cannot use port {port} of 127.0.0.1: {error}; choose another one, or 0 for any free port");
+    pub fn open(
+        port: u16,
+        page: String,
+        hello: &str,
+        on_post: Option<OnPost>,
+    ) -> Result<Arc<Self>> {
+        let cannot = |error| {
+            anyhow!(
+                "cannot use port {port} of 127.0.0.1: {error}; choose another one, or 0 for any free port"
+            )
+        };
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(cannot)?;
         let port = listener.local_addr().map_err(cannot)?.port();
-        let news = Mutex::new(News { hello: hello.into(), ..News::default() });
+        let news = Mutex::new(News {
+            hello: hello.into(),
+            ..News::default()
+        });
         let [readers, connections] = Default::default();
-        let server = Arc::new(Self { port, page, on_post, news, readers, connections, changed: Condvar::new() });
+        let server = Arc::new(Self {
+            port,
+            page,
+            on_post,
+            news,
+            readers,
+            connections,
+            changed: Condvar::new(),
+        });
         let own = server.clone();
-        thread::Builder::new().spawn(move || own.accept(&listener)).context("cannot start a thread for the server")?;
+        thread::Builder::new()
+            .spawn(move || own.accept(&listener))
+            .context("cannot start a thread for the server")?;
         Ok(server)
     }
 
@@ -114,7 +135,12 @@ impl Server {
             };
             let _ = stream.set_write_timeout(Some(PATIENCE));
             let Some(permit) = self.take_permit(&self.connections, MOST_CONNECTIONS) else {
-                let _ = answer(&mut stream, CROWDED, "text/plain", "There are too many connections.\n");
+                let _ = answer(
+                    &mut stream,
+                    CROWDED,
+                    "text/plain",
+                    "There are too many connections.\n",
+                );
                 continue;
             };
             let server = self.clone();
@@ -137,7 +163,8 @@ impl Server {
 
     fn serve(&self, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
-        let answered = Request::read(&mut stream).and_then(|request| self.answer(&mut stream, &request));
+        let answered =
+            Request::read(&mut stream).and_then(|request| self.answer(&mut stream, &request));
         if let Err(refusal) = answered {
             refuse(&mut stream, refusal);
         }
@@ -159,8 +186,12 @@ impl Server {
                 on_post(&request.body).map_err(|sentence| ("400 Bad Request", sentence))?;
                 stream.write_all(head("204 No Content", &[]).as_bytes())
             }
-            (_, "/" | "/events", _) => return Err(("405 Method Not Allowed\r\nAllow: GET", not_here)),
-            (_, "/controls", Some(_)) => return Err(("405 Method Not Allowed\r\nAllow: POST", not_here)),
+            (_, "/" | "/events", _) => {
+                return Err(("405 Method Not Allowed\r\nAllow: GET", not_here));
+            }
+            (_, "/controls", Some(_)) => {
+                return Err(("405 Method Not Allowed\r\nAllow: POST", not_here));
+            }
             _ => return Err(("404 Not Found", "There is no such page.")),
         };
         Ok(())
@@ -174,10 +205,14 @@ impl Server {
         };
         loop {
             stream.write_all(text.as_bytes())?;
-            let waited = self.changed.wait_timeout_while(self.news(), QUIET, |news| news.next() == next);
+            let waited = self
+                .changed
+                .wait_timeout_while(self.news(), QUIET, |news| news.next() == next);
             let (news, _) = waited.unwrap_or_else(PoisonError::into_inner);
             text = match next.checked_sub(news.first) {
-                Some(old) if old < news.events.len() as u64 => news.events.range(old as usize..).cloned().collect(),
+                Some(old) if old < news.events.len() as u64 => {
+                    news.events.range(old as usize..).cloned().collect()
+                }
                 Some(_) => "event: beat\ndata: 1\n\n".to_owned(),
                 None => news.hello.clone(),
             };

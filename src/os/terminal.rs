@@ -20,7 +20,10 @@ pub fn print(text: &str) -> Result<()> {
 /// Fails as [`print()`] does.
 pub fn is_read(text: &str) -> Result<bool> {
     let mut stdout = std::io::stdout();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush())
+    {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
         written => written.map(|()| true).context("cannot write to stdout"),
     }
@@ -31,17 +34,35 @@ const LONGEST_QUOTE: usize = 100;
 
 /// A text from an untrusted file, short enough for a message and on one line.
 pub fn shortened(text: &str) -> String {
-    let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let shown = |c: char| {
+        if c.is_control() {
+            char::REPLACEMENT_CHARACTER
+        } else {
+            c
+        }
+    };
     let start: String = text.chars().take(LONGEST_QUOTE).map(shown).collect();
-    if text.chars().nth(LONGEST_QUOTE).is_some() { format!("{start}…") } else { start }
+    if text.chars().nth(LONGEST_QUOTE).is_some() {
+        format!("{start}…")
+    } else {
+        start
+    }
 }
 
 /// A number with these decimals, or `-` if it is not known (NaN).
 pub fn number(value: f64, decimals: usize) -> String {
-    let text = if value.is_nan() { "-".into() } else { format!("{value:.decimals$}") };
+    let text = if value.is_nan() {
+        "-".into()
+    } else {
+        format!("{value:.decimals$}")
+    };
     // Not `-0.00`.
     let is_zero = text.contains('0') && text.chars().all(|c| "-0.".contains(c));
-    if is_zero { text.trim_start_matches('-').to_owned() } else { text }
+    if is_zero {
+        text.trim_start_matches('-').to_owned()
+    } else {
+        text
+    }
 }
 
 /// What each line of [`say_line`] begins with.
@@ -54,19 +75,33 @@ pub fn speak_as(name: &str) {
 
 /// Whether a character controls the terminal, is invisible, or changes the direction or the lines of the text around it.
 fn is_steering(c: char) -> bool {
-    let unseen = matches!(c, '\u{ad}' | '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}');
-    c.is_control() || unseen || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
+    let unseen =
+        matches!(c, '\u{ad}' | '\u{61c}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}');
+    c.is_control()
+        || unseen
+        || matches!(c, '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e0000}'..='\u{e007f}')
 }
 
 /// A text of one line. Characters that control a terminal are escaped as in JSON, so that JSON stays valid.
 pub fn harmless(text: &str) -> String {
-    let escape = |c: char| c.encode_utf16(&mut [0; 2]).iter().map(|unit| format!("\\u{unit:04x}")).collect();
+    let escape = |c: char| {
+        c.encode_utf16(&mut [0; 2])
+            .iter()
+            .map(|unit| format!("\\u{unit:04x}"))
+            .collect()
+    };
     escaped(text, "", escape)
 }
 
 /// A text in which the characters that control a terminal, but for those in `kept`, are escaped.
 fn escaped(text: &str, kept: &str, escape: impl Fn(char) -> String) -> String {
-    let shown = |c: char| if is_steering(c) && !kept.contains(c) { escape(c) } else { c.to_string() };
+    let shown = |c: char| {
+        if is_steering(c) && !kept.contains(c) {
+            escape(c)
+        } else {
+            c.to_string()
+        }
+    };
     text.chars().map(shown).collect()
 }
 
@@ -89,7 +124,11 @@ pub fn say_line(line: &str) {
 pub fn quoted(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
     let is_word = !text.is_empty() && text.chars().all(plain);
-    if is_word { text.to_owned() } else { format!("'{}'", text.replace('\'', "'\\''")) }
+    if is_word {
+        text.to_owned()
+    } else {
+        format!("'{}'", text.replace('\'', "'\\''"))
+    }
 }
 
 /// A path as a single shell word, even if it is not valid UTF-8.
@@ -97,7 +136,11 @@ pub fn quoted_path(path: &Path) -> String {
     if let Some(text) = path.to_str() {
         return quoted(text);
     }
-    let escaped = path.as_os_str().as_encoded_bytes().escape_ascii().to_string();
+    let escaped = path
+        .as_os_str()
+        .as_encoded_bytes()
+        .escape_ascii()
+        .to_string();
     // The only one of these escapes that means something else in a shell.
     format!("$'{}'", escaped.replace("\\\"", "\""))
 }
@@ -109,7 +152,9 @@ pub fn called_as() -> String {
         let is_release = exe.components().any(|part| part.as_os_str() == "release");
         return format!("cargo run {}--", if is_release { "--release " } else { "" });
     }
-    std::env::args_os().next().map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
+    std::env::args_os()
+        .next()
+        .map_or("shadow-repose".into(), |name| quoted_path(Path::new(&name)))
 }
 
 /// Whether somebody reads stderr as it is written.
@@ -119,7 +164,9 @@ pub fn is_terminal() -> bool {
 
 /// Whether there is a display on which a window could open.
 pub fn has_display() -> bool {
-    ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
+    ["DISPLAY", "WAYLAND_DISPLAY"]
+        .iter()
+        .any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
 }
 
 #[cfg(test)]
@@ -131,7 +178,10 @@ mod tests {
     #[test]
     fn what_steers_a_terminal_is_escaped_and_json_stays_the_same_json() {
         let name = "a\u{1b}[2J\n\u{9b}m\u{202e}\u{e0041}ü";
-        assert_eq!(harmless(name), r"a\u001b[2J\u000a\u009bm\u202e\udb40\udc41ü");
+        assert_eq!(
+            harmless(name),
+            r"a\u001b[2J\u000a\u009bm\u202e\udb40\udc41ü"
+        );
         let text = harmless(&serde_json::json!([name]).to_string());
         assert_eq!(serde_json::from_str::<[String; 1]>(&text).unwrap(), [name]);
         assert!(!text.chars().any(is_steering));

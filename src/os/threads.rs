@@ -22,10 +22,16 @@ pub fn thread_pool(threads: usize) -> Result<ThreadPool> {
     start(threads, ThreadPoolBuilder::build)
 }
 
-fn start<T>(threads: usize, build: fn(ThreadPoolBuilder) -> Result<T, ThreadPoolBuildError>) -> Result<T> {
+fn start<T>(
+    threads: usize,
+    build: fn(ThreadPoolBuilder) -> Result<T, ThreadPoolBuildError>,
+) -> Result<T> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let most = MOST_THREADS * cores;
-    ensure!(threads <= most, "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core");
+    ensure!(
+        threads <= most,
+        "{threads} worker threads: at most {most} on this machine, {MOST_THREADS} per core"
+    );
     // The text of this error already contains the text of its source.
     let started = build(ThreadPoolBuilder::new().num_threads(threads));
     started.map_err(|error| anyhow!("cannot start {threads} worker threads: {error}"))

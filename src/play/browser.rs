@@ -22,7 +22,9 @@ const BUILT_IN: &str = "built into the program";
 
 /// What a page says about who acts in episodes that are drawn from this seed.
 pub fn about(stage: &Stage, seed: u64) -> About {
-    let policy = stage.loaded().map(|loaded| (loaded.origin.to_string(), &*loaded.name));
+    let policy = stage
+        .loaded()
+        .map(|loaded| (loaded.origin.to_string(), &*loaded.name));
     described(stage.actor().name(), policy, Some(seed))
 }
 
@@ -37,7 +39,11 @@ fn described(actor: &str, policy: Option<(String, &str)>, seed: Option<u64>) -> 
         "policy" => name.to_owned(),
         other => format!("{name} ({other})"),
     });
-    About { title, policy, seed }
+    About {
+        title,
+        policy,
+        seed,
+    }
 }
 
 /// The newest policy of a run.
@@ -60,7 +66,11 @@ impl Followed {
         PolicySource::find(&place).context(needs)?;
         let run = RunFolder::containing(&place).context(needs)?;
         let path = run.checkpoints.latest();
-        Ok(Self { stamp: os::stamp(&path), run, path })
+        Ok(Self {
+            stamp: os::stamp(&path),
+            run,
+            path,
+        })
     }
 
     /// Whether the file has changed since the last call.
@@ -86,19 +96,33 @@ pub fn live(
     let stage = Rc::new(stage);
     let mut about = about(&stage, seed);
     if let Some(followed) = &followed {
-        about = About { title: followed.run.path.display().to_string(), policy: None, ..about };
+        about = About {
+            title: followed.run.path.display().to_string(),
+            policy: None,
+            ..about
+        };
     }
     let mut acting = stage.clone().acting(task.clone());
     let live = Live::open(port, (&about, shot.camera), hands as usize, &acting, None)?;
     let load = |path: &Path| {
-        let newer = Stage { choice: stage.choice, ..Stage::find(Some(path), set)? };
+        let newer = Stage {
+            choice: stage.choice,
+            ..Stage::find(Some(path), set)?
+        };
         let record = |stage: &Stage| stage.loaded().map(|loaded| loaded.record.clone());
-        ensure!(record(&newer) == record(&stage), "{} is for another hand", path.display());
+        ensure!(
+            record(&newer) == record(&stage),
+            "{} is for another hand",
+            path.display()
+        );
         let own = task.at_the_stage_of(&newer.task.config);
         let mut acting = Rc::new(newer).acting(own);
         // The page shows the settings of the first policy.
         for (key, value) in acting.task.config.unlike(&task.config) {
-            acting.policy.iter_mut().for_each(|name| *name += &format!(", {key} {}", short(&value)));
+            acting
+                .policy
+                .iter_mut()
+                .for_each(|name| *name += &format!(", {key} {}", short(&value)));
         }
         Ok(acting)
     };
@@ -120,28 +144,59 @@ pub fn live(
 /// # Errors
 /// Fails if the file is no trace, or if the HTML file cannot be written. Fails if the user does not name a scene that is not built
 /// in.
-pub fn from_trace(path: &Path, to: &Destination, shot: &Look, set: &[Override]) -> Result<ExitCode> {
+pub fn from_trace(
+    path: &Path,
+    to: &Destination,
+    shot: &Look,
+    set: &[Override],
+) -> Result<ExitCode> {
     let cannot = || format!("cannot use the trace {}", path.display());
     let bytes = os::read_bytes(path)?;
-    ensure!(bytes.starts_with(b"{"), "{}: it does not begin with the header of a trace", cannot());
+    ensure!(
+        bytes.starts_with(b"{"),
+        "{}: it does not begin with the header of a trace",
+        cannot()
+    );
     let text = String::from_utf8(bytes).with_context(cannot)?;
     let header = header(&text).with_context(cannot)?;
-    if let Some(set) = set.iter().find(|set| set.key != MODEL && !set.key.starts_with("hand.")) {
-        bail!("--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set", set.key);
+    if let Some(set) = set
+        .iter()
+        .find(|set| set.key != MODEL && !set.key.starts_with("hand."))
+    {
+        bail!(
+            "--set {}: a trace has its own settings; only {MODEL} and the parts of the hand can be set",
+            set.key
+        );
     }
     let stored = settings(path, &header).with_context(cannot)?;
-    let config = Settings::new().stored(stored, Reader::Run).sets(set).resolve().with_context(cannot)?;
+    let config = Settings::new()
+        .stored(stored, Reader::Run)
+        .sets(set)
+        .resolve()
+        .with_context(cannot)?;
     let task = Task::new(&config)?;
     let joints = json!(task.hand.parts.joints);
-    ensure!(header["joint_names"] == joints, "{}: it was recorded with another hand, which has other joints", cannot());
+    ensure!(
+        header["joint_names"] == joints,
+        "{}: it was recorded with another hand, which has other joints",
+        cannot()
+    );
     run::expect_output(&to.path, Some(path), task.config.model_file())?;
     let mut page = Replay::begin(to, &task, shot, 0)?;
     let left_out = page.read(&text).with_context(cannot)?;
     if left_out > 0 {
-        say!("note: {left_out} more episodes of {} are not in the HTML file", path.display());
+        say!(
+            "note: {left_out} more episodes of {} are not in the HTML file",
+            path.display()
+        );
     }
-    let actor = header["actor"].as_str().filter(|actor| actor.is_ascii() && !actor.is_empty()).unwrap_or("policy");
-    let policy = header["checkpoint"].as_str().map(|place| (place.to_owned(), place));
+    let actor = header["actor"]
+        .as_str()
+        .filter(|actor| actor.is_ascii() && !actor.is_empty())
+        .unwrap_or("policy");
+    let policy = header["checkpoint"]
+        .as_str()
+        .map(|place| (place.to_owned(), place));
     page.finish(&described(actor, policy, header["seed"].as_u64()))?;
     Ok(ExitCode::SUCCESS)
 }
@@ -161,7 +216,8 @@ fn settings(path: &Path, header: &Value) -> Result<Source> {
     let mut env = Table::new();
     let settings = header["settings"].as_object();
     for (key, value) in settings.context("it has no settings: not a trace of this program")? {
-        let value = toml::Value::try_from(value).with_context(|| format!("its setting {}", os::shortened(key)))?;
+        let value = toml::Value::try_from(value)
+            .with_context(|| format!("its setting {}", os::shortened(key)))?;
         env.insert(key.strip_prefix("env.").unwrap_or(key).to_owned(), value);
     }
     let text = Table::from_iter([("env".to_owned(), env.into())]).to_string();

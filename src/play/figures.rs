@@ -7,7 +7,12 @@ use crate::os::number;
 use crate::repose::{Score, named, task_terms};
 
 /// The object that `--json` prints. Unknown values are null.
-pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str>, seed: u64) -> Value {
+pub fn json_score(
+    score: &Score,
+    goal_times: &GoalTimes,
+    checkpoint: Option<&str>,
+    seed: u64,
+) -> Value {
     let mut object = score.as_json();
     object.insert("checkpoint".to_owned(), json!(checkpoint));
     object.insert("seed".to_owned(), json!(seed));
@@ -20,11 +25,15 @@ pub fn json_score(score: &Score, goal_times: &GoalTimes, checkpoint: Option<&str
 /// A table with a row for each measure and a column for each named score. Two columns fit into 60 characters.
 pub fn table(columns: &[(&str, Score)]) -> String {
     let mut text = format!("{:<21}", "");
-    columns.iter().for_each(|(name, _)| text += &format!(" {name:>18}"));
+    columns
+        .iter()
+        .for_each(|(name, _)| text += &format!(" {name:>18}"));
     let columns: Vec<_> = columns.iter().map(|(_, score)| lines(score)).collect();
     for (row, (label, _)) in columns[0].iter().enumerate() {
         text += &format!("\n{label:<21}");
-        columns.iter().for_each(|column| text += &format!(" {:>18}", column[row].1));
+        columns
+            .iter()
+            .for_each(|column| text += &format!(" {:>18}", column[row].1));
     }
     text + "\n"
 }
@@ -39,7 +48,10 @@ fn lines(score: &Score) -> Vec<(String, String)> {
             lines.push(("  95 % interval".to_owned(), format!("{low} … {high}")));
         }
     }
-    lines.extend(named(task_terms(), score.reward).map(|(term, value)| (format!("  {term}"), number(value, 2))));
+    lines.extend(
+        named(task_terms(), score.reward)
+            .map(|(term, value)| (format!("  {term}"), number(value, 2))),
+    );
     lines.push(("diverged episodes".to_owned(), score.diverged.to_string()));
     lines
 }
@@ -53,20 +65,50 @@ mod tests {
     #[test]
     fn the_json_of_a_score_says_of_which_policy_it_is_and_how_long_goals_took() {
         let goal_times = GoalTimes::new(&Config::default().env);
-        let score = Score::of(&[EpisodeStats { length: 10, ..Default::default() }], 0.01);
+        let score = Score::of(
+            &[EpisodeStats {
+                length: 10,
+                ..Default::default()
+            }],
+            0.01,
+        );
         let value = json_score(&score, &goal_times, None, 3);
-        let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
+        let keys: Vec<&str> = value
+            .as_object()
+            .unwrap()
+            .keys()
+            .map(String::as_str)
+            .collect();
         let (of_score, others) = keys.split_at(keys.len() - 5);
         assert_eq!(of_score, score.as_json().keys().collect::<Vec<_>>());
-        assert_eq!(others, ["checkpoint", "seed", "steps_to_goal", "drops_first_second", "steps_fit"]);
+        assert_eq!(
+            others,
+            [
+                "checkpoint",
+                "seed",
+                "steps_to_goal",
+                "drops_first_second",
+                "steps_fit"
+            ]
+        );
         assert!(value["checkpoint"].is_null() && value["seed"] == 3);
     }
 
     #[test]
     fn the_table_has_a_column_for_each_score() {
-        let score = Score::of(&[EpisodeStats { length: 10, goals: 2, ..Default::default() }], 0.01);
+        let score = Score::of(
+            &[EpisodeStats {
+                length: 10,
+                goals: 2,
+                ..Default::default()
+            }],
+            0.01,
+        );
         let text = table(&[("policy", score), ("zero actions", score)]);
-        let goals = text.lines().find(|line| line.starts_with("goals per episode")).unwrap();
+        let goals = text
+            .lines()
+            .find(|line| line.starts_with("goals per episode"))
+            .unwrap();
         assert_eq!(goals.matches("2.000").count(), 2, "{text}");
     }
 }

@@ -23,11 +23,22 @@ impl Files {
     pub fn begin(stage: &Stage, episodes: Episodes, outputs: &Outputs) -> Result<Self> {
         let task = &stage.task;
         let trace = outputs.trace.as_ref().map(|to| {
-            let trace = Trace::new(task, stage.actor().name(), stage.origin().as_deref(), episodes.seed);
+            let trace = Trace::new(
+                task,
+                stage.actor().name(),
+                stage.origin().as_deref(),
+                episodes.seed,
+            );
             OutputFile::create(&to.path).map(|output| (output, trace))
         });
-        let page = outputs.page.as_ref().map(|to| Replay::begin(to, task, &outputs.shot, episodes.count));
-        Ok(Self { trace: trace.transpose()?, page: page.transpose()? })
+        let page = outputs
+            .page
+            .as_ref()
+            .map(|to| Replay::begin(to, task, &outputs.shot, episodes.count));
+        Ok(Self {
+            trace: trace.transpose()?,
+            page: page.transpose()?,
+        })
     }
 
     pub fn observe(&mut self, moment: &Moment) {

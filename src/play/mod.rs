@@ -47,13 +47,27 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
             let followed = args.follow.then(|| Followed::find(place)).transpose()?;
             let newest: Option<&Path> = followed.as_ref().map(|followed| &*followed.path);
             let stage = Stage::set(newest.or(place), args)?;
-            browser::live((port, args.hands), &shot, stage, followed, (args.seed, &args.set))
+            browser::live(
+                (port, args.hands),
+                &shot,
+                stage,
+                followed,
+                (args.seed, &args.set),
+            )
         }
         Plan::Robustness(report) => {
             requests.wait_for_end();
             let stage = Stage::set(place, args)?;
-            let load = |changes: &[Override]| task(stage.loaded(), &[&args.set[..], changes].concat());
-            robustness(&load, &stage.actor(), &stage.place(), episodes(args, 256), &report, requests)
+            let load =
+                |changes: &[Override]| task(stage.loaded(), &[&args.set[..], changes].concat());
+            robustness(
+                &load,
+                &stage.actor(),
+                &stage.place(),
+                episodes(args, 256),
+                &report,
+                requests,
+            )
         }
         #[cfg(not(feature = "viewer"))]
         Plan::Window(_) => bail!("{}. {INSTEAD}", see::NO_WINDOWS),
@@ -65,7 +79,12 @@ pub fn play(args: &PlayArgs, requests: &Requests) -> Result<ExitCode> {
                 say!("note: there is no display. {INSTEAD}");
             }
             let is_seen = outputs.film.is_some() || outputs.page.is_some();
-            score(&stage, episodes(args, if is_seen { 1 } else { 256 }), &outputs, requests)
+            score(
+                &stage,
+                episodes(args, if is_seen { 1 } else { 256 }),
+                &outputs,
+                requests,
+            )
         }
     }
 }

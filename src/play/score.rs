@@ -23,7 +23,12 @@ use crate::see;
 ///
 /// # Errors
 /// Fails if an output cannot be written, if an action is not finite, or if an episode panics.
-pub fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Requests) -> Result<ExitCode> {
+pub fn score(
+    stage: &Stage,
+    episodes: Episodes,
+    outputs: &Outputs,
+    requests: &Requests,
+) -> Result<ExitCode> {
     let task = &stage.task;
     let actor = &stage.actor();
     let place = stage.origin();
@@ -33,7 +38,12 @@ pub fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Re
         goal_times.observe(moment);
         files.observe(moment);
     };
-    let trial = Trial { task, actor, episodes, stop: &requests.stop };
+    let trial = Trial {
+        task,
+        actor,
+        episodes,
+        stop: &requests.stop,
+    };
     let played = match &outputs.film {
         #[cfg(not(feature = "video"))]
         Some(_) => bail!(see::NO_FILMS),
@@ -46,17 +56,32 @@ pub fn score(stage: &Stage, episodes: Episodes, outputs: &Outputs, requests: &Re
         return Ok(os::exit_code(requests.signal()));
     };
     files.finish(&about(stage, episodes.seed))?;
-    played.divergence().into_iter().for_each(|warning| say!("warning: {warning}"));
+    played
+        .divergence()
+        .into_iter()
+        .for_each(|warning| say!("warning: {warning}"));
     if outputs.json {
-        os::print(&format!("{}\n", json_score(&played, &goal_times, place.as_deref(), episodes.seed)))?;
+        os::print(&format!(
+            "{}\n",
+            json_score(&played, &goal_times, place.as_deref(), episodes.seed)
+        ))?;
         return Ok(ExitCode::SUCCESS);
     }
     let mut columns = vec![(actor.name(), played)];
     if let Some(place) = place {
         os::print(&format!("checkpoint {place}\n"))?;
         if outputs.film.is_none() && outputs.page.is_none() {
-            let zero = scored(Trial { actor: &Actor::Zero, ..trial }, &mut |_| {})?;
-            columns.push((Actor::Zero.name(), zero.context("these episodes cannot be interrupted")?));
+            let zero = scored(
+                Trial {
+                    actor: &Actor::Zero,
+                    ..trial
+                },
+                &mut |_| {},
+            )?;
+            columns.push((
+                Actor::Zero.name(),
+                zero.context("these episodes cannot be interrupted")?,
+            ));
         }
     }
     os::print(&table(&columns))?;
@@ -85,7 +110,15 @@ fn film(
     requests.wait_for_end();
     let mut played = Vec::new();
     for first in first..first + count {
-        let one = Trial { task, episodes: Episodes { first, count: 1, ..trial.episodes }, ..trial };
+        let one = Trial {
+            task,
+            episodes: Episodes {
+                first,
+                count: 1,
+                ..trial.episodes
+            },
+            ..trial
+        };
         let result = one.play(&mut |moment| {
             observe(&moment);
             film.observe(&moment)

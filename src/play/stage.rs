@@ -33,7 +33,10 @@ impl Stage {
     pub fn set(place: Option<&Path>, args: &PlayArgs) -> Result<Self> {
         let mut stage = Self::find(place, &args.set)?;
         if args.stochastic {
-            ensure!(stage.policy.is_some(), "--stochastic samples from a policy: --ckpt names none");
+            ensure!(
+                stage.policy.is_some(),
+                "--stochastic samples from a policy: --ckpt names none"
+            );
             stage.choice = 1;
         }
         let file = stage.loaded().and_then(|loaded| loaded.origin.file());
@@ -42,9 +45,17 @@ impl Stage {
         if let Some(loaded) = stage.loaded().filter(|_| !args.json) {
             say!("playing {}", loaded.name);
         }
-        stage.task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
+        stage
+            .task
+            .warnings
+            .iter()
+            .for_each(|warning| say!("warning: {warning}"));
         if !args.json {
-            stage.task.notes().iter().for_each(|note| say!("note: {note}"));
+            stage
+                .task
+                .notes()
+                .iter()
+                .for_each(|note| say!("note: {note}"));
         }
         Ok(stage)
     }
@@ -55,11 +66,19 @@ impl Stage {
     /// Fails as [`Loaded::find`] and [`Loaded::task`] do.
     pub fn find(place: Option<&Path>, set: &[Override]) -> Result<Self> {
         if let Some(choice) = place.and_then(Actor::without_policy) {
-            return Ok(Self { policy: None, choice, task: task(None, set)? });
+            return Ok(Self {
+                policy: None,
+                choice,
+                task: task(None, set)?,
+            });
         }
         let loaded = Loaded::find(place, set)?;
         let task = task(Some(&loaded), set)?;
-        Ok(Self { policy: Some(loaded), choice: 0, task })
+        Ok(Self {
+            policy: Some(loaded),
+            choice: 0,
+            task,
+        })
     }
 
     /// The kinds of actions between which a user may choose, by name.
@@ -67,10 +86,16 @@ impl Stage {
         self.actors_of(Policy::freeze)
     }
 
-    fn actors_of(&self, freeze: for<'a> fn(&'a Policy) -> FrozenPolicy<'a>) -> Vec<(&'static str, Actor<'_>)> {
+    fn actors_of(
+        &self,
+        freeze: for<'a> fn(&'a Policy) -> FrozenPolicy<'a>,
+    ) -> Vec<(&'static str, Actor<'_>)> {
         match &self.policy {
             Some(Loaded { policy, .. }) => {
-                vec![("deterministic", Actor::Mean(freeze(policy))), ("stochastic", Actor::Stochastic(freeze(policy)))]
+                vec![
+                    ("deterministic", Actor::Mean(freeze(policy))),
+                    ("stochastic", Actor::Stochastic(freeze(policy))),
+                ]
             }
             None => Actor::WITHOUT_POLICY.into(),
         }
@@ -92,7 +117,8 @@ impl Stage {
 
     /// Where the policy comes from, or the name of the actor.
     pub fn place(&self) -> String {
-        self.origin().unwrap_or_else(|| self.actor().name().to_owned())
+        self.origin()
+            .unwrap_or_else(|| self.actor().name().to_owned())
     }
 
     /// The actor of a page that shows this task.
@@ -102,7 +128,11 @@ impl Stage {
             let (_, actor) = &self.actors_of(Policy::freeze_briefly)[self.choice];
             player.step(actor)
         };
-        LiveActor { step: Rc::new(step), policy, task }
+        LiveActor {
+            step: Rc::new(step),
+            policy,
+            task,
+        }
     }
 }
 
@@ -113,7 +143,10 @@ impl Stage {
 pub fn task(loaded: Option<&Loaded>, set: &[Override]) -> Result<Arc<Task>> {
     match loaded {
         Some(loaded) => loaded.task(set),
-        None => Settings::new().sets(set).resolve().and_then(|config| Task::new(&config)),
+        None => Settings::new()
+            .sets(set)
+            .resolve()
+            .and_then(|config| Task::new(&config)),
     }
 }
 
@@ -122,8 +155,15 @@ fn expect_outputs(out: &[Destination], policy: Option<&Path>, scene: Option<&Pat
     for (i, Destination { path, .. }) in out.iter().enumerate() {
         run::expect_output(path, policy, scene)?;
         let end = os::final_path(path);
-        let is_taken = end.is_some() && out[..i].iter().any(|other| os::final_path(&other.path) == end);
-        ensure!(!is_taken, "--out {}: one file cannot be both", path.display());
+        let is_taken = end.is_some()
+            && out[..i]
+                .iter()
+                .any(|other| os::final_path(&other.path) == end);
+        ensure!(
+            !is_taken,
+            "--out {}: one file cannot be both",
+            path.display()
+        );
     }
     Ok(())
 }

@@ -22,17 +22,28 @@ pub struct Acting<'a> {
 impl Acting<'_> {
     /// Draws actions for the observations of step `t`. Writes actions, means, noise scales, log-probabilities and values.
     pub fn act(&self, block: &mut RolloutBlock, t: usize, noise: &mut Rng, work: &mut Workspace) {
-        let Spaces { observation_size, action_size, .. } = self.frozen.policy.spaces;
-        let [seen, acted, one] = [observation_size, action_size, 1].map(|width| block.step(t, width));
+        let Spaces {
+            observation_size,
+            action_size,
+            ..
+        } = self.frozen.policy.spaces;
+        let [seen, acted, one] =
+            [observation_size, action_size, 1].map(|width| block.step(t, width));
         let observations = &block.observations[seen];
         let actions = &mut block.actions[acted.clone()];
         let means = &mut block.means[acted];
-        self.frozen.compute(observations, [means, &mut block.values[one.clone()]], work);
+        self.frozen
+            .compute(observations, [means, &mut block.values[one.clone()]], work);
         let std = self.frozen.policy.std();
-        let constant: f32 = repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
-        let rows = actions.chunks_exact_mut(action_size).zip(means.chunks_exact(action_size));
+        let constant: f32 =
+            repeat_n(std.ln() + 0.5 * std::f32::consts::TAU.ln(), action_size).sum();
+        let rows = actions
+            .chunks_exact_mut(action_size)
+            .zip(means.chunks_exact(action_size));
         let rows = rows.zip(observations.chunks_exact(observation_size));
-        let figures = block.noise_scales[one.clone()].iter_mut().zip(&mut block.log_probs[one]);
+        let figures = block.noise_scales[one.clone()]
+            .iter_mut()
+            .zip(&mut block.log_probs[one]);
         for (((actions, means), observation), (scale, log_prob)) in rows.zip(figures) {
             *scale = self.noise_scale(observation);
             let mut squares = 0.0;
@@ -56,7 +67,8 @@ impl Acting<'_> {
         }
         let [near, far] = self.config.away_range.map(|distance| distance as f32);
         let spaces = &self.frozen.policy.spaces;
-        let fraction = (((spaces.distance)(spaces, observation) - near) / (far - near)).clamp(0.0, 1.0);
+        let fraction =
+            (((spaces.distance)(spaces, observation) - near) / (far - near)).clamp(0.0, 1.0);
         1.0 + (self.away_scale - 1.0) * fraction
     }
 
@@ -72,7 +84,8 @@ impl Acting<'_> {
             *reward *= self.config.reward_scale as f32;
             if let Some(observation) = cut_off {
                 let mut value = [0.0];
-                self.frozen.compute(observation, [&mut [], &mut value], work);
+                self.frozen
+                    .compute(observation, [&mut [], &mut value], work);
                 *reward += self.config.gamma as f32 * value[0];
             }
         }
@@ -82,6 +95,10 @@ impl Acting<'_> {
     pub fn finish(&self, block: &mut RolloutBlock, horizon: usize, work: &mut Workspace) {
         let seen = block.step(horizon, self.frozen.policy.spaces.observation_size);
         let one = block.step(horizon, 1);
-        self.frozen.compute(&block.observations[seen], [&mut [], &mut block.values[one]], work);
+        self.frozen.compute(
+            &block.observations[seen],
+            [&mut [], &mut block.values[one]],
+            work,
+        );
     }
 }

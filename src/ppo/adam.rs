@@ -35,30 +35,46 @@ pub struct Adam {
 impl Adam {
     /// Creates an optimizer of `count` parameters that has not taken a step.
     pub fn new(count: usize) -> Self {
-        Self { mean: vec![0.0; count], square: vec![0.0; count], steps: 0 }
+        Self {
+            mean: vec![0.0; count],
+            square: vec![0.0; count],
+            steps: 0,
+        }
     }
 
     /// Moves the parameters in the range `own` one step against the gradient, which is first multiplied by `scale`, with this
     /// learning `rate`.
-    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], own: Range<usize>, (rate, scale): (f64, f64)) {
+    pub fn step(
+        &mut self,
+        parameters: &mut [f32],
+        gradient: &[f32],
+        own: Range<usize>,
+        (rate, scale): (f64, f64),
+    ) {
         self.steps += 1;
         let correction = |beta: f64| 1.0 - beta.powi(self.steps as i32);
         let scale = scale as f32;
         let rate = (rate / correction(BETA1)) as f32;
         let unbiased = (1.0 / correction(BETA2)) as f32;
-        let [mean, square] = [&mut self.mean, &mut self.square].map(|moment| &mut moment[own.clone()]);
-        let parameters = parameters[own.clone()].par_chunks_mut(CHUNK).zip(gradient[own].par_chunks(CHUNK));
+        let [mean, square] =
+            [&mut self.mean, &mut self.square].map(|moment| &mut moment[own.clone()]);
+        let parameters = parameters[own.clone()]
+            .par_chunks_mut(CHUNK)
+            .zip(gradient[own].par_chunks(CHUNK));
         let moments = mean.par_chunks_mut(CHUNK).zip(square.par_chunks_mut(CHUNK));
-        parameters.zip(moments).for_each(|((x, grad), (mean, square))| {
-            widest!({
-                for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square) {
-                    let grad = grad * scale;
-                    *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
-                    *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
-                    *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
-                }
+        parameters
+            .zip(moments)
+            .for_each(|((x, grad), (mean, square))| {
+                widest!({
+                    for (((x, grad), mean), square) in x.iter_mut().zip(grad).zip(mean).zip(square)
+                    {
+                        let grad = grad * scale;
+                        *mean = BETA1 as f32 * *mean + (1.0 - BETA1) as f32 * grad;
+                        *square = BETA2 as f32 * *square + (1.0 - BETA2) as f32 * grad * grad;
+                        *x -= rate * *mean / ((*square * unbiased).sqrt() + EPSILON as f32);
+                    }
+                });
             });
-        });
     }
 }
 
@@ -66,7 +82,12 @@ impl Adam {
 pub fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
     let mut chunks = Vec::new();
     for group in groups {
-        chunks.extend(group.clone().step_by(NORM_CHUNK).map(|first| first..group.end.min(first + NORM_CHUNK)));
+        chunks.extend(
+            group
+                .clone()
+                .step_by(NORM_CHUNK)
+                .map(|first| first..group.end.min(first + NORM_CHUNK)),
+        );
     }
     chunks
 }
@@ -75,7 +96,12 @@ pub fn norm_chunks(groups: &[Range<usize>]) -> Vec<Range<usize>> {
 /// group.
 pub fn norm(squares: &[f64], groups: &[Range<usize>]) -> f64 {
     let mut squares = squares.iter();
-    let of_group = |group: &Range<usize>| squares.by_ref().take(group.len().div_ceil(NORM_CHUNK)).sum::<f64>();
+    let of_group = |group: &Range<usize>| {
+        squares
+            .by_ref()
+            .take(group.len().div_ceil(NORM_CHUNK))
+            .sum::<f64>()
+    };
     groups.iter().map(of_group).sum::<f64>().sqrt()
 }
 
@@ -85,7 +111,10 @@ pub fn sum_of_squares(x: &[f32]) -> f64 {
     widest!({
         let (whole, rest) = x.as_chunks::<32>();
         for chunk in whole.iter().map(|chunk| &chunk[..]).chain([rest]) {
-            lanes.iter_mut().zip(chunk).for_each(|(lane, x)| *lane += x * x);
+            lanes
+                .iter_mut()
+                .zip(chunk)
+                .for_each(|(lane, x)| *lane += x * x);
         }
     });
     lanes.iter().map(|&lane| f64::from(lane)).sum()
@@ -97,7 +126,12 @@ mod tests {
 
     fn norm_of(gradient: &[f32], groups: &[Range<usize>]) -> f64 {
         let chunks = norm_chunks(groups).into_par_iter();
-        norm(&chunks.map(|chunk| sum_of_squares(&gradient[chunk])).collect::<Vec<f64>>(), groups)
+        norm(
+            &chunks
+                .map(|chunk| sum_of_squares(&gradient[chunk]))
+                .collect::<Vec<f64>>(),
+            groups,
+        )
     }
 
     /// The expected values come from this program (PyTorch):
@@ -119,9 +153,17 @@ mod tests {
             let gradient = [2.0 * x[0], x[1], 0.2 * x[2]];
             let norm = norm_of(&gradient, &[0..2, 2..3]);
             assert!((norm - expected_norm).abs() < 1e-5, "norm {norm}");
-            adam.step(&mut x, &gradient, 0..3, (0.1, (1.0 / (norm + 1e-6)).min(1.0)));
+            adam.step(
+                &mut x,
+                &gradient,
+                0..3,
+                (0.1, (1.0 / (norm + 1e-6)).min(1.0)),
+            );
             for (found, expected) in x.iter().zip(expected) {
-                assert!((found - expected).abs() < 1e-6, "{found} instead of {expected}");
+                assert!(
+                    (found - expected).abs() < 1e-6,
+                    "{found} instead of {expected}"
+                );
             }
         }
         assert_eq!(adam.steps, 3);
@@ -135,10 +177,19 @@ mod tests {
 
     #[test]
     fn the_norm_is_that_of_all_numbers_on_any_number_of_threads() {
-        let gradient: Vec<f32> = (0..20_000).map(|i| ((i * 7919) % 1000) as f32 - 500.0).collect();
-        let exact = gradient.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
+        let gradient: Vec<f32> = (0..20_000)
+            .map(|i| ((i * 7919) % 1000) as f32 - 500.0)
+            .collect();
+        let exact = gradient
+            .iter()
+            .map(|&x| f64::from(x).powi(2))
+            .sum::<f64>()
+            .sqrt();
         let on = |threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             pool.install(|| norm_of(&gradient, &[0..12_345, 12_345..20_000]))
         };
         assert!((on(1) / exact - 1.0).abs() < 1e-5);

@@ -18,7 +18,12 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 75,
         action_size: 20,
-        object_and_goal: Some(ObjectAndGoal { object: 51, goal: 64, relative: 0, rotations: 1 }),
+        object_and_goal: Some(ObjectAndGoal {
+            object: 51,
+            goal: 64,
+            relative: 0,
+            rotations: 1,
+        }),
         distance: |_, _| 0.0,
     };
 
@@ -28,11 +33,16 @@ mod tests {
         (config.backend, config.activation, config.hidden) = (backend, activation, vec![64, 33]);
         config.bounds_coef = 0.1;
         let mut ppo = Ppo::new(&config, SPACES, 3, Exchange::alone(1)).unwrap();
-        ppo.policy.see(&[&[0.3, 0.9].map(|x| [x; SPACES.observation_size]).concat()], &ppo.exchange);
+        ppo.policy.see(
+            &[&[0.3, 0.9].map(|x| [x; SPACES.observation_size]).concat()],
+            &ppo.exchange,
+        );
         let mut rollout = Rollout::new(16, &[32, 32, 21], &SPACES);
         let mut rng = rng::stream(0, "test", 0);
         let mut fill = |numbers: &mut [f32], scale: f64| {
-            numbers.iter_mut().for_each(|x| *x = rng::uniform(&mut rng, -scale, scale) as f32);
+            numbers
+                .iter_mut()
+                .for_each(|x| *x = rng::uniform(&mut rng, -scale, scale) as f32);
         };
         for block in &mut rollout.blocks {
             fill(&mut block.observations, 1.0);
@@ -42,11 +52,23 @@ mod tests {
             fill(&mut block.advantages, 2.0);
             fill(&mut block.returns, 1.0);
             // Every third sample acts with more noise.
-            block.noise_scales.iter_mut().step_by(3).for_each(|scale| *scale = 1.5);
-            let means = block.means.chunks_exact(20).zip(block.actions.chunks_exact(20)).zip(&block.noise_scales);
+            block
+                .noise_scales
+                .iter_mut()
+                .step_by(3)
+                .for_each(|scale| *scale = 1.5);
+            let means = block
+                .means
+                .chunks_exact(20)
+                .zip(block.actions.chunks_exact(20))
+                .zip(&block.noise_scales);
             for (((means, actions), scale), log_prob) in means.zip(&mut block.log_probs) {
-                let z = means.iter().zip(actions).map(|(mean, action)| (action - mean) / (0.5 * scale));
-                *log_prob = -0.5 * z.map(|z| z * z).sum::<f32>() - 20.0 * (0.5f32.ln() + 0.918_938_5);
+                let z = means
+                    .iter()
+                    .zip(actions)
+                    .map(|(mean, action)| (action - mean) / (0.5 * scale));
+                *log_prob =
+                    -0.5 * z.map(|z| z * z).sum::<f32>() - 20.0 * (0.5f32.ln() + 0.918_938_5);
             }
         }
         ppo.backend.begin(&ppo.policy, &rollout);
@@ -55,27 +77,44 @@ mod tests {
 
     /// Takes one gradient step with a learning rate of 1e-3, without clipping.
     fn step(ppo: &mut Ppo) {
-        ppo.adam.step(&mut ppo.policy.parameters, &ppo.gradient, 0..ppo.gradient.len(), (1e-3, 1.0));
+        ppo.adam.step(
+            &mut ppo.policy.parameters,
+            &ppo.gradient,
+            0..ppo.gradient.len(),
+            (1e-3, 1.0),
+        );
     }
 
     /// Computes the gradient of these samples and leaves it in the learner.
     fn gradient(ppo: &mut Ppo, rollout: &Rollout, samples: &[u32]) -> Losses {
         let groups = ppo.exchange.groups(samples);
         let count = samples.len();
-        let sums = ppo.backend.gradients(&ppo.policy, rollout, &groups, count, &mut ppo.of_groups).unwrap();
+        let sums = ppo
+            .backend
+            .gradients(&ppo.policy, rollout, &groups, count, &mut ppo.of_groups)
+            .unwrap();
         let add_up = |parameters, out: &mut [f32]| tree_sum(out, &ppo.of_groups, parameters);
-        ppo.slices.reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
+        ppo.slices
+            .reduce_scatter(&mut ppo.gradient, add_up, |_| 0.0);
         ppo.losses(&sums, count)
     }
 
     /// Splits these values by parameter tensor.
     fn by_name<'a>(policy: &Policy, numbers: &'a [f32]) -> Vec<(String, &'a [f32])> {
-        policy.layout.views().into_iter().map(|view| (view.name, &numbers[view.range])).collect()
+        policy
+            .layout
+            .views()
+            .into_iter()
+            .map(|view| (view.name, &numbers[view.range]))
+            .collect()
     }
 
     #[track_caller]
     fn assert_close(found: f64, expected: f64, tolerance: f64, what: &str) {
-        assert!((found - expected).abs() <= tolerance * expected.abs().max(1e-6), "{what}: {found} not {expected}");
+        assert!(
+            (found - expected).abs() <= tolerance * expected.abs().max(1e-6),
+            "{what}: {found} not {expected}"
+        );
     }
 
     #[test]
@@ -86,11 +125,17 @@ mod tests {
                 let what = format!("{activation:?}, {samples} samples");
                 let [(fused, kernels), (candle, reference)] = BACKENDS.map(|backend| {
                     let (mut ppo, rollout) = learner(backend, activation);
-                    let samples: Vec<u32> = (0..samples).map(|i| (i * 7) % rollout.samples() as u32).collect();
+                    let samples: Vec<u32> = (0..samples)
+                        .map(|i| (i * 7) % rollout.samples() as u32)
+                        .collect();
                     (gradient(&mut ppo, &rollout, &samples), ppo)
                 });
                 for (name, found, expected) in [
-                    ("total", fused.total(&kernels.config), candle.total(&kernels.config)),
+                    (
+                        "total",
+                        fused.total(&kernels.config),
+                        candle.total(&kernels.config),
+                    ),
                     ("surrogate", fused.surrogate, candle.surrogate),
                     ("value", fused.value_error, candle.value_error),
                     ("excess", fused.excess, candle.excess),
@@ -100,11 +145,18 @@ mod tests {
                     assert_close(found, expected, 2e-4, &format!("{what}: {name}"));
                 }
                 assert_eq!(fused.clipped, candle.clipped, "{what}");
-                assert!(fused.clipped > 0.0 && fused.clipped < 1.0, "{what}: some are clipped, but not all");
+                assert!(
+                    fused.clipped > 0.0 && fused.clipped < 1.0,
+                    "{what}: some are clipped, but not all"
+                );
                 let [a, b] = [&kernels, &reference].map(|ppo| by_name(&ppo.policy, &ppo.gradient));
                 for ((name, a), (_, b)) in a.into_iter().zip(b) {
                     let largest = b.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-                    let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                    let error = a
+                        .iter()
+                        .zip(b)
+                        .map(|(a, b)| (a - b).abs())
+                        .fold(0.0, f32::max);
                     assert!(
                         largest > 0.0 && error < 1e-4 * largest,
                         "{what}: gradient of {name}: {error} of {largest}"
@@ -127,8 +179,18 @@ mod tests {
             for (found, expected) in [(total(&eight), total(&one)), (eight.0.kl, one.0.kl)] {
                 assert_close(found, expected, 1e-4, "losses");
             }
-            let largest = one.1.gradient.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-            assert!(one.1.gradient.iter().zip(&eight.1.gradient).all(|(a, b)| (a - b).abs() < 1e-5 * largest));
+            let largest = one
+                .1
+                .gradient
+                .iter()
+                .fold(0.0f32, |most, x| most.max(x.abs()));
+            assert!(
+                one.1
+                    .gradient
+                    .iter()
+                    .zip(&eight.1.gradient)
+                    .all(|(a, b)| (a - b).abs() < 1e-5 * largest)
+            );
         }
     }
 
@@ -137,19 +199,30 @@ mod tests {
         let [fused, candle] = BACKENDS.map(|backend| {
             let (mut ppo, rollout) = learner(backend, Activation::Elu);
             for part in 0..20 {
-                let samples: Vec<u32> = (0..256).map(|i| (i * 5 + part * 31) % rollout.samples() as u32).collect();
+                let samples: Vec<u32> = (0..256)
+                    .map(|i| (i * 5 + part * 31) % rollout.samples() as u32)
+                    .collect();
                 gradient(&mut ppo, &rollout, &samples);
                 step(&mut ppo);
             }
             ppo
         });
         let first = learner(config::Backend::Fused, Activation::Elu).0;
-        let [fused, candle, first] = [&fused, &candle, &first].map(|ppo| by_name(&ppo.policy, &ppo.policy.parameters));
+        let [fused, candle, first] =
+            [&fused, &candle, &first].map(|ppo| by_name(&ppo.policy, &ppo.policy.parameters));
         for (((name, a), (_, b)), (_, first)) in fused.into_iter().zip(candle).zip(first) {
-            let difference =
-                |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(x - y).powi(2)).sum::<f64>().sqrt();
+            let difference = |x: &[f32], y: &[f32]| {
+                x.iter()
+                    .zip(y)
+                    .map(|(x, y)| f64::from(x - y).powi(2))
+                    .sum::<f64>()
+                    .sqrt()
+            };
             let (apart, moved) = (difference(a, b), difference(a, first));
-            assert!(apart < 1e-2 * moved, "{name} moved by {moved}, but is {apart} from candle's");
+            assert!(
+                apart < 1e-2 * moved,
+                "{name} moved by {moved}, but is {apart} from candle's"
+            );
         }
     }
 
@@ -163,8 +236,14 @@ mod tests {
             ppo.config.desired_kl = Geometric(Ramp::constant(0.0));
             (ppo.learning_rate, ppo.config.max_grad_norm) = (1e-3, norm);
             let before = ppo.policy.parameters.clone();
-            ppo.update(&mut rollout, 1, &AtomicBool::new(false)).unwrap().unwrap();
-            let moved = before.iter().zip(&ppo.policy.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            ppo.update(&mut rollout, 1, &AtomicBool::new(false))
+                .unwrap()
+                .unwrap();
+            let moved = before
+                .iter()
+                .zip(&ppo.policy.parameters)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f32::max);
             assert!(moved <= most && moved >= least, "{norm}: {moved}");
         }
     }
@@ -173,7 +252,9 @@ mod tests {
     fn gradients_are_the_same_bits_for_any_number_of_threads_and_whatever_came_before() {
         for precision in [Precision::F32, Precision::Bf16Rounded, Precision::Bf16] {
             // Not every processor has a unit for bf16.
-            let Ok(arithmetic) = Arithmetic::new(precision) else { continue };
+            let Ok(arithmetic) = Arithmetic::new(precision) else {
+                continue;
+            };
             let run = |threads: &[usize]| {
                 let (mut ppo, rollout) = learner(config::Backend::Fused, Activation::Tanh);
                 ppo.backend = Box::new(Fused::new(&ppo.config, arithmetic));
@@ -182,8 +263,15 @@ mod tests {
                 let mut losses = Vec::new();
                 for (i, &number) in threads.iter().enumerate() {
                     // A few samples at first, all of them in the end.
-                    let samples = if i + 1 < threads.len() { &samples[..40] } else { &samples[..] };
-                    let pool = rayon::ThreadPoolBuilder::new().num_threads(number).build().unwrap();
+                    let samples = if i + 1 < threads.len() {
+                        &samples[..40]
+                    } else {
+                        &samples[..]
+                    };
+                    let pool = rayon::ThreadPoolBuilder::new()
+                        .num_threads(number)
+                        .build()
+                        .unwrap();
                     losses.push(pool.install(|| gradient(&mut ppo, &rollout, samples)));
                 }
                 step(&mut ppo);
@@ -198,7 +286,12 @@ mod tests {
 
     #[test]
     fn the_smallest_nets_and_minibatches_agree_with_candle() {
-        let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, ..SPACES };
+        let spaces = Spaces {
+            observation_size: 1,
+            action_size: 1,
+            object_and_goal: None,
+            ..SPACES
+        };
         let [fused, candle] = BACKENDS.map(|backend| {
             let mut config = Config::default().ppo;
             (config.backend, config.hidden) = (backend, vec![1]);
@@ -209,9 +302,21 @@ mod tests {
             rollout.blocks[0].advantages.fill(1.5);
             rollout.blocks[0].returns.fill(0.3);
             ppo.backend.begin(&ppo.policy, &rollout);
-            (gradient(&mut ppo, &rollout, &[0]).total(&ppo.config), ppo.gradient)
+            (
+                gradient(&mut ppo, &rollout, &[0]).total(&ppo.config),
+                ppo.gradient,
+            )
         });
         assert_close(fused.0, candle.0, 1e-5, "loss");
-        assert!(fused.1.iter().zip(&candle.1).all(|(a, b)| (a - b).abs() < 1e-5), "{:?} not {:?}", fused.1, candle.1);
+        assert!(
+            fused
+                .1
+                .iter()
+                .zip(&candle.1)
+                .all(|(a, b)| (a - b).abs() < 1e-5),
+            "{:?} not {:?}",
+            fused.1,
+            candle.1
+        );
     }
 }

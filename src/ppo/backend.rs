@@ -30,20 +30,35 @@ impl Add for Losses {
     type Output = Self;
 
     fn add(mut self, mut other: Self) -> Self {
-        self.summed().into_iter().zip(other.summed()).for_each(|(sum, more)| *sum += *more);
-        Self { ratio_error: self.ratio_error.max(other.ratio_error), ..self }
+        self.summed()
+            .into_iter()
+            .zip(other.summed())
+            .for_each(|(sum, more)| *sum += *more);
+        Self {
+            ratio_error: self.ratio_error.max(other.ratio_error),
+            ..self
+        }
     }
 }
 
 impl Losses {
     fn summed(&mut self) -> [&mut f64; 5] {
-        let Self { surrogate, value_error, excess, kl, clipped, ratio_error: _ } = self;
+        let Self {
+            surrogate,
+            value_error,
+            excess,
+            kl,
+            clipped,
+            ratio_error: _,
+        } = self;
         [surrogate, value_error, excess, kl, clipped]
     }
 
     /// The means, given sums over `count` things.
     pub(super) fn means(mut self, count: usize) -> Self {
-        self.summed().into_iter().for_each(|sum| *sum /= count as f64);
+        self.summed()
+            .into_iter()
+            .for_each(|sum| *sum /= count as f64);
         self
     }
 

@@ -48,22 +48,44 @@ impl Checkpoint {
     /// Fails if the bytes are not a complete checkpoint of this program.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let (mut texts, arrays) = format::parse(bytes)?;
-        let mut text = |key: &str| texts.remove(key).with_context(|| format!("its metadata has no `{key}`"));
+        let mut text = |key: &str| {
+            texts
+                .remove(key)
+                .with_context(|| format!("its metadata has no `{key}`"))
+        };
         let format = text("format")?;
-        ensure!(format != CONVERTIBLE, "its format is `{format}`; `scripts/convert OLD NEW` writes it as `{FORMAT}`");
-        ensure!(format == FORMAT, "its format is `{}`; this program reads `{FORMAT}`", shortened(&format));
+        ensure!(
+            format != CONVERTIBLE,
+            "its format is `{format}`; `scripts/convert OLD NEW` writes it as `{FORMAT}`"
+        );
+        ensure!(
+            format == FORMAT,
+            "its format is `{}`; this program reads `{FORMAT}`",
+            shortened(&format)
+        );
         let config = text("config")?;
         let long = config.len();
-        ensure!(long <= LONGEST_CONFIG, "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed");
-        let progress = serde_json::from_str(&text("progress")?)
-            .map_err(|error| anyhow!("its metadata `progress`: {}", shortened(&error.to_string())))?;
+        ensure!(
+            long <= LONGEST_CONFIG,
+            "its configuration has {long} bytes; at most {LONGEST_CONFIG} are allowed"
+        );
+        let progress = serde_json::from_str(&text("progress")?).map_err(|error| {
+            anyhow!("its metadata `progress`: {}", shortened(&error.to_string()))
+        })?;
         let scene = text("scene")?;
         let hand = text("hand")?;
         let provenance = texts.remove("provenance");
         if let Some(key) = texts.keys().next() {
             bail!("its metadata has an unknown `{}`", shortened(key));
         }
-        Ok(Self { config, progress, provenance, scene, hand, arrays })
+        Ok(Self {
+            config,
+            progress,
+            provenance,
+            scene,
+            hand,
+            arrays,
+        })
     }
 
     /// The bytes of a file.
@@ -79,16 +101,26 @@ impl Checkpoint {
             ("scene", &self.scene),
             ("hand", &self.hand),
         ];
-        let provenance = self.provenance.iter().map(|text| ("provenance", text.as_str()));
-        let texts = always.into_iter().chain(provenance).map(|(key, text)| (key.into(), text.into())).collect();
+        let provenance = self
+            .provenance
+            .iter()
+            .map(|text| ("provenance", text.as_str()));
+        let texts = always
+            .into_iter()
+            .chain(provenance)
+            .map(|(key, text)| (key.into(), text.into()))
+            .collect();
         format::to_bytes(texts, &self.arrays)
     }
 
     /// Only the parts that playing needs. The path of a fork's checkpoint is left out. The path of an own scene stays in the
     /// settings, where it tells scenes apart.
     pub fn policy_alone(&self) -> Self {
-        let needed =
-            |name: &str| ["actor.", "critic.", "normalizer.", LOG_STD].iter().any(|part| name.starts_with(part));
+        let needed = |name: &str| {
+            ["actor.", "critic.", "normalizer.", LOG_STD]
+                .iter()
+                .any(|part| name.starts_with(part))
+        };
         let mut alone = self.clone();
         alone.arrays.retain(|name, _| needed(name));
         alone.progress.fork = None;
@@ -106,7 +138,9 @@ impl Checkpoint {
     }
 
     fn take(&mut self, name: &str) -> Result<Array> {
-        self.arrays.remove(name).with_context(|| format!("tensor `{name}` is missing"))
+        self.arrays
+            .remove(name)
+            .with_context(|| format!("tensor `{name}` is missing"))
     }
 
     /// Removes an f64 array of any shape and returns its values.
@@ -114,7 +148,9 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_doubles(&mut self, name: &str) -> Result<Vec<f64>> {
-        let Array::F64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type F64") };
+        let Array::F64(_, values) = self.take(name)? else {
+            bail!("tensor `{name}` must be of type F64")
+        };
         Ok(values)
     }
 
@@ -123,13 +159,19 @@ impl Checkpoint {
     /// # Errors
     /// Fails if the array is missing or of another type.
     pub fn take_counters(&mut self, name: &str) -> Result<Vec<u64>> {
-        let Array::U64(_, values) = self.take(name)? else { bail!("tensor `{name}` must be of type U64") };
+        let Array::U64(_, values) = self.take(name)? else {
+            bail!("tensor `{name}` must be of type U64")
+        };
         Ok(values)
     }
 
     fn take_vector(&mut self, name: &str, size: usize) -> Result<Vec<f64>> {
         let values = self.take_doubles(name)?;
-        ensure!(values.len() == size, "tensor `{name}` has {} values, expected {size}", values.len());
+        ensure!(
+            values.len() == size,
+            "tensor `{name}` has {} values, expected {size}",
+            values.len()
+        );
         Ok(values)
     }
 
@@ -140,7 +182,9 @@ impl Checkpoint {
         for View { name, shape, .. } in views {
             let name = format!("{prefix}{name}");
             self.expect(&name, shape)?;
-            let Array::F32(_, values) = self.take(&name)? else { bail!("tensor `{name}` must be of type F32") };
+            let Array::F32(_, values) = self.take(&name)? else {
+                bail!("tensor `{name}` must be of type F32")
+            };
             all.extend(values);
         }
         Ok(all)
@@ -152,14 +196,22 @@ impl Checkpoint {
     /// Fails if a tensor is missing or of another shape.
     pub fn expect_policy(&self, config: &PpoConfig, spaces: &Spaces) -> Result<()> {
         let layout = ParameterLayout::new(&config.hidden, spaces);
-        layout.views().iter().try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
+        layout
+            .views()
+            .iter()
+            .try_for_each(|View { name, shape, .. }| self.expect(name, shape))?;
         self.expect(LOG_STD, &[spaces.action_size])
     }
 
     fn expect(&self, name: &str, shape: &[usize]) -> Result<()> {
-        let found = self.shape(name).with_context(|| format!("tensor `{name}` is missing"))?;
+        let found = self
+            .shape(name)
+            .with_context(|| format!("tensor `{name}` is missing"))?;
         let [said, expected] = [found, shape].map(|sizes| shortened(&format!("{sizes:?}")));
-        ensure!(found == shape, "tensor `{name}` has the shape {said}, expected {expected}");
+        ensure!(
+            found == shape,
+            "tensor `{name}` has the shape {said}, expected {expected}"
+        );
         Ok(())
     }
 
@@ -175,11 +227,25 @@ impl Checkpoint {
         let count = self.take_vector("normalizer.count", 1)?[0];
         let mean = self.take_vector("normalizer.mean", size)?;
         let variance = self.take_vector("normalizer.variance", size)?;
-        let sound = mean.iter().chain(&variance).chain([&count]).all(|x| x.abs() < 1e18);
-        ensure!(sound, "a tensor `normalizer.…` has a value that no observations can produce");
+        let sound = mean
+            .iter()
+            .chain(&variance)
+            .chain([&count])
+            .all(|x| x.abs() < 1e18);
+        ensure!(
+            sound,
+            "a tensor `normalizer.…` has a value that no observations can produce"
+        );
         let positive = count >= 0.0 && variance.iter().all(|&v| v >= 0.0);
-        ensure!(positive, "tensor `normalizer.variance` or `normalizer.count` has a negative value");
-        policy.normalizer = Normalizer { mean, variance, count };
+        ensure!(
+            positive,
+            "tensor `normalizer.variance` or `normalizer.count` has a negative value"
+        );
+        policy.normalizer = Normalizer {
+            mean,
+            variance,
+            count,
+        };
         Ok(policy)
     }
 
@@ -213,8 +279,13 @@ impl Ppo {
     pub fn save(&self, checkpoint: &mut Checkpoint) {
         let vector = |values: &[f64]| Array::F64(vec![values.len()], values.to_vec());
         let adam = &self.adam;
-        let [mean, square] = [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
-        let kinds = [("", &self.policy.parameters[..]), ("adam.mean.", &mean), ("adam.square.", &square)];
+        let [mean, square] =
+            [&adam.mean, &adam.square].map(|moment| self.slices.all_gathered(moment));
+        let kinds = [
+            ("", &self.policy.parameters[..]),
+            ("adam.mean.", &mean),
+            ("adam.square.", &square),
+        ];
         for View { name, shape, range } in self.policy.layout.views() {
             for (prefix, numbers) in kinds {
                 let array = Array::F32(shape.clone(), numbers[range.clone()].to_vec());
@@ -255,10 +326,17 @@ impl Ppo {
         }
         let steps = checkpoint.take_counters("adam.steps")?;
         // The optimizer counts steps in 32 bits, enough for 2 · 10¹² environment steps of the default configuration.
-        ensure!(steps.len() == 1 && steps[0] <= i32::MAX as u64, "tensor `adam.steps` is not a step count");
+        ensure!(
+            steps.len() == 1 && steps[0] <= i32::MAX as u64,
+            "tensor `adam.steps` is not a step count"
+        );
         self.adam.steps = steps[0];
         self.learning_rate = checkpoint.take_vector("learning_rate", 1)?[0];
-        ensure!(self.learning_rate > 0.0, "its learning rate is {}", self.learning_rate);
+        ensure!(
+            self.learning_rate > 0.0,
+            "its learning rate is {}",
+            self.learning_rate
+        );
         Ok(())
     }
 }
@@ -271,7 +349,12 @@ mod tests {
     use crate::ppo::update::Stage;
     use crate::ranks::Exchange;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 3,
+        action_size: 2,
+        object_and_goal: None,
+        distance: |_, _| 0.0,
+    };
 
     fn config(backend: Backend, hidden: &[usize]) -> PpoConfig {
         let mut config = Config::default().ppo;
@@ -280,44 +363,70 @@ mod tests {
     }
 
     fn learner(hidden: &[usize]) -> Ppo {
-        Ppo::new(&config(Backend::Fused, hidden), SPACES, 0, Exchange::alone(1)).unwrap()
+        Ppo::new(
+            &config(Backend::Fused, hidden),
+            SPACES,
+            0,
+            Exchange::alone(1),
+        )
+        .unwrap()
     }
 
     fn progress() -> Progress {
-        Progress { iteration: 7, env_steps: 99, best: Some([1.5, 0.25]), fork: None, rise: None }
+        Progress {
+            iteration: 7,
+            env_steps: 99,
+            best: Some([1.5, 0.25]),
+            fork: None,
+            rise: None,
+        }
     }
 
     fn saved(ppo: &Ppo) -> Checkpoint {
-        let mut checkpoint = Checkpoint { config: "[env]".into(), progress: progress(), ..Checkpoint::default() };
+        let mut checkpoint = Checkpoint {
+            config: "[env]".into(),
+            progress: progress(),
+            ..Checkpoint::default()
+        };
         ppo.save(&mut checkpoint);
         checkpoint
     }
 
     fn refusal(mut checkpoint: Checkpoint, into: &mut Ppo) -> String {
-        let restored = into.restore(&mut checkpoint).and_then(|()| checkpoint.finish());
+        let restored = into
+            .restore(&mut checkpoint)
+            .and_then(|()| checkpoint.finish());
         format!("{:#}", restored.expect_err("must be refused"))
     }
 
     /// A learner that has taken one optimizer step.
     fn learnt(backend: Backend, seed: u64) -> Ppo {
         let mut ppo = Ppo::new(&config(backend, &[8]), SPACES, seed, Exchange::alone(1)).unwrap();
-        ppo.policy.see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);
+        ppo.policy
+            .see(&[&[1.0, 2.0, 3.0, 5.0, 7.0, 11.0]], &ppo.exchange);
         ppo.learning_rate = 0.123;
         let rollout = Rollout::new(4, &[8], &SPACES);
         let samples: Vec<u32> = (0..32).collect();
         ppo.backend.begin(&ppo.policy, &rollout);
-        ppo.minibatch_step(&rollout, &samples, Stage::First).unwrap();
+        ppo.minibatch_step(&rollout, &samples, Stage::First)
+            .unwrap();
         ppo
     }
 
     #[test]
     fn what_is_saved_is_what_is_restored_by_either_backend() {
-        for [backend, other] in [[Backend::Fused, Backend::Candle], [Backend::Candle, Backend::Fused]] {
+        for [backend, other] in [
+            [Backend::Fused, Backend::Candle],
+            [Backend::Candle, Backend::Fused],
+        ] {
             let from = learnt(backend, 1);
             let bytes = saved(&from).to_bytes().unwrap();
             for mut to in [learnt(backend, 2), learnt(other, 3)] {
                 let mut checkpoint = Checkpoint::parse(&bytes).unwrap();
-                assert_eq!((checkpoint.config.as_str(), &checkpoint.progress), ("[env]", &progress()));
+                assert_eq!(
+                    (checkpoint.config.as_str(), &checkpoint.progress),
+                    ("[env]", &progress())
+                );
                 to.restore(&mut checkpoint).unwrap();
                 checkpoint.finish().unwrap();
                 assert_eq!(to.policy.normalizer, from.policy.normalizer);
@@ -331,7 +440,11 @@ mod tests {
     #[test]
     fn a_policy_alone_plays_and_cannot_be_trained_on() {
         let from = learnt(Backend::Fused, 1);
-        let alone = Checkpoint { provenance: Some("{}".into()), ..saved(&from) }.policy_alone();
+        let alone = Checkpoint {
+            provenance: Some("{}".into()),
+            ..saved(&from)
+        }
+        .policy_alone();
         let bytes = alone.to_bytes().unwrap();
         assert!(bytes.len() < saved(&from).to_bytes().unwrap().len() * 2 / 3);
         let read = Checkpoint::parse(&bytes).unwrap();
@@ -339,15 +452,21 @@ mod tests {
         let policy = Policy::load(&config(Backend::Fused, &[8]), SPACES, &read).unwrap();
         assert_eq!(policy.normalizer, from.policy.normalizer);
         assert_eq!(policy.parameters, from.policy.parameters);
-        assert!(refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing"));
+        assert!(
+            refusal(read, &mut learner(&[8])).contains("`adam.mean.actor.0.weight` is missing")
+        );
     }
 
     #[test]
     fn a_learner_begins_with_the_policy_of_another_and_nothing_else_of_it() {
         let from = learnt(Backend::Fused, 1);
-        let mut to = Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Exchange::alone(1)).unwrap();
+        let mut to =
+            Ppo::new(&config(Backend::Fused, &[8]), SPACES, 5, Exchange::alone(1)).unwrap();
         to.begin_with(&saved(&from)).unwrap();
-        assert_eq!(saved(&to).policy_alone().arrays, saved(&from).policy_alone().arrays);
+        assert_eq!(
+            saved(&to).policy_alone().arrays,
+            saved(&from).policy_alone().arrays
+        );
         let fresh = config(Backend::Fused, &[8]).learning_rate;
         assert_eq!((to.learning_rate, to.adam.steps), (fresh, 0));
         assert!(learner(&[9]).begin_with(&saved(&from)).is_err());
@@ -357,21 +476,40 @@ mod tests {
     fn other_shapes_and_names_are_refused_by_name() {
         let checkpoint = saved(&learner(&[8]));
         let wider = refusal(checkpoint.clone(), &mut learner(&[9]));
-        assert!(wider.contains("`actor.0.weight` has the shape [8, 3], expected [9, 3]"), "{wider}");
+        assert!(
+            wider.contains("`actor.0.weight` has the shape [8, 3], expected [9, 3]"),
+            "{wider}"
+        );
         let deeper = refusal(checkpoint.clone(), &mut learner(&[8, 2]));
-        assert!(deeper.contains("`actor.1.weight` has the shape [2, 8]") || deeper.contains("is missing"), "{deeper}");
+        assert!(
+            deeper.contains("`actor.1.weight` has the shape [2, 8]")
+                || deeper.contains("is missing"),
+            "{deeper}"
+        );
         let mut more = checkpoint.clone();
         more.insert("actor.9.weight", Array::F32(vec![1], vec![0.0]));
         let refused = refusal(more.clone(), &mut learner(&[8]));
-        assert!(refused.contains("`actor.9.weight` is not part of this policy"), "{refused}");
+        assert!(
+            refused.contains("`actor.9.weight` is not part of this policy"),
+            "{refused}"
+        );
         assert!(Policy::load(&config(Backend::Fused, &[8]), SPACES, &more).is_err());
         let mut negative = checkpoint;
-        negative.insert("adam.square.actor.1.bias", Array::F32(vec![2], vec![0.0, -1.0]));
+        negative.insert(
+            "adam.square.actor.1.bias",
+            Array::F32(vec![2], vec![0.0, -1.0]),
+        );
         let refused = refusal(negative.clone(), &mut learner(&[8]));
-        assert!(refused.contains("`adam.square.actor.1.bias` has a negative value"), "{refused}");
+        assert!(
+            refused.contains("`adam.square.actor.1.bias` has a negative value"),
+            "{refused}"
+        );
         negative.insert(LOG_STD, Array::F32(vec![2], vec![-1.0, -2.0]));
         let refused = refusal(negative, &mut learner(&[8]));
-        assert!(refused.contains("`log_std` must hold the same F32 value for each action"), "{refused}");
+        assert!(
+            refused.contains("`log_std` must hold the same F32 value for each action"),
+            "{refused}"
+        );
     }
 
     #[test]
@@ -386,6 +524,12 @@ mod tests {
     fn weights_that_are_not_finite_are_not_saved() {
         let mut ppo = learner(&[8]);
         ppo.policy.normalizer.mean[0] = f64::NAN;
-        assert!(saved(&ppo).to_bytes().unwrap_err().to_string().contains("normalizer.mean"));
+        assert!(
+            saved(&ppo)
+                .to_bytes()
+                .unwrap_err()
+                .to_string()
+                .contains("normalizer.mean")
+        );
     }
 }

@@ -53,12 +53,18 @@ pub type Arrays = BTreeMap<String, Array>;
 pub fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
     let mut parts = Vec::new();
     for (name, array) in arrays {
-        ensure!(array.is_finite(), "`{name}` is not finite and cannot be saved");
+        ensure!(
+            array.is_finite(),
+            "`{name}` is not finite and cannot be saved"
+        );
         parts.push((name, array.bytes(), array.shape()));
     }
     let mut views = Vec::new();
     for (name, (kind, bytes), shape) in &parts {
-        views.push((name.to_string(), TensorView::new(*kind, shape.to_vec(), bytes)?));
+        views.push((
+            name.to_string(),
+            TensorView::new(*kind, shape.to_vec(), bytes)?,
+        ));
     }
     seal(texts, views)
 }
@@ -69,9 +75,17 @@ pub fn to_bytes(texts: Texts, arrays: &Arrays) -> Result<Vec<u8>> {
 /// Fails if the bytes were not written by [`to_bytes`], or with [`Damaged`] if they were changed since.
 pub fn parse(bytes: &[u8]) -> Result<(Texts, Arrays)> {
     let (mut texts, views) = read(bytes)?;
-    let stored = texts.remove(CHECKSUM).context("no checksum: not a file of this program")?;
+    let stored = texts
+        .remove(CHECKSUM)
+        .context("no checksum: not a file of this program")?;
     let found = checksum(&texts, &views);
-    ensure!(stored == found, Damaged(format!("damaged: its checksum is {found} instead of {}", shortened(&stored))));
+    ensure!(
+        stored == found,
+        Damaged(format!(
+            "damaged: its checksum is {found} instead of {}",
+            shortened(&stored)
+        ))
+    );
     let mut arrays = Arrays::new();
     for (name, view) in views {
         let array = Array::read(&view).with_context(|| format!("tensor `{}`", shortened(&name)))?;
@@ -85,10 +99,15 @@ pub fn parse(bytes: &[u8]) -> Result<(Texts, Arrays)> {
 fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
     texts.insert(CHECKSUM.into(), checksum(&texts, &views));
     let mut bytes = safetensors::serialize(views, Some(texts.into_iter().collect()))?;
-    let (length, rest) = bytes.split_first_chunk_mut().context("a file begins with the length of its header")?;
+    let (length, rest) = bytes
+        .split_first_chunk_mut()
+        .context("a file begins with the length of its header")?;
     let header = &mut rest[..u64::from_le_bytes(*length) as usize];
     let mut parsed: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(header)?;
-    parsed.values_mut().filter_map(serde_json::Value::as_object_mut).for_each(serde_json::Map::sort_keys);
+    parsed
+        .values_mut()
+        .filter_map(serde_json::Value::as_object_mut)
+        .for_each(serde_json::Map::sort_keys);
     let sorted = serde_json::to_vec(&parsed)?;
     header.fill(b' ');
     header[..sorted.len()].copy_from_slice(&sorted);
@@ -100,10 +119,21 @@ fn seal(mut texts: Texts, views: Vec<(String, TensorView)>) -> Result<Vec<u8>> {
 /// # Errors
 /// Fails if the bytes do not begin like a safetensors file.
 fn expect_safetensors(bytes: &[u8]) -> Result<()> {
-    ensure!(!bytes.starts_with(b"version "), "a Git LFS pointer: `git lfs pull` fetches the file itself");
-    ensure!(!(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)), "an ONNX file, not a safetensors file");
-    let length = bytes.first_chunk().map_or(1, |length| u64::from_le_bytes(*length));
-    ensure!((1..=LARGEST_HEADER).contains(&length), Damaged("not a safetensors file".into()));
+    ensure!(
+        !bytes.starts_with(b"version "),
+        "a Git LFS pointer: `git lfs pull` fetches the file itself"
+    );
+    ensure!(
+        !(bytes.starts_with(&[8]) && bytes.get(2) == Some(&0x12)),
+        "an ONNX file, not a safetensors file"
+    );
+    let length = bytes
+        .first_chunk()
+        .map_or(1, |length| u64::from_le_bytes(*length));
+    ensure!(
+        (1..=LARGEST_HEADER).contains(&length),
+        Damaged("not a safetensors file".into())
+    );
     Ok(())
 }
 
@@ -112,10 +142,15 @@ fn read(bytes: &[u8]) -> Result<(Texts, Vec<(String, TensorView<'_>)>)> {
     expect_safetensors(bytes)?;
     let whole = |error: SafeTensorError| {
         let reason = shortened(&error.to_string());
-        Damaged(format!("not a complete safetensors file ({reason}); it may be cut off"))
+        Damaged(format!(
+            "not a complete safetensors file ({reason}); it may be cut off"
+        ))
     };
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(whole)?;
-    let texts = header.metadata().clone().context("no metadata: not a file of this program")?;
+    let texts = header
+        .metadata()
+        .clone()
+        .context("no metadata: not a file of this program")?;
     let mut views = SafeTensors::deserialize(bytes).map_err(whole)?.tensors();
     views.sort_by(|(a, _), (b, _)| a.cmp(b));
     Ok((texts.into_iter().collect(), views))
@@ -145,7 +180,9 @@ fn checksum(texts: &Texts, views: &[(String, TensorView)]) -> String {
     for (name, view) in views {
         take(name.as_bytes());
         take(view.dtype().to_string().as_bytes());
-        view.shape().iter().for_each(|size| take(&(*size as u64).to_le_bytes()));
+        view.shape()
+            .iter()
+            .for_each(|size| take(&(*size as u64).to_le_bytes()));
         take(view.data());
     }
     format!("{:08x}", hasher.finalize())
@@ -157,9 +194,18 @@ impl Array {
         let (words, _) = view.data().as_chunks::<4>();
         let (longs, _) = view.data().as_chunks::<8>();
         let array = match view.dtype() {
-            Dtype::F32 => Self::F32(shape, words.iter().map(|word| f32::from_le_bytes(*word)).collect()),
-            Dtype::F64 => Self::F64(shape, longs.iter().map(|long| f64::from_le_bytes(*long)).collect()),
-            Dtype::U64 => Self::U64(shape, longs.iter().map(|long| u64::from_le_bytes(*long)).collect()),
+            Dtype::F32 => Self::F32(
+                shape,
+                words.iter().map(|word| f32::from_le_bytes(*word)).collect(),
+            ),
+            Dtype::F64 => Self::F64(
+                shape,
+                longs.iter().map(|long| f64::from_le_bytes(*long)).collect(),
+            ),
+            Dtype::U64 => Self::U64(
+                shape,
+                longs.iter().map(|long| u64::from_le_bytes(*long)).collect(),
+            ),
             other => bail!("has the type {other:?}, expected F32, F64 or U64"),
         };
         ensure!(array.is_finite(), "has a value that is infinite or NaN");
@@ -169,9 +215,18 @@ impl Array {
     /// The type of the values, and their bytes.
     fn bytes(&self) -> (Dtype, Vec<u8>) {
         match self {
-            Self::F32(_, values) => (Dtype::F32, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
-            Self::F64(_, values) => (Dtype::F64, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
-            Self::U64(_, values) => (Dtype::U64, values.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Self::F32(_, values) => (
+                Dtype::F32,
+                values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            ),
+            Self::F64(_, values) => (
+                Dtype::F64,
+                values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            ),
+            Self::U64(_, values) => (
+                Dtype::U64,
+                values.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            ),
         }
     }
 
@@ -202,7 +257,10 @@ mod tests {
             ("mean", Array::F64(vec![2], vec![0.1, 0.2])),
         ];
         let texts = Texts::from([("config".into(), "a = 1".into())]);
-        (texts, arrays.map(|(name, array)| (name.to_owned(), array)).into())
+        (
+            texts,
+            arrays.map(|(name, array)| (name.to_owned(), array)).into(),
+        )
     }
 
     fn written((texts, arrays): (Texts, Arrays)) -> Vec<u8> {
@@ -215,7 +273,10 @@ mod tests {
 
     /// The position of these bytes in the file.
     fn find(bytes: &[u8], part: &[u8]) -> usize {
-        bytes.windows(part.len()).position(|window| window == part).expect("it is in the file")
+        bytes
+            .windows(part.len())
+            .position(|window| window == part)
+            .expect("it is in the file")
     }
 
     #[test]
@@ -269,7 +330,10 @@ mod tests {
     #[test]
     fn what_is_no_safetensors_file_is_called_what_it_is() {
         for (text, what) in [
-            (&b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"[..], "a Git LFS pointer"),
+            (
+                &b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"[..],
+                "a Git LFS pointer",
+            ),
             (b"\x08\x08\x12\x0dshadow-repose", "an ONNX file"),
             (b"<!DOCTYPE html><html></html>", "not a safetensors file"),
             (b"PK\x03\x04\x14\x00\x00\x00\x08", "not a safetensors file"),
@@ -284,12 +348,21 @@ mod tests {
     #[test]
     fn numbers_that_are_not_finite_are_neither_written_nor_read() {
         let mut bad = content();
-        bad.1.insert("weight".into(), Array::F32(vec![1], vec![f32::NAN]));
-        assert!(to_bytes(bad.0, &bad.1).unwrap_err().to_string().contains("`weight` is not finite"));
+        bad.1
+            .insert("weight".into(), Array::F32(vec![1], vec![f32::NAN]));
+        assert!(
+            to_bytes(bad.0, &bad.1)
+                .unwrap_err()
+                .to_string()
+                .contains("`weight` is not finite")
+        );
         let mut bytes = written(content());
         let at = find(&bytes, &0.2_f64.to_le_bytes());
         bytes[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
         assert!(refusal(&bytes).contains("checksum"));
-        assert!(refusal(&sealed(&bytes).unwrap()).contains("tensor `mean`: has a value that is infinite or NaN"));
+        assert!(
+            refusal(&sealed(&bytes).unwrap())
+                .contains("tensor `mean`: has a value that is infinite or NaN")
+        );
     }
 }

@@ -31,16 +31,31 @@ pub struct Fused {
 }
 
 /// A job: the samples of a group, a net, what computes the gradient of its outputs, and the place for the gradient of its parameters.
-type Job<'a> = (&'a [u32], &'a Net<'a>, fn(&Loss<'a>, &[u32], &[f32], &mut [f32], &mut Sums), &'a mut [f32]);
+type Job<'a> = (
+    &'a [u32],
+    &'a Net<'a>,
+    fn(&Loss<'a>, &[u32], &[f32], &mut [f32], &mut Sums),
+    &'a mut [f32],
+);
 
 impl Fused {
     /// Creates the backend with these settings.
     pub fn new(config: &PpoConfig, arithmetic: Arithmetic) -> Self {
-        Self { config: config.clone(), arithmetic, workspaces: Vec::new(), seen: Vec::new() }
+        Self {
+            config: config.clone(),
+            arithmetic,
+            workspaces: Vec::new(),
+            seen: Vec::new(),
+        }
     }
 
     /// Passes the samples of a job forward and backward through its net, `rows` of them at a time.
-    fn pass<'a>(&self, loss: &Loss<'a>, rows: usize, (group, net, of_outputs, gradient): Job<'a>) -> Losses {
+    fn pass<'a>(
+        &self,
+        loss: &Loss<'a>,
+        rows: usize,
+        (group, net, of_outputs, gradient): Job<'a>,
+    ) -> Losses {
         let mut sums = loss.of_none();
         let thread = rayon::current_thread_index().expect("runs on a rayon thread");
         let work = &mut *self.workspaces[thread].lock().expect("no job has panicked");
@@ -68,7 +83,9 @@ impl GradientBackend for Fused {
         for raw in rollout.blocks.iter().map(RolloutBlock::acted_on) {
             parts.push((raw, rest.split_off_mut(..raw.len()).expect("room for all")));
         }
-        parts.into_par_iter().for_each(|(raw, seen)| perception.apply(raw, seen));
+        parts
+            .into_par_iter()
+            .for_each(|(raw, seen)| perception.apply(raw, seen));
     }
 
     fn gradients(
@@ -80,7 +97,8 @@ impl GradientBackend for Fused {
         gradients: &mut Vec<Vec<f32>>,
     ) -> Result<Vec<Losses>> {
         let workspace = || Mutex::new(Workspace::new(&policy.layout.actor, ROWS, self.arithmetic));
-        self.workspaces.resize_with(rayon::current_num_threads(), workspace);
+        self.workspaces
+            .resize_with(rayon::current_num_threads(), workspace);
         // The rows that pass through a net together: blocks of equal size as far as possible.
         let samples = groups.iter().map(|group| group.len()).max().unwrap_or(0);
         let rows = samples.div_ceil(samples.div_ceil(ROWS));
@@ -94,7 +112,11 @@ impl GradientBackend for Fused {
             jobs.push((group, actor, Loss::actor, for_actor));
             jobs.push((group, critic, Loss::critic, for_critic));
         }
-        let losses: Vec<Losses> = jobs.into_par_iter().with_max_len(1).map(|job| self.pass(&loss, rows, job)).collect();
+        let losses: Vec<Losses> = jobs
+            .into_par_iter()
+            .with_max_len(1)
+            .map(|job| self.pass(&loss, rows, job))
+            .collect();
         Ok(losses.chunks(2).map(|nets| nets[0] + nets[1]).collect())
     }
 }

@@ -11,7 +11,14 @@ use super::rollout::RolloutBlock;
 ///
 /// J. Schulman et al., "High-dimensional continuous control using generalized advantage estimation" (2016), eq. 16.
 pub fn gae(block: &mut RolloutBlock, gamma: f32, lambda: f32) {
-    let RolloutBlock { rewards, values, dones, advantages, returns, .. } = block;
+    let RolloutBlock {
+        rewards,
+        values,
+        dones,
+        advantages,
+        returns,
+        ..
+    } = block;
     let envs = values.len() - rewards.len();
     for env in 0..envs {
         let mut advantage = 0.0;
@@ -33,8 +40,15 @@ mod tests {
 
     /// A block of three steps.
     fn block(rewards: &[f32], values: &[f32], dones: &[bool]) -> RolloutBlock {
-        let spaces = Spaces { observation_size: 1, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
-        let mut block = Rollout::new(3, &[rewards.len() / 3], &spaces).blocks.remove(0);
+        let spaces = Spaces {
+            observation_size: 1,
+            action_size: 1,
+            object_and_goal: None,
+            distance: |_, _| 0.0,
+        };
+        let mut block = Rollout::new(3, &[rewards.len() / 3], &spaces)
+            .blocks
+            .remove(0);
         block.rewards.copy_from_slice(rewards);
         block.values.copy_from_slice(values);
         block.dones.copy_from_slice(dones);
@@ -46,7 +60,11 @@ mod tests {
         // Two environments, three steps, γ = 0.5, λ = 0.5. The second environment ends with step 1.
         let rewards = [1.0, 1.0, 2.0, 2.0, 3.0, 3.0];
         let values = [4.0, 4.0, 8.0, 8.0, 2.0, 2.0, 6.0, 6.0];
-        let mut block = block(&rewards, &values, &[false, false, false, true, false, false]);
+        let mut block = block(
+            &rewards,
+            &values,
+            &[false, false, false, true, false, false],
+        );
         gae(&mut block, 0.5, 0.5);
         // First:  δ2 = 3 + 3 - 2 = 4, δ1 = 2 + 1 - 8 = -5, δ0 = 1 + 4 - 4 = 1; A2 = 4, A1 = -5 + 4/4 = -4, A0 = 1 - 4/4 = 0
         // Second: δ2 = 4, δ1 = 2 - 8 = -6 (nothing after the end), δ0 = 1; A2 = 4, A1 = -6, A0 = 1 - 6/4 = -0.5

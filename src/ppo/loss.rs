@@ -59,14 +59,21 @@ impl<'a> Loss<'a> {
 
     /// The sums over no samples.
     pub fn of_none(&self) -> Sums {
-        Sums { losses: Losses::default(), squared_shifts: vec![0.0; self.action_size] }
+        Sums {
+            losses: Losses::default(),
+            squared_shifts: vec![0.0; self.action_size],
+        }
     }
 
     /// The losses of a group, given the sums of [`Loss::actor`] or [`Loss::critic`].
     pub fn of_group(&self, sums: &Sums) -> Losses {
         // The divergence of Gaussians with the same standard deviation.
         let variance = (2.0 * f64::from(self.log_std)).exp();
-        let kl = sums.squared_shifts.iter().map(|&shift| 0.5 * f64::from(shift) / variance).sum();
+        let kl = sums
+            .squared_shifts
+            .iter()
+            .map(|&shift| 0.5 * f64::from(shift) / variance)
+            .sum();
         Losses { kl, ..sums.losses }
     }
 
@@ -82,8 +89,17 @@ impl<'a> Loss<'a> {
     }
 
     #[inline(always)]
-    fn actor_sample(&self, (block, i): (&RolloutBlock, usize), mean: &[f32], grad: &mut [f32], sums: &mut Sums) {
-        let Sums { losses: sums, squared_shifts } = sums;
+    fn actor_sample(
+        &self,
+        (block, i): (&RolloutBlock, usize),
+        mean: &[f32],
+        grad: &mut [f32],
+        sums: &mut Sums,
+    ) {
+        let Sums {
+            losses: sums,
+            squared_shifts,
+        } = sums;
         let row = RolloutBlock::row(mean.len(), i);
         let inverse_scale = 1.0 / block.noise_scales[i];
         // `grad` first holds the distances from the mean in standard deviations, and then the gradient.
@@ -117,7 +133,11 @@ impl<'a> Loss<'a> {
         let free = ratio * advantage;
         let bounded = ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage;
         // A NaN ratio takes the second branch and makes the sum NaN.
-        if free <= bounded { (free, -self.sample_weight * free) } else { (bounded, 0.0) }
+        if free <= bounded {
+            (free, -self.sample_weight * free)
+        } else {
+            (bounded, 0.0)
+        }
     }
 
     /// Writes the gradient `[m]` with respect to the `values` `[m]` of these samples.
@@ -131,8 +151,11 @@ impl<'a> Loss<'a> {
             let bounded = old + step - target;
             let inside = (value - old).abs() <= self.value_clip;
             // Where clipping the step makes the error larger, the error does not depend on the value.
-            let (error, slope) =
-                if inside || free * free >= bounded * bounded { (free, 2.0 * free) } else { (bounded, 0.0) };
+            let (error, slope) = if inside || free * free >= bounded * bounded {
+                (free, 2.0 * free)
+            } else {
+                (bounded, 0.0)
+            };
             sums.losses.value_error += f64::from(error * error);
             *grad = self.value_coef * self.sample_weight * slope;
         }
@@ -146,15 +169,26 @@ mod tests {
     use crate::spaces::Spaces;
 
     fn assert_close(found: &[f32], expected: &[f32]) {
-        let close = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
-        assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
+        let close = found
+            .iter()
+            .zip(expected)
+            .all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
+        assert!(
+            close && found.len() == expected.len(),
+            "{found:?} instead of {expected:?}"
+        );
     }
 
     /// The expected values come from the formulas of the PyTorch program in `candle/loss.rs`, in doubles, with gradients by
     /// central differences. Both actions have a standard deviation with the logarithm -0.5.
     #[test]
     fn losses_and_gradients_are_those_of_the_formulas() {
-        let spaces = Spaces { observation_size: 1, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
+        let spaces = Spaces {
+            observation_size: 1,
+            action_size: 2,
+            object_and_goal: None,
+            distance: |_, _| 0.0,
+        };
         let mut rollout = Rollout::new(1, &[3], &spaces);
         let block = &mut rollout.blocks[0];
         block.actions = vec![0.5, -1.0, -0.3, 0.9, 0.2, 1.5];
@@ -167,7 +201,8 @@ mod tests {
         for (i, log_prob) in block.log_probs.iter_mut().enumerate() {
             let std = block.noise_scales[i] * log_std.exp();
             let z = [0, 1].map(|j| (block.actions[2 * i + j] - block.means[2 * i + j]) / std);
-            *log_prob = -0.5 * (z[0] * z[0] + z[1] * z[1]) - 2.0 * log_std - std::f32::consts::TAU.ln();
+            *log_prob =
+                -0.5 * (z[0] * z[0] + z[1] * z[1]) - 2.0 * log_std - std::f32::consts::TAU.ln();
         }
         let mut config = Config::default().ppo;
         (config.clip, config.value_clip) = (0.2, 0.3);
@@ -178,8 +213,16 @@ mod tests {
         let loss = Loss::new(&policy, &rollout, 3, &config);
         let (mut actor, mut critic) = (loss.of_none(), loss.of_none());
         let mut grad = [0.0; 6];
-        loss.actor(&[0, 1, 2], &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8], &mut grad, &mut actor);
-        assert_close(&grad, &[0.0, 0.0, 0.130_386_1, -0.097_789_58, 6.613_660_5, 7.715_937]);
+        loss.actor(
+            &[0, 1, 2],
+            &[0.1, -0.2, 0.5, 0.3, -0.4, 0.8],
+            &mut grad,
+            &mut actor,
+        );
+        assert_close(
+            &grad,
+            &[0.0, 0.0, 0.130_386_1, -0.097_789_58, 6.613_660_5, 7.715_937],
+        );
         let mut grad = [0.0; 3];
         loss.critic(&[0, 1, 2], &[0.3, -0.6, 1.4], &mut grad, &mut critic);
         assert_close(&grad, &[-0.266_666_65, -0.933_333_4, 0.0]);
@@ -198,10 +241,16 @@ mod tests {
             grad
         });
         assert!((actor.losses.excess - 0.25).abs() < 1e-6);
-        let config = PpoConfig { bounds_coef: 0.0, ..config.clone() };
+        let config = PpoConfig {
+            bounds_coef: 0.0,
+            ..config.clone()
+        };
         let mut free = [0.0; 2];
         let loss = Loss::new(&policy, &rollout, 3, &config);
         loss.actor(&[2], &[1.5, -0.2], &mut free, &mut actor);
-        assert_close(&[grads[0][0] - free[0], grads[0][1] - free[1]], &[0.5 / 3.0, 0.0]);
+        assert_close(
+            &[grads[0][0] - free[0], grads[0][1] - free[1]],
+            &[0.5 / 3.0, 0.0],
+        );
     }
 }

@@ -21,40 +21,60 @@ const LIMIT: f64 = 5.0;
 ///
 /// # Errors
 /// Fails if a loss or gradient is not finite.
-pub fn time_gradient_steps(ppo: &mut Ppo, rollout: &mut Rollout, repeats: usize) -> Result<(Vec<f64>, Option<f64>)> {
+pub fn time_gradient_steps(
+    ppo: &mut Ppo,
+    rollout: &mut Rollout,
+    repeats: usize,
+) -> Result<(Vec<f64>, Option<f64>)> {
     ppo.prepare(rollout);
     ppo.backend.begin(&ppo.policy, rollout);
     // Samples from the whole rollout, as in a shuffled minibatch.
     let samples = rollout.samples();
     let step = samples / ppo.config.minibatch_of(samples, rollout.horizon);
-    let minibatch: Vec<u32> = (0..samples as u32).step_by(step).take(samples / step).collect();
+    let minibatch: Vec<u32> = (0..samples as u32)
+        .step_by(step)
+        .take(samples / step)
+        .collect();
     let mut seconds = Vec::new();
     let mut all = 0.0;
     let before = os::processor_seconds();
     while seconds.len() < repeats && (seconds.len() < 3 || all < LIMIT) {
         let taken = rayon::scope(|_| {
             let start = Instant::now();
-            ppo.minibatch_step(rollout, &minibatch, Stage::Later).map(|_| start.elapsed())
+            ppo.minibatch_step(rollout, &minibatch, Stage::Later)
+                .map(|_| start.elapsed())
         });
         let taken = taken?.as_secs_f64();
         all += taken;
         seconds.push(taken);
     }
-    let worked = os::processor_seconds().zip(before).map(|(after, before)| after - before);
+    let worked = os::processor_seconds()
+        .zip(before)
+        .map(|(after, before)| after - before);
     let of_threads = all * rayon::current_num_threads() as f64;
-    Ok((seconds, worked.map(|worked| (1.0 - worked / of_threads).max(0.0))))
+    Ok((
+        seconds,
+        worked.map(|worked| (1.0 - worked / of_threads).max(0.0)),
+    ))
 }
 
 /// The matrix products of one forward and backward pass: sizes of weights `[outputs, inputs]`, and whether the
 /// gradient of the inputs is needed. It is not needed for observations.
 fn products(policy: &Policy) -> impl Iterator<Item = (usize, usize, bool)> {
     let nets = [&policy.layout.actor, &policy.layout.critic];
-    nets.into_iter().flat_map(|layers| layers.iter().enumerate().map(|(i, layer)| (layer.outputs, layer.inputs, i > 0)))
+    nets.into_iter().flat_map(|layers| {
+        layers
+            .iter()
+            .enumerate()
+            .map(|(i, layer)| (layer.outputs, layer.inputs, i > 0))
+    })
 }
 
 /// The number of floating-point operations of these products for one sample, both nets.
 pub fn flops_per_sample(policy: &Policy) -> f64 {
-    products(policy).map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64).sum()
+    products(policy)
+        .map(|(o, i, inner)| (if inner { 6 } else { 4 } * o * i) as f64)
+        .sum()
 }
 
 /// Times the matrix products of one forward and backward pass of the policy on `samples` samples, on all threads. Their
@@ -63,7 +83,10 @@ pub fn matmul_gflops(ppo: &Ppo, samples: usize, repeats: usize) -> Vec<f64> {
     let policy = &ppo.policy;
     let arithmetic = ppo.arithmetic;
     let blocks = samples.div_ceil(ROWS);
-    let widest = products(policy).map(|(o, i, _)| o.max(i)).max().expect("a policy has layers");
+    let widest = products(policy)
+        .map(|(o, i, _)| o.max(i))
+        .max()
+        .expect("a policy has layers");
     let pass = |_: usize| {
         let x = vec![0.5f32; ROWS * widest];
         let dz = vec![0.1f32; ROWS * widest];

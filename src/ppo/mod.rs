@@ -85,7 +85,9 @@ impl Ppo {
         let arithmetic = Arithmetic::new(config.precision)?;
         let backend: Box<dyn GradientBackend> = match config.backend {
             Backend::Fused => Box::new(Fused::new(config, arithmetic)),
-            Backend::Candle => Box::new(Reference { config: config.clone() }),
+            Backend::Candle => Box::new(Reference {
+                config: config.clone(),
+            }),
         };
         let count = policy.layout.count();
         let slices = exchange.slices(norm_chunks(&policy.layout.nets()));
@@ -109,13 +111,20 @@ impl Ppo {
     /// A checksum (CRC-32) of all parameters.
     pub fn checksum(&self) -> u32 {
         let mut hasher = crc32fast::Hasher::new();
-        self.policy.parameters.iter().for_each(|x| hasher.update(&x.to_le_bytes()));
+        self.policy
+            .parameters
+            .iter()
+            .for_each(|x| hasher.update(&x.to_le_bytes()));
         hasher.finalize()
     }
 
     /// Creates a rollout of the first horizon for blocks with these numbers of environments.
     pub fn rollout(&self, block_sizes: &[usize]) -> Rollout {
-        Rollout::new(self.config.first_horizon(), block_sizes, &self.policy.spaces)
+        Rollout::new(
+            self.config.first_horizon(),
+            block_sizes,
+            &self.policy.spaces,
+        )
     }
 
     /// Sets the standard deviations of the actions, the desired KL divergence and the horizon of the rollout. All follow
@@ -131,7 +140,9 @@ impl Ppo {
 
     /// Begins a fork of another run after this iteration.
     pub fn begin_after(&mut self, iteration: u64) {
-        self.actor_from = iteration.saturating_add(self.config.critic_first).saturating_add(1);
+        self.actor_from = iteration
+            .saturating_add(self.config.critic_first)
+            .saturating_add(1);
     }
 
     /// Whether only the critic learns in this iteration.
@@ -148,7 +159,11 @@ impl Ppo {
     pub fn acting(&self) -> Acting<'_> {
         let away_std = self.config.away_std.at(self.env_steps) as f32;
         let away_scale = (away_std / self.policy.std()).max(1.0);
-        Acting { frozen: self.policy.freeze_for(self.arithmetic), config: &self.config, away_scale }
+        Acting {
+            frozen: self.policy.freeze_for(self.arithmetic),
+            config: &self.config,
+            away_scale,
+        }
     }
 
     /// The generator of the action noise for a block of environments in an iteration.

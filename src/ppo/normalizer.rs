@@ -22,19 +22,32 @@ pub struct Normalizer {
 impl Normalizer {
     /// Creates a normaliser that has seen nothing and leaves observations of `size` values almost unchanged.
     pub fn new(size: usize) -> Self {
-        Self { mean: vec![0.0; size], variance: vec![1.0; size], count: 0.0 }
+        Self {
+            mean: vec![0.0; size],
+            variance: vec![1.0; size],
+            count: 0.0,
+        }
     }
 
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the statistics. `perceive` is first applied to each row.
     ///
     /// T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
     /// variances" (1979), eq. 2.1.
-    pub fn update(&mut self, arrays: &[&[f32]], exchange: &Exchange, perceive: impl Fn(&mut [f32]) + Sync) {
+    pub fn update(
+        &mut self,
+        arrays: &[&[f32]],
+        exchange: &Exchange,
+        perceive: impl Fn(&mut [f32]) + Sync,
+    ) {
         let size = self.mean.len();
         let rows = exchange.of_all(arrays.iter().map(|array| array.len() / size).sum()) as f64;
         let mean_of = |f: fn(f64, f64) -> f64, means: &[f64]| -> Vec<f64> {
             let sums = |arrays: &[&[f32]]| column_sums(arrays, means, &perceive, f);
-            exchange.sum(arrays, sums, add).into_iter().map(|total| total / rows).collect()
+            exchange
+                .sum(arrays, sums, add)
+                .into_iter()
+                .map(|total| total / rows)
+                .collect()
         };
         let mean = mean_of(|x, _| x, &vec![0.0; size]);
         let variance = mean_of(|x, mean| (x - mean).powi(2), &mean);
@@ -42,7 +55,8 @@ impl Normalizer {
         for i in 0..size {
             let delta = mean[i] - self.mean[i];
             let between = delta * delta * self.count * rows / total;
-            self.variance[i] = (self.variance[i] * self.count + variance[i] * rows + between) / total;
+            self.variance[i] =
+                (self.variance[i] * self.count + variance[i] * rows + between) / total;
             self.mean[i] += delta * rows / total;
         }
         self.count = total;
@@ -71,7 +85,10 @@ fn column_sums(
         });
         sums
     };
-    let tasks: Vec<&[f32]> = arrays.iter().flat_map(|array| array.chunks(ROWS_PER_TASK * size)).collect();
+    let tasks: Vec<&[f32]> = arrays
+        .iter()
+        .flat_map(|array| array.chunks(ROWS_PER_TASK * size))
+        .collect();
     let partial: Vec<Vec<f64>> = tasks.into_par_iter().map(of_task).collect();
     partial.into_iter().reduce(add).expect("a row")
 }
@@ -91,14 +108,28 @@ mod tests {
         let mut rng = rng::stream(0, "test", 0);
         // The second column is far from zero: a naive sum of squares would lose its variance.
         let rows: Vec<f32> = (0..5000)
-            .flat_map(|_| [rng::uniform(&mut rng, -1.0, 3.0) as f32, rng::uniform(&mut rng, 4000.0, 4001.0) as f32])
+            .flat_map(|_| {
+                [
+                    rng::uniform(&mut rng, -1.0, 3.0) as f32,
+                    rng::uniform(&mut rng, 4000.0, 4001.0) as f32,
+                ]
+            })
             .collect();
         let mut normalizer = Normalizer::new(2);
-        for batch in [&[&rows[..14]][..], &[&rows[14..3000], &rows[3000..3004]], &[&rows[3004..]]] {
+        for batch in [
+            &[&rows[..14]][..],
+            &[&rows[14..3000], &rows[3000..3004]],
+            &[&rows[3004..]],
+        ] {
             normalizer.update(batch, &Exchange::alone(1), |_| {});
         }
         for column in 0..2 {
-            let values: Vec<f64> = rows.iter().skip(column).step_by(2).map(|&x| f64::from(x)).collect();
+            let values: Vec<f64> = rows
+                .iter()
+                .skip(column)
+                .step_by(2)
+                .map(|&x| f64::from(x))
+                .collect();
             let mean = values.iter().sum::<f64>() / 5000.0;
             let variance = values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / 5000.0;
             assert!((normalizer.mean[column] - mean).abs() < 1e-9 * mean.abs());

@@ -48,13 +48,21 @@ impl ParameterLayout {
         let mut net = |outputs: usize| -> Vec<Layer> {
             let mut inputs = spaces.observation_size;
             let layer = |&outputs: &usize| {
-                let layer = Layer { inputs, outputs, weight: take(outputs * inputs), bias: take(outputs) };
+                let layer = Layer {
+                    inputs,
+                    outputs,
+                    weight: take(outputs * inputs),
+                    bias: take(outputs),
+                };
                 inputs = outputs;
                 layer
             };
             hidden.iter().chain([&outputs]).map(layer).collect()
         };
-        Self { actor: net(spaces.action_size), critic: net(1) }
+        Self {
+            actor: net(spaces.action_size),
+            critic: net(1),
+        }
     }
 
     /// The number of weights and biases.
@@ -71,10 +79,27 @@ impl ParameterLayout {
     pub fn views(&self) -> Vec<View> {
         let mut views = Vec::new();
         for (net, layers) in [("actor", &self.actor), ("critic", &self.critic)] {
-            for (i, Layer { inputs, outputs, weight, bias }) in layers.iter().enumerate() {
+            for (
+                i,
+                Layer {
+                    inputs,
+                    outputs,
+                    weight,
+                    bias,
+                },
+            ) in layers.iter().enumerate()
+            {
                 let weight_shape = vec![*outputs, *inputs];
-                views.push(View { name: format!("{net}.{i}.weight"), shape: weight_shape, range: weight.clone() });
-                views.push(View { name: format!("{net}.{i}.bias"), shape: vec![*outputs], range: bias.clone() });
+                views.push(View {
+                    name: format!("{net}.{i}.weight"),
+                    shape: weight_shape,
+                    range: weight.clone(),
+                });
+                views.push(View {
+                    name: format!("{net}.{i}.bias"),
+                    shape: vec![*outputs],
+                    range: bias.clone(),
+                });
             }
         }
         views
@@ -89,16 +114,30 @@ mod tests {
     fn the_views_cover_all_numbers_once_and_have_the_names_of_the_files() {
         let layout = ParameterLayout::new(
             &[5, 4],
-            &Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 },
+            &Spaces {
+                observation_size: 3,
+                action_size: 2,
+                object_and_goal: None,
+                distance: |_, _| 0.0,
+            },
         );
         let views = layout.views();
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let layers = "0.weight 0.bias 1.weight 1.bias 2.weight 2.bias";
-        let of = |net: &str| layers.split(' ').map(|layer| format!("{net}.{layer} ")).collect::<String>();
+        let of = |net: &str| {
+            layers
+                .split(' ')
+                .map(|layer| format!("{net}.{layer} "))
+                .collect::<String>()
+        };
         assert_eq!(names.join(" "), of("actor") + of("critic").trim_end());
         let mut end = 0;
         for View { name, shape, range } in &views {
-            assert_eq!((range.start, range.len()), (end, shape.iter().product()), "{name}");
+            assert_eq!(
+                (range.start, range.len()),
+                (end, shape.iter().product()),
+                "{name}"
+            );
             end = range.end;
         }
         assert_eq!(end, layout.count());

@@ -31,28 +31,48 @@ pub struct Perception {
 impl Perception {
     /// Creates the perception of the observations that `spaces` describes, by a policy that has seen these statistics.
     pub fn new(spaces: &Spaces, Normalizer { mean, variance, .. }: &Normalizer) -> Self {
-        let object_and_goal = spaces.object_and_goal.filter(|places| places.rotations != 1);
+        let object_and_goal = spaces
+            .object_and_goal
+            .filter(|places| places.rotations != 1);
         let mask = object_and_goal.map_or(1, |places| places.rotations);
-        let mut own = CUBE_ROTATIONS.into_iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1);
+        let mut own = CUBE_ROTATIONS
+            .into_iter()
+            .enumerate()
+            .filter(|(i, _)| mask >> i & 1 == 1);
         Self {
             object_and_goal,
-            rotations: std::array::from_fn(|_| own.next().map_or(CUBE_ROTATIONS[0], |(_, rotation)| rotation)),
+            rotations: std::array::from_fn(|_| {
+                own.next()
+                    .map_or(CUBE_ROTATIONS[0], |(_, rotation)| rotation)
+            }),
             mean: mean.iter().map(|&m| m as f32).collect(),
-            factor: variance.iter().map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32).collect(),
+            factor: variance
+                .iter()
+                .map(|&v| (1.0 / (v + EPSILON).sqrt()) as f32)
+                .collect(),
         }
     }
 
     /// Maps one raw observation `[O]`, in place, to the observation that represents all equivalent ones.
     #[inline(always)]
     pub fn canonicalize(&self, observation: &mut [f32]) {
-        let Some(ObjectAndGoal { object, goal, .. }) = self.object_and_goal else { return };
+        let Some(ObjectAndGoal { object, goal, .. }) = self.object_and_goal else {
+            return;
+        };
         let q = quaternion(observation, object);
         // The cosine of half the angle that remains to the unrotated orientation. All are computed first, so that the loop vectorises.
-        let close = self.rotations.map(|s| (q[0] * s[0] - q[1] * s[1] - q[2] * s[2] - q[3] * s[3]).abs());
-        let best = self.rotations[(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })];
+        let close = self
+            .rotations
+            .map(|s| (q[0] * s[0] - q[1] * s[1] - q[2] * s[2] - q[3] * s[3]).abs());
+        let best = self.rotations
+            [(1..close.len()).fold(0, |best, i| if close[i] > close[best] { i } else { best })];
         for place in [object, goal] {
             let turned = quat::mul(quaternion(observation, place), best);
-            let turned = if turned[0] < 0.0 { turned.map(|x| -x) } else { turned };
+            let turned = if turned[0] < 0.0 {
+                turned.map(|x| -x)
+            } else {
+                turned
+            };
             observation[place..place + 4].copy_from_slice(&turned);
         }
     }
@@ -72,7 +92,9 @@ impl Perception {
 }
 
 fn quaternion(observation: &[f32], place: usize) -> [f32; 4] {
-    *observation[place..].first_chunk().expect("an offset within the observation")
+    *observation[place..]
+        .first_chunk()
+        .expect("an offset within the observation")
 }
 
 #[cfg(test)]
@@ -84,11 +106,19 @@ mod tests {
     const SPACES: Spaces = Spaces {
         observation_size: 20,
         action_size: 1,
-        object_and_goal: Some(ObjectAndGoal { object: 5, goal: 11, relative: 0, rotations: u32::MAX }),
+        object_and_goal: Some(ObjectAndGoal {
+            object: 5,
+            goal: 11,
+            relative: 0,
+            rotations: u32::MAX,
+        }),
         distance: |_, _| 0.0,
     };
 
-    const UNTURNED: Spaces = Spaces { object_and_goal: None, ..SPACES };
+    const UNTURNED: Spaces = Spaces {
+        object_and_goal: None,
+        ..SPACES
+    };
 
     fn perceive(row: &mut [f32]) {
         Perception::new(&SPACES, &Normalizer::new(20)).canonicalize(row);
@@ -115,7 +145,10 @@ mod tests {
             for axis in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
                 let turned = quat::rotate(q, axis);
                 let largest = turned.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-                assert!((largest - 1.0).abs() < 1e-6, "{rotation:?} takes {axis:?} to {turned:?}");
+                assert!(
+                    (largest - 1.0).abs() < 1e-6,
+                    "{rotation:?} takes {axis:?} to {turned:?}"
+                );
             }
             for other in &CUBE_ROTATIONS[..i] {
                 let cosine: f32 = rotation.iter().zip(other).map(|(a, b)| a * b).sum();
@@ -135,7 +168,12 @@ mod tests {
                 let mut other = observation(turn(object), turn(goal));
                 perceive(&mut other);
                 let close = seen.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-5);
-                assert!(close, "{rotation:?}: {:?} and {:?}", &seen[5..9], &other[5..9]);
+                assert!(
+                    close,
+                    "{rotation:?}: {:?} and {:?}",
+                    &seen[5..9],
+                    &other[5..9]
+                );
             }
         }
     }
@@ -148,12 +186,17 @@ mod tests {
             let mut seen = raw.clone();
             perceive(&mut seen);
             let [new_object, new_goal] = [5, 11].map(|at| quaternion(&seen, at));
-            let between = |a: [f32; 4], b: [f32; 4]| quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)));
+            let between = |a: [f32; 4], b: [f32; 4]| {
+                quat::mul(a.map(f64::from), quat::conj(b.map(f64::from)))
+            };
             let left = quat::mul(object, quat::conj(goal));
             assert!(quat::angle_between(between(new_object, new_goal), left) < 1e-3);
             // The largest misorientation of a cube is 62.8°. Equally near are then no rotation, a quarter turn about
             // either of two axes, and a third turn about the diagonal between them.
-            assert!(new_object[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0, "{new_object:?}");
+            assert!(
+                new_object[0] > (62.9f32.to_radians() / 2.0).cos() && new_goal[0] >= 0.0,
+                "{new_object:?}"
+            );
             let others = (0..20).filter(|i| !(5..9).contains(i) && !(11..15).contains(i));
             assert!(others.into_iter().all(|i| seen[i] == raw[i]));
             let before = seen.clone();
@@ -164,9 +207,17 @@ mod tests {
 
     #[test]
     fn what_is_read_is_perceived_and_then_normalised() {
-        let normalizer = Normalizer { mean: vec![1.0; 20], variance: vec![4.0; 20], count: 9.0 };
+        let normalizer = Normalizer {
+            mean: vec![1.0; 20],
+            variance: vec![4.0; 20],
+            count: 9.0,
+        };
         let perception = Perception::new(&SPACES, &normalizer);
-        let raw = [observation(random(0), random(1)), observation(random(2), random(3))].concat();
+        let raw = [
+            observation(random(0), random(1)),
+            observation(random(2), random(3)),
+        ]
+        .concat();
         let mut found = vec![0.0; 40];
         perception.apply(&raw, &mut found);
         for (found, raw) in found.chunks_exact(20).zip(raw.chunks_exact(20)) {
@@ -180,7 +231,11 @@ mod tests {
 
     #[test]
     fn normalised_values_are_in_standard_deviations_and_clipped() {
-        let normalizer = Normalizer { mean: vec![2.0], variance: vec![4.0], count: 9.0 };
+        let normalizer = Normalizer {
+            mean: vec![2.0],
+            variance: vec![4.0],
+            count: 9.0,
+        };
         let mut normalised = [0.0; 3];
         let perception = Perception::new(&UNTURNED, &normalizer);
         perception.apply(&[4.0, 2.0, 400.0], &mut normalised);

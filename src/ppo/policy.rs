@@ -48,21 +48,42 @@ impl Policy {
         let layout = ParameterLayout::new(&config.hidden, &spaces);
         let parameters = vec![0.0; layout.count()];
         let normalizer = Normalizer::new(spaces.observation_size);
-        Self { layout, parameters, log_std: 0.0, normalizer, activation: config.activation, spaces }
+        Self {
+            layout,
+            parameters,
+            log_std: 0.0,
+            normalizer,
+            activation: config.activation,
+            spaces,
+        }
     }
 
     /// Creates an untrained policy with weights drawn from `seed` and the first standard deviation.
     ///
     /// Weights and biases are uniform in ± 1/√inputs, as in PyTorch's `Linear`.
     pub fn random(config: &PpoConfig, spaces: Spaces, seed: u64) -> Self {
-        let mut policy = Self { log_std: config.std.at(0).ln() as f32, ..Self::new(config, spaces) };
+        let mut policy = Self {
+            log_std: config.std.at(0).ln() as f32,
+            ..Self::new(config, spaces)
+        };
         let mut rng = rng::stream(seed, "weights", 0);
-        for (i, layer) in policy.layout.actor.iter().chain(&policy.layout.critic).enumerate() {
+        for (i, layer) in policy
+            .layout
+            .actor
+            .iter()
+            .chain(&policy.layout.critic)
+            .enumerate()
+        {
             let bound = 1.0 / (layer.inputs as f32).sqrt();
             let is_last_of_actor = i + 1 == policy.layout.actor.len();
-            let of_weights = if is_last_of_actor { bound * LAST_ACTOR_LAYER } else { bound };
+            let of_weights = if is_last_of_actor {
+                bound * LAST_ACTOR_LAYER
+            } else {
+                bound
+            };
             for (range, bound) in [(&layer.weight, of_weights), (&layer.bias, bound)] {
-                policy.parameters[range.clone()].fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
+                policy.parameters[range.clone()]
+                    .fill_with(|| bound * (2.0 * rng.random::<f32>() - 1.0));
             }
         }
         policy
@@ -76,7 +97,8 @@ impl Policy {
     /// Adds the raw rows of these arrays `[B, O]` on all ranks to the normaliser.
     pub(super) fn see(&mut self, arrays: &[&[f32]], exchange: &Exchange) {
         let perception = self.perception();
-        self.normalizer.update(arrays, exchange, |row| perception.canonicalize(row));
+        self.normalizer
+            .update(arrays, exchange, |row| perception.canonicalize(row));
     }
 
     /// The way it currently reads observations.
@@ -87,7 +109,8 @@ impl Policy {
     /// Actor and critic.
     fn plain_nets(&self) -> [Net<'_>; 2] {
         let layout = &self.layout;
-        [&layout.actor, &layout.critic].map(|layers| Net::new(layers, &self.parameters, self.activation))
+        [&layout.actor, &layout.critic]
+            .map(|layers| Net::new(layers, &self.parameters, self.activation))
     }
 
     /// Actor and critic, prepared for workspaces of this arithmetic, to learn or to act.
@@ -104,12 +127,19 @@ impl Policy {
 
     /// The policy in its current state, for a few calls. It costs nothing, but each product rearranges the weights anew.
     pub fn freeze_briefly(&self) -> FrozenPolicy<'_> {
-        FrozenPolicy { policy: self, nets: self.plain_nets(), perception: self.perception() }
+        FrozenPolicy {
+            policy: self,
+            nets: self.plain_nets(),
+            perception: self.perception(),
+        }
     }
 
     /// The policy in its current state, prepared for workspaces of this arithmetic.
     pub(super) fn freeze_for(&self, arithmetic: Arithmetic) -> FrozenPolicy<'_> {
-        FrozenPolicy { nets: self.nets(arithmetic, false), ..self.freeze_briefly() }
+        FrozenPolicy {
+            nets: self.nets(arithmetic, false),
+            ..self.freeze_briefly()
+        }
     }
 
     /// The mean actions `[B, A]` for raw observations `[B, O]`. The results for a row are bit for bit the same whatever the other
@@ -141,7 +171,10 @@ impl Policy {
         if rows <= GROUP {
             group((observations, &mut results));
         } else {
-            observations.par_chunks(GROUP * size).zip(results.par_chunks_mut(GROUP * width)).for_each(group);
+            observations
+                .par_chunks(GROUP * size)
+                .zip(results.par_chunks_mut(GROUP * width))
+                .for_each(group);
         }
         results.truncate(rows * width);
         results
@@ -155,13 +188,23 @@ impl FrozenPolicy<'_> {
     }
 
     /// Writes the mean actions `[B, A]` and the values `[B]` for raw observations `[B, O]`. An empty slice is left out.
-    pub fn compute(&self, observations: &[f32], mut outputs: [&mut [f32]; 2], work: &mut Workspace) {
+    pub fn compute(
+        &self,
+        observations: &[f32],
+        mut outputs: [&mut [f32]; 2],
+        work: &mut Workspace,
+    ) {
         let size = self.policy.spaces.observation_size;
         let mut done = 0;
         for raw in observations.chunks(work.rows * size) {
             let rows = raw.len() / size;
             self.perception.apply(raw, &mut work.inputs[..raw.len()]);
-            for (net, out) in self.nets.iter().zip(&mut outputs).filter(|(_, out)| !out.is_empty()) {
+            for (net, out) in self
+                .nets
+                .iter()
+                .zip(&mut outputs)
+                .filter(|(_, out)| !out.is_empty())
+            {
                 let width = net.outputs();
                 out[done * width..][..rows * width].copy_from_slice(net.forward(rows, work));
             }
@@ -178,20 +221,35 @@ mod tests {
     #[test]
     fn what_a_fixed_policy_computes_of_a_row_does_not_depend_on_the_other_rows() {
         const SIZE: usize = 75;
-        let spaces = Spaces { observation_size: SIZE, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
+        let spaces = Spaces {
+            observation_size: SIZE,
+            action_size: 20,
+            object_and_goal: None,
+            distance: |_, _| 0.0,
+        };
         let policy = Policy::random(&Config::default().ppo, spaces, 7);
-        let observations: Vec<f32> = (0..150 * SIZE).map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0).collect();
+        let observations: Vec<f32> = (0..150 * SIZE)
+            .map(|i| ((i * 61 % 97) as f32 - 48.0) / 20.0)
+            .collect();
         let actions = policy.mean_actions(&observations);
         let values = policy.values(&observations);
         assert_eq!([actions.len(), values.len()], [150 * 20, 150]);
         for rows in [0, 1, 2, 63, 64, 65, 150] {
             let first = &observations[..rows * SIZE];
-            assert_eq!(policy.mean_actions(first), actions[..rows * 20], "{rows} rows");
+            assert_eq!(
+                policy.mean_actions(first),
+                actions[..rows * 20],
+                "{rows} rows"
+            );
             assert_eq!(policy.values(first), values[..rows], "{rows} rows");
         }
         let frozen = policy.freeze();
         let mut means = vec![0.0; 64 * 20];
-        frozen.compute(&observations[..64 * SIZE], [&mut means, &mut []], &mut frozen.workspace(64));
+        frozen.compute(
+            &observations[..64 * SIZE],
+            [&mut means, &mut []],
+            &mut frozen.workspace(64),
+        );
         assert_eq!(means, actions[..64 * 20], "as a score computes them");
     }
 }

@@ -49,7 +49,8 @@ impl Rise {
 pub fn beats(found: [f64; 2], best: Option<[f64; 2]>) -> bool {
     let order = |[goals, rot_dist]: [f64; 2]| (goals, -rot_dist);
     // If every episode diverged at once, there is no rotation error to compare.
-    found.iter().all(|figure| figure.is_finite()) && best.is_none_or(|best| order(found) > order(best))
+    found.iter().all(|figure| figure.is_finite())
+        && best.is_none_or(|best| order(found) > order(best))
 }
 
 /// The checkpoint of another run that a run was forked from.

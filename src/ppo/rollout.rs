@@ -46,7 +46,11 @@ pub struct RolloutBlock {
 impl Rollout {
     /// Creates an empty rollout of `horizon` steps for blocks with these numbers of environments.
     pub fn new(horizon: usize, block_sizes: &[usize], spaces: &Spaces) -> Self {
-        let Spaces { observation_size, action_size, .. } = *spaces;
+        let Spaces {
+            observation_size,
+            action_size,
+            ..
+        } = *spaces;
         let block = |&envs: &usize| {
             let steps = horizon * envs;
             RolloutBlock {
@@ -69,7 +73,11 @@ impl Rollout {
         for (i, block) in blocks.iter().enumerate() {
             places.extend((0..block.samples() as u32).map(|row| (i as u32, row)));
         }
-        Self { horizon, blocks, places }
+        Self {
+            horizon,
+            blocks,
+            places,
+        }
     }
 
     /// The number of samples, T × N.
@@ -87,7 +95,11 @@ impl Rollout {
     pub fn resize(&mut self, horizon: usize, spaces: &Spaces) {
         let sizes: Vec<usize> = self.blocks.iter().map(|block| block.envs).collect();
         let mut resized = Self::new(horizon, &sizes, spaces);
-        for (new, old) in resized.first_observations_mut().into_iter().zip(self.first_observations_mut()) {
+        for (new, old) in resized
+            .first_observations_mut()
+            .into_iter()
+            .zip(self.first_observations_mut())
+        {
             new.copy_from_slice(old);
         }
         *self = resized;
@@ -103,7 +115,10 @@ impl Rollout {
 
     /// The observations `[n, O]` of each block that the first step acts on.
     pub fn first_observations_mut(&mut self) -> Vec<&mut [f32]> {
-        self.blocks.iter_mut().map(RolloutBlock::first_observations_mut).collect()
+        self.blocks
+            .iter_mut()
+            .map(RolloutBlock::first_observations_mut)
+            .collect()
     }
 }
 
@@ -139,7 +154,12 @@ impl RolloutBlock {
 mod tests {
     use super::*;
 
-    const SPACES: Spaces = Spaces { observation_size: 4, action_size: 1, object_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 4,
+        action_size: 1,
+        object_and_goal: None,
+        distance: |_, _| 0.0,
+    };
 
     #[test]
     fn what_follows_the_last_step_is_what_the_next_iteration_starts_from() {
@@ -159,8 +179,18 @@ mod tests {
         assert_eq!(rollout.samples(), 38);
         let found = |sample| {
             let (block, row) = rollout.locate(sample);
-            (rollout.blocks.iter().position(|other| std::ptr::eq(other, block)).unwrap(), row)
+            (
+                rollout
+                    .blocks
+                    .iter()
+                    .position(|other| std::ptr::eq(other, block))
+                    .unwrap(),
+                row,
+            )
         };
-        assert_eq!([0, 15, 16, 31, 32, 37].map(found), [(0, 0), (0, 15), (1, 0), (1, 15), (2, 0), (2, 5)]);
+        assert_eq!(
+            [0, 15, 16, 31, 32, 37].map(found),
+            [(0, 0), (0, 15), (1, 0), (1, 15), (2, 0), (2, 5)]
+        );
     }
 }

@@ -73,7 +73,12 @@ impl Ppo {
     ///
     /// # Errors
     /// Fails if a loss, gradient or weight is not finite. The policy must then not be used or saved.
-    pub fn update(&mut self, rollout: &mut Rollout, iteration: u64, stop: &AtomicBool) -> Result<Option<UpdateStats>> {
+    pub fn update(
+        &mut self,
+        rollout: &mut Rollout,
+        iteration: u64,
+        stop: &AtomicBool,
+    ) -> Result<Option<UpdateStats>> {
         // Runs on a worker thread: each of the many short parallel sections would put an outside thread to sleep and
         // wake it.
         rayon::scope(|_| {
@@ -84,7 +89,9 @@ impl Ppo {
                 self.adam = Adam::new(self.policy.layout.count());
             }
             let samples = rollout.samples();
-            let size = self.config.minibatch_of(self.exchange.of_all(samples), rollout.horizon);
+            let size = self
+                .config
+                .minibatch_of(self.exchange.of_all(samples), rollout.horizon);
             let stream = |shard| rng::stream(self.seed, "shuffle", iteration << 32 | shard as u64);
             let shuffles = self.exchange.own_shards().map(stream).collect();
             let mut minibatches = self.exchange.epochs(samples, size, shuffles);
@@ -107,7 +114,10 @@ impl Ppo {
             }
             for View { name, range, .. } in self.policy.layout.views() {
                 let finite = self.policy.parameters[range].iter().all(|x| x.is_finite());
-                ensure!(finite, "the update made `{name}` infinite or NaN: the training run has failed and stops here");
+                ensure!(
+                    finite,
+                    "the update made `{name}` infinite or NaN: the training run has failed and stops here"
+                );
             }
             // The normaliser is part of the policy, which does not change while the critic learns alone.
             if !self.is_critic_alone(iteration) {
@@ -122,20 +132,37 @@ impl Ppo {
     /// explained variance.
     pub fn prepare(&self, rollout: &mut Rollout) -> f64 {
         let [gamma, lambda] = [self.config.gamma, self.config.lambda].map(|factor| factor as f32);
-        rollout.blocks.par_iter_mut().for_each(|block| gae(block, gamma, lambda));
+        rollout
+            .blocks
+            .par_iter_mut()
+            .for_each(|block| gae(block, gamma, lambda));
         let (_, spread) = self.mean_and_variance(rollout, |block| &block.returns);
         let (mean, residual) = self.mean_and_variance(rollout, |block| &block.advantages);
         let scale = 1.0 / (residual.sqrt() + 1e-8);
-        for x in rollout.blocks.iter_mut().flat_map(|block| &mut block.advantages) {
+        for x in rollout
+            .blocks
+            .iter_mut()
+            .flat_map(|block| &mut block.advantages)
+        {
             *x = ((f64::from(*x) - mean) * scale) as f32;
         }
-        if spread > 0.0 { 1.0 - residual / spread } else { f64::NAN }
+        if spread > 0.0 {
+            1.0 - residual / spread
+        } else {
+            f64::NAN
+        }
     }
 
     /// The mean and variance of one array over all samples of the update.
     fn mean_and_variance(&self, rollout: &Rollout, of: fn(&RolloutBlock) -> &[f32]) -> (f64, f64) {
         let sum = |term: &(dyn Fn(f64) -> f64 + Sync)| {
-            let of_blocks = |blocks: &[RolloutBlock]| blocks.iter().flat_map(of).map(|&x| term(f64::from(x))).sum();
+            let of_blocks = |blocks: &[RolloutBlock]| {
+                blocks
+                    .iter()
+                    .flat_map(of)
+                    .map(|&x| term(f64::from(x)))
+                    .sum()
+            };
             self.exchange.sum(&rollout.blocks, of_blocks, f64::add)
         };
         let count = self.exchange.of_all(rollout.samples()) as f64;
@@ -147,25 +174,41 @@ impl Ppo {
     ///
     /// # Errors
     /// Fails if one of them is not finite. Nothing has moved then.
-    pub fn minibatch_step(&mut self, rollout: &Rollout, samples: &[u32], stage: Stage) -> Result<(Losses, f64)> {
+    pub fn minibatch_step(
+        &mut self,
+        rollout: &Rollout,
+        samples: &[u32],
+        stage: Stage,
+    ) -> Result<(Losses, f64)> {
         let nets = self.policy.layout.nets();
         let groups = self.exchange.groups(samples);
         let count = self.exchange.of_all(samples.len());
-        let sums = self.backend.gradients(&self.policy, rollout, &groups, count, &mut self.of_groups)?;
+        let sums =
+            self.backend
+                .gradients(&self.policy, rollout, &groups, count, &mut self.of_groups)?;
         let add_up = |parameters: Range<usize>, out: &mut [f32]| match stage {
             Stage::CriticAlone if parameters.start < nets[0].end => out.fill(0.0),
             _ => tree_sum(out, &self.of_groups, parameters),
         };
-        let squares = self.slices.reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
+        let squares = self
+            .slices
+            .reduce_scatter(&mut self.gradient, add_up, sum_of_squares);
         let grad_norm = norm(&squares, &nets);
         let losses = self.losses(&sums, count);
-        for (what, value) in [("the loss", losses.total(&self.config)), ("the norm of the gradient", grad_norm)] {
-            ensure!(value.is_finite(), "{what} is {value}: the training run has failed and stops here");
+        for (what, value) in [
+            ("the loss", losses.total(&self.config)),
+            ("the norm of the gradient", grad_norm),
+        ] {
+            ensure!(
+                value.is_finite(),
+                "{what} is {value}: the training run has failed and stops here"
+            );
         }
         if let Stage::Later = stage {
             let range = self.config.learning_rate_range;
             let desired_kl = self.config.desired_kl.at(self.env_steps);
-            self.learning_rate = learning_rate::adapted(self.learning_rate, losses.kl, desired_kl, range);
+            self.learning_rate =
+                learning_rate::adapted(self.learning_rate, losses.kl, desired_kl, range);
         }
         // As in PyTorch's clip_grad_norm_, including the constant that prevents a division by zero.
         let scale = (self.config.max_grad_norm / (grad_norm + 1e-6)).min(1.0);
@@ -174,22 +217,32 @@ impl Ppo {
             own = own.start.max(nets[1].start).min(own.end)..own.end;
         }
         let parameters = &mut self.policy.parameters;
-        self.adam.step(parameters, &self.gradient, own, (self.learning_rate, scale));
+        self.adam
+            .step(parameters, &self.gradient, own, (self.learning_rate, scale));
         self.slices.all_gather(parameters);
         Ok((losses, grad_norm))
     }
 
     /// The mean losses of a minibatch of `count` samples, given the sums of each group on this rank.
     pub fn losses(&self, sums: &[Losses], count: usize) -> Losses {
-        let of_shard = |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
-        let own = sums.chunks(sums.len() / self.exchange.own_shards().len()).map(of_shard).collect();
+        let of_shard =
+            |groups: &[Losses]| groups.iter().copied().reduce(Losses::add).expect("a group");
+        let own = sums
+            .chunks(sums.len() / self.exchange.own_shards().len())
+            .map(of_shard)
+            .collect();
         self.exchange.in_order(own, Losses::add).means(count)
     }
 
     /// The statistics of an update with these steps: the mean losses and the norm of the gradient of each.
     fn stats(&self, steps: &[(Losses, f64)], explained_variance: f64) -> UpdateStats {
         let mean = |sum: f64| sum / steps.len() as f64;
-        let losses = steps.iter().map(|(losses, _)| *losses).reduce(Losses::add).expect("a step").means(steps.len());
+        let losses = steps
+            .iter()
+            .map(|(losses, _)| *losses)
+            .reduce(Losses::add)
+            .expect("a step")
+            .means(steps.len());
         // The entropy of the Gaussian at noise scale 1.
         let of_action = f64::from(self.policy.log_std) + 0.5 * (TAU * E).ln();
         let entropy: f64 = repeat_n(of_action, self.policy.spaces.action_size).sum();
@@ -212,7 +265,12 @@ mod tests {
     use crate::ranks::Exchange;
     use crate::spaces::Spaces;
 
-    const SPACES: Spaces = Spaces { observation_size: 3, action_size: 2, object_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 3,
+        action_size: 2,
+        object_and_goal: None,
+        distance: |_, _| 0.0,
+    };
 
     #[test]
     fn the_entropy_is_the_one_of_a_gaussian_with_this_standard_deviation() {

@@ -20,10 +20,20 @@ impl Exchange {
         }
         let all = self.all_gather((os::program_checksum(), scene.to_owned(), Machine::this()));
         for (rank, (program, scene, _)) in all.iter().enumerate() {
-            ensure!(*program == all[0].0, "rank {rank} runs another program than rank 0");
-            ensure!(*scene == all[0].1, "rank {rank} has another scene than rank 0");
+            ensure!(
+                *program == all[0].0,
+                "rank {rank} runs another program than rank 0"
+            );
+            ensure!(
+                *scene == all[0].1,
+                "rank {rank} has another scene than rank 0"
+            );
         }
-        let is_bound = |Machine { name, allowed, processors }: &Machine| {
+        let is_bound = |Machine {
+                            name,
+                            allowed,
+                            processors,
+                        }: &Machine| {
             let here = all.iter().filter(|(.., other)| other.name == *name).count();
             *allowed <= ONE_CORE && allowed * here < *processors
         };

@@ -31,12 +31,23 @@ pub struct Exchange {
 impl Exchange {
     /// Creates the exchange of rank `rank` of `size`, with a single shard.
     pub fn new(rank: usize, size: usize, ranks: Arc<dyn Ranks>) -> Self {
-        Self { rank, size, ranks: Some(ranks), ..Self::alone(1) }
+        Self {
+            rank,
+            size,
+            ranks: Some(ranks),
+            ..Self::alone(1)
+        }
     }
 
     /// Creates the exchange of one rank that computes all shards.
     pub fn alone(shards: usize) -> Self {
-        Self { shards, rank: 0, size: 1, ranks: None, sent: Arc::default() }
+        Self {
+            shards,
+            rank: 0,
+            size: 1,
+            ranks: None,
+            sent: Arc::default(),
+        }
     }
 
     /// Deals this number of shards, a power of two, to the ranks.
@@ -45,7 +56,10 @@ impl Exchange {
     /// Fails if the number of ranks is not a power of two, or if there are fewer shards.
     pub fn over(self, shards: usize) -> Result<Self> {
         let ranks = self.size;
-        ensure!(ranks.is_power_of_two(), "{ranks} ranks: their number must be a power of two");
+        ensure!(
+            ranks.is_power_of_two(),
+            "{ranks} ranks: their number must be a power of two"
+        );
         ensure!(
             ranks <= shards,
             "{ranks} ranks, but the training run has only {shards} shards (run.shards), and each rank needs at least one"
@@ -91,46 +105,76 @@ impl Exchange {
         of: impl Fn(&[P]) -> T + Send + Sync,
         add: impl Fn(T, T) -> T,
     ) -> T {
-        self.in_order(parts.par_chunks(parts.len() / self.own_shards().len()).map(of).collect(), add)
+        self.in_order(
+            parts
+                .par_chunks(parts.len() / self.own_shards().len())
+                .map(of)
+                .collect(),
+            add,
+        )
     }
 
     /// Adds the results of all shards, of which this rank has its `own`, in the order of the shards.
-    pub fn in_order<T: Serialize + DeserializeOwned>(&self, own: Vec<T>, add: impl Fn(T, T) -> T) -> T {
-        self.all_gather(own).into_iter().flatten().reduce(add).expect("there is a shard")
+    pub fn in_order<T: Serialize + DeserializeOwned>(
+        &self,
+        own: Vec<T>,
+        add: impl Fn(T, T) -> T,
+    ) -> T {
+        self.all_gather(own)
+            .into_iter()
+            .flatten()
+            .reduce(add)
+            .expect("there is a shard")
     }
 
     /// The values of all ranks, in their order.
     pub fn all_gather<T: Serialize + DeserializeOwned>(&self, own: T) -> Vec<T> {
-        let Some(ranks) = &self.ranks else { return vec![own] };
+        let Some(ranks) = &self.ranks else {
+            return vec![own];
+        };
         let own = postcard::to_stdvec(&own).expect("values of known size");
         let all = self.timed(own.len() * (self.size - 1), || ranks.all_gather(own));
-        all.iter().map(|bytes| postcard::from_bytes(bytes).expect("the ranks run the same program")).collect()
+        all.iter()
+            .map(|bytes| postcard::from_bytes(bytes).expect("the ranks run the same program"))
+            .collect()
     }
 
     /// The value of the first rank. The others pass `None`.
     pub fn broadcast<T: Serialize + DeserializeOwned>(&self, first: Option<T>) -> T {
-        self.all_gather(first).swap_remove(0).expect("the first rank has it")
+        self.all_gather(first)
+            .swap_remove(0)
+            .expect("the first rank has it")
     }
 
     /// Sends each rank its slice, and returns the slices that all have sent, this rank's among them.
     pub(super) fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let ranks = self.ranks.as_ref().expect("there are several");
-        self.timed(4 * (numbers.len() - slices[self.rank].len()), || ranks.all_to_all(numbers, slices))
+        self.timed(4 * (numbers.len() - slices[self.rank].len()), || {
+            ranks.all_to_all(numbers, slices)
+        })
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
     pub(super) fn all_gather_slices(&self, numbers: &mut [f32], slices: &[Range<usize>]) {
         if let Some(ranks) = &self.ranks {
-            self.timed(4 * slices[self.rank].len() * (self.size - 1), || ranks.all_gather_slices(numbers, slices));
+            self.timed(4 * slices[self.rank].len() * (self.size - 1), || {
+                ranks.all_gather_slices(numbers, slices)
+            });
         }
     }
 
     /// The traffic since the last call, by name: the time spent (s, including the wait for others) and the bytes sent
     /// by this rank. Both are `NaN` for a single rank.
     pub fn take_traffic(&self) -> [(&'static str, f64); 2] {
-        let [nanoseconds, bytes] = self.sent.each_ref().map(|sum| sum.swap(0, Ordering::Relaxed));
+        let [nanoseconds, bytes] = self
+            .sent
+            .each_ref()
+            .map(|sum| sum.swap(0, Ordering::Relaxed));
         let known = |value: f64| if self.is_alone() { f64::NAN } else { value };
-        [("exchange_s", known(nanoseconds as f64 * 1e-9)), ("exchange_bytes", known(bytes as f64))]
+        [
+            ("exchange_s", known(nanoseconds as f64 * 1e-9)),
+            ("exchange_bytes", known(bytes as f64)),
+        ]
     }
 
     fn timed<T>(&self, bytes: usize, talk: impl FnOnce() -> T) -> T {
@@ -155,14 +199,30 @@ mod tests {
         let exchange = Exchange::alone(4);
         // 1 is lost when added to 1e16: once in this order, never or twice in others.
         let of_shard = |parts: &[f64]| parts.iter().sum::<f64>();
-        assert_eq!(exchange.sum(&[1e16, 1.0, -1e16, 1.0], of_shard, |sum, next| sum + next), 1.0);
-        assert_eq!(exchange.sum(&[1e16, 1.0, 0.0, 0.0, -1e16, 1.0, 0.0, 1.0], of_shard, |sum, next| sum + next), 1.0);
+        assert_eq!(
+            exchange.sum(&[1e16, 1.0, -1e16, 1.0], of_shard, |sum, next| sum + next),
+            1.0
+        );
+        assert_eq!(
+            exchange.sum(
+                &[1e16, 1.0, 0.0, 0.0, -1e16, 1.0, 0.0, 1.0],
+                of_shard,
+                |sum, next| sum + next
+            ),
+            1.0
+        );
     }
 
     #[test]
     fn trainings_that_cannot_be_dealt_to_the_ranks_are_refused() {
-        let three = Exchange { size: 3, ..Exchange::alone(1) };
+        let three = Exchange {
+            size: 3,
+            ..Exchange::alone(1)
+        };
         let refused = three.over(16).err().unwrap().to_string();
-        assert!(refused.contains("3 ranks") && refused.contains("power of two"), "{refused}");
+        assert!(
+            refused.contains("3 ranks") && refused.contains("power of two"),
+            "{refused}"
+        );
     }
 }

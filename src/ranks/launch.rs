@@ -41,7 +41,9 @@ pub fn is_spokesman() -> bool {
 /// Fails if there are several.
 pub fn expect_one() -> Result<()> {
     match launched() {
-        Some((_, size)) => bail!("only `train` runs on several ranks; {size} processes were started"),
+        Some((_, size)) => {
+            bail!("only `train` runs on several ranks; {size} processes were started")
+        }
         None => Ok(()),
     }
 }
@@ -86,7 +88,9 @@ pub fn together(work: impl FnOnce(&Exchange) -> Result<ExitCode>) -> Result<Exit
 
 #[cfg(feature = "mpi")]
 fn join() -> Result<(Exchange, Option<super::mpi::Universe>)> {
-    let Some((_, size)) = launched() else { return Ok((Exchange::alone(1), None)) };
+    let Some((_, size)) = launched() else {
+        return Ok((Exchange::alone(1), None));
+    };
     let (universe, ranks) = super::mpi::join()?;
     let exchange = Exchange::new(ranks.rank, ranks.size, std::sync::Arc::new(ranks));
     if exchange.is_alone() {
@@ -116,15 +120,33 @@ mod tests {
     #[test]
     fn a_process_is_one_of_several_where_a_launcher_says_so() {
         let of = |variables: &[(&str, &str)]| {
-            told(|name| variables.iter().find(|(other, _)| *other == name).map(|(_, value)| value.to_string()))
+            told(|name| {
+                variables
+                    .iter()
+                    .find(|(other, _)| *other == name)
+                    .map(|(_, value)| value.to_string())
+            })
         };
         assert_eq!(of(&[]), None);
         assert_eq!(of(&[("PMI_SIZE", "1"), ("PMI_RANK", "0")]), None);
         let expected = Some((3, 4));
-        assert_eq!(of(&[("OMPI_COMM_WORLD_SIZE", "4"), ("OMPI_COMM_WORLD_RANK", "3")]), expected);
+        assert_eq!(
+            of(&[("OMPI_COMM_WORLD_SIZE", "4"), ("OMPI_COMM_WORLD_RANK", "3")]),
+            expected
+        );
         assert_eq!(of(&[("PMI_SIZE", "4"), ("PMI_RANK", "3")]), expected);
-        assert_eq!(of(&[("SLURM_STEP_NUM_TASKS", "4"), ("SLURM_PROCID", "3")]), expected);
+        assert_eq!(
+            of(&[("SLURM_STEP_NUM_TASKS", "4"), ("SLURM_PROCID", "3")]),
+            expected
+        );
         // One launcher inside another: mpirun in a job step of one task.
-        assert_eq!(of(&[("SLURM_STEP_NUM_TASKS", "1"), ("PMI_SIZE", "4"), ("PMI_RANK", "3")]), expected);
+        assert_eq!(
+            of(&[
+                ("SLURM_STEP_NUM_TASKS", "1"),
+                ("PMI_SIZE", "4"),
+                ("PMI_RANK", "3")
+            ]),
+            expected
+        );
     }
 }

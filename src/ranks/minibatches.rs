@@ -16,15 +16,28 @@ impl Exchange {
     /// Deals the `samples` samples of this rank, shard after shard, into minibatches of `size` samples of all ranks. Each call of
     /// the result gives those of another epoch, as [`Exchange::groups`] takes them. `shuffles` has a generator for each shard
     /// of this rank.
-    pub fn epochs(&self, samples: usize, size: usize, mut shuffles: Vec<Rng>) -> impl FnMut() -> Vec<Vec<u32>> + use<> {
+    pub fn epochs(
+        &self,
+        samples: usize,
+        size: usize,
+        mut shuffles: Vec<Rng>,
+    ) -> impl FnMut() -> Vec<Vec<u32>> + use<> {
         let mut order: Vec<u32> = (0..samples as u32).collect();
         let in_shard = samples / shuffles.len();
         let of_shard = size / self.shards;
         move || {
-            order.chunks_mut(in_shard).zip(&mut shuffles).for_each(|(samples, rng)| samples.shuffle(rng));
-            let window =
-                |part: usize| order.chunks(in_shard).flat_map(move |shard| &shard[part * of_shard..][..of_shard]);
-            (0..in_shard / of_shard).map(|part| window(part).copied().collect()).collect()
+            order
+                .chunks_mut(in_shard)
+                .zip(&mut shuffles)
+                .for_each(|(samples, rng)| samples.shuffle(rng));
+            let window = |part: usize| {
+                order
+                    .chunks(in_shard)
+                    .flat_map(move |shard| &shard[part * of_shard..][..of_shard])
+            };
+            (0..in_shard / of_shard)
+                .map(|part| window(part).copied().collect())
+                .collect()
         }
     }
 
@@ -37,7 +50,8 @@ impl Exchange {
         while groups > 1 && in_shard / groups < SMALLEST_GROUP {
             groups /= 2;
         }
-        let split = |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
+        let split =
+            |shard: &'a [u32]| (0..groups).map(move |group| &shard[part(in_shard, group, groups)]);
         samples.chunks(in_shard).flat_map(split).collect()
     }
 }
@@ -50,14 +64,23 @@ mod tests {
     #[test]
     fn an_epoch_takes_each_sample_once_and_equally_many_from_each_shard() {
         let exchange = Exchange::alone(4);
-        let mut epoch = exchange.epochs(4 * 96, 4 * 32, (0..4).map(|shard| rng::stream(1, "shuffle", shard)).collect());
+        let mut epoch = exchange.epochs(
+            4 * 96,
+            4 * 32,
+            (0..4)
+                .map(|shard| rng::stream(1, "shuffle", shard))
+                .collect(),
+        );
         for _ in 0..2 {
             let mut seen = Vec::new();
             for samples in epoch() {
                 let groups = exchange.groups(&samples);
                 assert_eq!((samples.len(), groups.len()), (128, 4));
                 for (shard, group) in groups.iter().enumerate() {
-                    assert!(group.len() == 32 && group.iter().all(|&sample| sample as usize / 96 == shard));
+                    assert!(
+                        group.len() == 32
+                            && group.iter().all(|&sample| sample as usize / 96 == shard)
+                    );
                 }
                 seen.extend(groups.concat());
             }
@@ -70,11 +93,22 @@ mod tests {
     fn the_samples_of_few_shards_are_split_into_groups_of_similar_size() {
         let samples: Vec<u32> = (0..1301).collect();
         let sizes = |shards: usize, samples: &[u32]| {
-            Exchange::alone(shards).groups(samples).iter().map(|group| group.len()).collect::<Vec<_>>()
+            Exchange::alone(shards)
+                .groups(samples)
+                .iter()
+                .map(|group| group.len())
+                .collect::<Vec<_>>()
         };
         assert_eq!(sizes(1, &samples[..20]), [20]);
         assert_eq!(sizes(1, &samples[..64]), [32; 2]);
-        assert_eq!((sizes(1, &samples).len(), sizes(8, &samples[..1024])), (16, vec![64; 16]));
-        assert!(sizes(1, &samples).iter().all(|&size| size == 81 || size == 82));
+        assert_eq!(
+            (sizes(1, &samples).len(), sizes(8, &samples[..1024])),
+            (16, vec![64; 16])
+        );
+        assert!(
+            sizes(1, &samples)
+                .iter()
+                .all(|&size| size == 81 || size == 82)
+        );
     }
 }

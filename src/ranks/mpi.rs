@@ -26,8 +26,12 @@ pub struct Mpi {
 /// Fails if this MPI does not allow calls from more than one thread.
 pub fn join() -> Result<(Universe, Mpi)> {
     // The learner runs on a worker thread, everything else on the main thread, one at a time.
-    let (universe, granted) = mpi::initialize_with_threading(Threading::Serialized).context("MPI was started twice")?;
-    ensure!(granted >= Threading::Serialized, "this MPI allows calls from one thread only ({granted:?})");
+    let (universe, granted) =
+        mpi::initialize_with_threading(Threading::Serialized).context("MPI was started twice")?;
+    ensure!(
+        granted >= Threading::Serialized,
+        "this MPI allows calls from one thread only ({granted:?})"
+    );
     let world = universe.world();
     let rank = world.rank() as usize;
     let size = world.size() as usize;
@@ -41,8 +45,14 @@ fn world() -> SimpleCommunicator {
 
 /// The lengths and the beginnings of slices, as MPI counts them: in 32 bits.
 fn counts(slices: &[Range<usize>]) -> (Vec<i32>, Vec<i32>) {
-    let count = |n: usize| -> i32 { n.try_into().expect("fewer than 2^31 weights, and bytes of states") };
-    slices.iter().map(|slice| (count(slice.len()), count(slice.start))).unzip()
+    let count = |n: usize| -> i32 {
+        n.try_into()
+            .expect("fewer than 2^31 weights, and bytes of states")
+    };
+    slices
+        .iter()
+        .map(|slice| (count(slice.len()), count(slice.start)))
+        .unzip()
 }
 
 /// The slices of `array` that the ranks write, one after another.
@@ -58,7 +68,9 @@ impl Ranks for Mpi {
     fn all_to_all(&self, numbers: &[f32], slices: &[Range<usize>]) -> Vec<f32> {
         let own = slices[self.rank].len();
         let mut received = vec![0.0; own * self.size];
-        let of_ranks: Vec<Range<usize>> = (0..self.size).map(|rank| rank * own..(rank + 1) * own).collect();
+        let of_ranks: Vec<Range<usize>> = (0..self.size)
+            .map(|rank| rank * own..(rank + 1) * own)
+            .collect();
         let (lengths, firsts) = counts(slices);
         let sent = Partition::new(numbers, lengths, firsts);
         world().all_to_all_varcount_into(&sent, &mut places(&mut received, &of_ranks));
@@ -82,7 +94,10 @@ impl Ranks for Mpi {
         let slices: Vec<Range<usize>> = lengths.into_iter().map(slice).collect();
         let mut all = vec![0; end];
         world().all_gather_varcount_into(&bytes[..], &mut places(&mut all, &slices));
-        slices.into_iter().map(|slice| all[slice].to_vec()).collect()
+        slices
+            .into_iter()
+            .map(|slice| all[slice].to_vec())
+            .collect()
     }
 
     fn abort(&self) -> ! {

@@ -30,7 +30,13 @@ impl Exchange {
             end(dealt.start)..end(dealt.end)
         };
         let all: Vec<Range<usize>> = (0..self.size).map(values).collect();
-        Slices { exchange: self.clone(), dealt: self.own(chunks.len()), own: all[self.rank].clone(), chunks, all }
+        Slices {
+            exchange: self.clone(),
+            dealt: self.own(chunks.len()),
+            own: all[self.rank].clone(),
+            chunks,
+            all,
+        }
     }
 }
 
@@ -49,18 +55,32 @@ impl Slices {
                 sum(chunk, out);
                 of(out)
             };
-            return split(numbers, &self.chunks).into_par_iter().map(sum_and_of).collect();
+            return split(numbers, &self.chunks)
+                .into_par_iter()
+                .map(sum_and_of)
+                .collect();
         }
-        split(numbers, &self.chunks).into_par_iter().for_each(|(chunk, out)| sum(chunk, out));
+        split(numbers, &self.chunks)
+            .into_par_iter()
+            .for_each(|(chunk, out)| sum(chunk, out));
         let parts = self.exchange.all_to_all(numbers, &self.all);
         // A rank without values has no chunks either, so the length does not matter.
         let parts: Vec<&[f32]> = parts.chunks(self.own.len().max(1)).collect();
         let add_and_of = |(chunk, out): (Range<usize>, &mut [f32])| {
-            tree_sum(out, &parts, chunk.start - self.own.start..chunk.end - self.own.start);
+            tree_sum(
+                out,
+                &parts,
+                chunk.start - self.own.start..chunk.end - self.own.start,
+            );
             of(out)
         };
-        let own = split(&mut numbers[self.own.clone()], &self.chunks[self.dealt.clone()]);
-        self.exchange.all_gather(own.into_par_iter().map(add_and_of).collect::<Vec<f64>>()).concat()
+        let own = split(
+            &mut numbers[self.own.clone()],
+            &self.chunks[self.dealt.clone()],
+        );
+        self.exchange
+            .all_gather(own.into_par_iter().map(add_and_of).collect::<Vec<f64>>())
+            .concat()
     }
 
     /// Replaces the slices of the other ranks by what these have computed.
@@ -77,8 +97,16 @@ impl Slices {
 }
 
 /// Splits numbers into the chunks, which follow one another.
-fn split<'a>(mut numbers: &'a mut [f32], chunks: &[Range<usize>]) -> Vec<(Range<usize>, &'a mut [f32])> {
-    let next = |chunk: &Range<usize>| (chunk.clone(), numbers.split_off_mut(..chunk.len()).expect("room for all"));
+fn split<'a>(
+    mut numbers: &'a mut [f32],
+    chunks: &[Range<usize>],
+) -> Vec<(Range<usize>, &'a mut [f32])> {
+    let next = |chunk: &Range<usize>| {
+        (
+            chunk.clone(),
+            numbers.split_off_mut(..chunk.len()).expect("room for all"),
+        )
+    };
     chunks.iter().map(next).collect()
 }
 
@@ -93,7 +121,10 @@ mod tests {
             (1, vec![Range { start: 0, end: 20 }]),
             (2, vec![0..10, 10..20]),
             (4, vec![0..5, 5..10, 10..12, 12..20]),
-            (8, vec![0..0, 0..5, 5..5, 5..10, 10..12, 12..12, 12..17, 17..20]),
+            (
+                8,
+                vec![0..0, 0..5, 5..5, 5..10, 10..12, 12..12, 12..17, 17..20],
+            ),
         ] {
             let of_rank = |rank| {
                 let mut exchange = Exchange::alone(1);
@@ -102,8 +133,10 @@ mod tests {
             };
             let slices: Vec<Slices> = (0..ranks).map(of_rank).collect();
             assert_eq!(slices[0].all, expected, "{ranks} ranks");
-            let dealt: Vec<Range<usize>> =
-                slices.into_iter().flat_map(|slices| slices.chunks[slices.dealt].to_vec()).collect();
+            let dealt: Vec<Range<usize>> = slices
+                .into_iter()
+                .flat_map(|slices| slices.chunks[slices.dealt].to_vec())
+                .collect();
             assert_eq!(dealt, chunks);
         }
     }

@@ -25,19 +25,33 @@ pub struct Conditions {
 
 impl Conditions {
     pub fn new(randomization: Option<&Arc<Randomization>>) -> Self {
-        Self { randomization: randomization.cloned(), draw: None, assisted: 0.0, twisted: false, bias: Vec::new() }
+        Self {
+            randomization: randomization.cloned(),
+            draw: None,
+            assisted: 0.0,
+            twisted: false,
+            bias: Vec::new(),
+        }
     }
 
     /// Draws the conditions of the episode of `rng`, which is randomised with this `probability`. Gives the simulation its
     /// physics, after which the state must be reset.
     pub fn begin(&mut self, rng: &Rng, probability: f64, sim: &mut Simulation, task: &Task) {
-        self.draw =
-            self.randomization.as_ref().and_then(|randomization| randomization.draw(rng, probability, &task.hand));
-        self.assisted = (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
+        self.draw = self
+            .randomization
+            .as_ref()
+            .and_then(|randomization| randomization.draw(rng, probability, &task.hand));
+        self.assisted =
+            (2.0 * rng::uniform(&mut rng::beside(rng, "assist"), 0.0, 1.0) - 1.0).max(0.0);
         self.twisted = false;
         self.bias.clear();
-        sensing::combine(&mut self.bias, task.bias.draw(&mut rng::beside(rng, "bias")));
-        let Some(randomization) = &self.randomization else { return };
+        sensing::combine(
+            &mut self.bias,
+            task.bias.draw(&mut rng::beside(rng, "bias")),
+        );
+        let Some(randomization) = &self.randomization else {
+            return;
+        };
         sim.change_scene(&randomization.scene_of(self.draw.as_ref(), &task.hand));
         if self.draw.as_ref().is_some_and(|draw| draw.has_bias) {
             let rng = &mut rng::beside(rng, "bias of randomization");
@@ -52,20 +66,38 @@ impl Conditions {
 
     /// The largest delay of any episode.
     pub fn most_delay(&self, task: &Task) -> usize {
-        let drawn = self.randomization.as_ref().map_or(0, |randomization| randomization.config.delay[1]);
+        let drawn = self
+            .randomization
+            .as_ref()
+            .map_or(0, |randomization| randomization.config.delay[1]);
         (task.config.action_delay + drawn) as usize
     }
 
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.
-    pub fn push(&self, rng: &Rng, step: u32, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
-        let force = self.randomization.as_ref()?.push(self.draw.as_ref()?, rng, step)?;
+    pub fn push(
+        &self,
+        rng: &Rng,
+        step: u32,
+        sim: &mut Simulation,
+        task: &Task,
+    ) -> Option<[f64; 3]> {
+        let force = self
+            .randomization
+            .as_ref()?
+            .push(self.draw.as_ref()?, rng, step)?;
         sim.push(task.hand.object.body, force);
         Some(force)
     }
 
     /// Applies the torque that helps to turn the object by the rotation `left`, and returns it, N m, if there is one. With full
     /// assistance, the task's object gets an angular acceleration of `most` for each rad.
-    pub fn assist(&mut self, most: f64, left: Quat, sim: &mut Simulation, task: &Task) -> Option<[f64; 3]> {
+    pub fn assist(
+        &mut self,
+        most: f64,
+        left: Quat,
+        sim: &mut Simulation,
+        task: &Task,
+    ) -> Option<[f64; 3]> {
         let factor = self.assisted * most * task.hand.object.inertia;
         if factor == 0.0 && !self.twisted {
             return None;
@@ -79,12 +111,20 @@ impl Conditions {
     /// Adds sensor noise for step `steps` and the constant offset of the episode that owns `rng`.
     pub fn disturb(&self, rng: &Rng, steps: u32, task: &Task, observation: &mut [f32]) {
         let drawn = self.randomization.as_ref().zip(self.draw.as_ref());
-        let spreads = [Some(&task.noise), drawn.and_then(|(randomization, draw)| randomization.noise(draw))];
-        let noises = spreads.into_iter().flatten().filter(|spread| !spread.is_empty());
+        let spreads = [
+            Some(&task.noise),
+            drawn.and_then(|(randomization, draw)| randomization.noise(draw)),
+        ];
+        let noises = spreads
+            .into_iter()
+            .flatten()
+            .filter(|spread| !spread.is_empty());
         let mut noise_rng = None;
         for noise in noises {
             let rng = noise_rng.get_or_insert_with(|| rng::beside_at(rng, "noise", steps));
-            noise.draw(rng).for_each(|(i, added)| observation[i] += added);
+            noise
+                .draw(rng)
+                .for_each(|(i, added)| observation[i] += added);
         }
         if noise_rng.is_some() || !self.bias.is_empty() {
             sensing::offset(observation, &self.bias, &task.hand.layout);

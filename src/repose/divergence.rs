@@ -39,7 +39,10 @@ impl Diverged {
             "actions": actions,
         });
         add_settings(config, &mut dump);
-        dump["randomization"] = self.draw.as_ref().map_or(Value::Null, |draw| draw.physics.as_json());
+        dump["randomization"] = self
+            .draw
+            .as_ref()
+            .map_or(Value::Null, |draw| draw.physics.as_json());
         dump["pushes"] = json!(tail.pushes);
         dump["torques"] = json!(tail.torques);
         format!("{dump}\n")
@@ -85,10 +88,24 @@ pub struct Recorder {
 
 impl Recorder {
     /// Records a step that is about to be taken, after its controls have been set.
-    pub fn record(&mut self, sim: &Simulation, action: &[f32], push: Option<[f64; 3]>, torque: Option<[f64; 3]>) {
+    pub fn record(
+        &mut self,
+        sim: &Simulation,
+        action: &[f32],
+        push: Option<[f64; 3]>,
+        torque: Option<[f64; 3]>,
+    ) {
         let width = action.len();
-        if self.now.as_ref().is_none_or(|tail| tail.controls.len() == STEPS * width) {
-            self.before = self.now.replace(Tail { start: sim.state(), width, ..Tail::default() });
+        if self
+            .now
+            .as_ref()
+            .is_none_or(|tail| tail.controls.len() == STEPS * width)
+        {
+            self.before = self.now.replace(Tail {
+                start: sim.state(),
+                width,
+                ..Tail::default()
+            });
         }
         let tail = self.now.as_mut().expect("just begun");
         tail.controls.extend(sim.ctrl());

@@ -106,8 +106,12 @@ impl Repose {
     fn actuate(&mut self, action: &[f32]) {
         let last = &mut self.last;
         std::mem::swap(&mut last.previous_action, &mut last.action);
-        last.action.iter_mut().zip(action).for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
-        self.servos.apply(&last.action, &self.task.hand.actuators, &self.lesson);
+        last.action
+            .iter_mut()
+            .zip(action)
+            .for_each(|(clipped, action)| *clipped = action.clamp(-1.0, 1.0));
+        self.servos
+            .apply(&last.action, &self.task.hand.actuators, &self.lesson);
         self.send();
     }
 
@@ -122,10 +126,15 @@ impl Repose {
     fn advance(&mut self, action: &[f32]) {
         let rot_dist_before = self.rot_dist();
         self.actuate(action);
-        self.last.push = self.conditions.push(&self.rng, self.episode.length, &mut self.sim, &self.task);
+        self.last.push =
+            self.conditions
+                .push(&self.rng, self.episode.length, &mut self.sim, &self.task);
         let left = quat::mul(self.goal, quat::conj(self.object().orientation));
-        let torque = self.conditions.assist(self.lesson.assist, left, &mut self.sim, &self.task);
-        self.recorder.record(&self.sim, action, self.last.push, torque);
+        let torque = self
+            .conditions
+            .assist(self.lesson.assist, left, &mut self.sim, &self.task);
+        self.recorder
+            .record(&self.sim, action, self.last.push, torque);
         self.last.diverged = self.sim.step(self.task.config.substeps());
         if self.last.diverged {
             // MuJoCo may have cleared the controls. Restore what was sent for anyone who reads them.
@@ -170,7 +179,13 @@ impl Repose {
     fn replace_goal(&mut self) {
         self.goal = self.draw_rotation();
         let position = self.task.goal_place();
-        self.sim.place(self.task.hand.goal, Pose { position, orientation: self.goal });
+        self.sim.place(
+            self.task.hand.goal,
+            Pose {
+                position,
+                orientation: self.goal,
+            },
+        );
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
@@ -179,7 +194,10 @@ impl Repose {
     fn restore_times(&mut self, [age, held]: [u64; 2]) -> Result<()> {
         // `age` has no tighter limit: a fork may have shorter episodes.
         let possible = age <= u64::from(u32::MAX / 2) && held <= age;
-        ensure!(possible, "impossible episode: at step {age} its goal has been held for {held} steps");
+        ensure!(
+            possible,
+            "impossible episode: at step {age} its goal has been held for {held} steps"
+        );
         self.age = age as u32;
         self.held = held as u32;
         Ok(())
@@ -208,31 +226,55 @@ impl Env for Repose {
         let hand = &task.hand;
         let config = &task.config;
         self.rng = rng;
-        self.conditions.begin(&self.rng, self.lesson.randomized, &mut self.sim, &task);
+        self.conditions
+            .begin(&self.rng, self.lesson.randomized, &mut self.sim, &task);
         self.sim.reset();
         self.sim.qpos_mut().copy_from_slice(&hand.start);
         for joint in &hand.joints {
-            let noise = rng::uniform(&mut self.rng, -config.reset_dof_pos_noise, config.reset_dof_pos_noise);
+            let noise = rng::uniform(
+                &mut self.rng,
+                -config.reset_dof_pos_noise,
+                config.reset_dof_pos_noise,
+            );
             let angle = &mut self.sim.qpos_mut()[joint.qpos];
             *angle = (*angle + noise).clamp(joint.range[0], joint.range[1]);
         }
         for joint in &hand.joints {
-            let noise = rng::uniform(&mut self.rng, -config.reset_dof_vel_noise, config.reset_dof_vel_noise);
+            let noise = rng::uniform(
+                &mut self.rng,
+                -config.reset_dof_vel_noise,
+                config.reset_dof_vel_noise,
+            );
             self.sim.qvel_mut()[joint.dof] = noise;
         }
         for (axis, start) in config.goal_position.value.into_iter().enumerate() {
-            let noise = rng::uniform(&mut self.rng, -config.reset_position_noise, config.reset_position_noise);
+            let noise = rng::uniform(
+                &mut self.rng,
+                -config.reset_position_noise,
+                config.reset_position_noise,
+            );
             self.sim.qpos_mut()[hand.object.qpos + axis] = start + noise;
         }
         let orientation = self.draw_rotation();
-        self.sim.qpos_mut()[hand.object.qpos + 3..hand.object.qpos + 7].copy_from_slice(&orientation);
+        self.sim.qpos_mut()[hand.object.qpos + 3..hand.object.qpos + 7]
+            .copy_from_slice(&orientation);
         self.replace_goal();
-        let target = |actuator: &Actuator| self.sim.length(*actuator).clamp(actuator.range[0], actuator.range[1]);
-        self.servos.reset(hand.actuators.iter().map(target), self.conditions.delay(&self.task));
+        let target = |actuator: &Actuator| {
+            self.sim
+                .length(*actuator)
+                .clamp(actuator.range[0], actuator.range[1])
+        };
+        self.servos.reset(
+            hand.actuators.iter().map(target),
+            self.conditions.delay(&self.task),
+        );
         self.send();
         self.last.action.fill(0.0);
         self.age = 0;
-        self.episode = EpisodeStats { randomized: self.conditions.draw.is_some(), ..Default::default() };
+        self.episode = EpisodeStats {
+            randomized: self.conditions.draw.is_some(),
+            ..Default::default()
+        };
         self.recorder = Recorder::default();
         self.show(observation);
     }
@@ -252,7 +294,10 @@ impl Env for Repose {
         let reached = if self.last.diverged {
             let draw = self.conditions.draw.clone();
             let length = self.episode.length;
-            self.diverged = self.recorder.tail().map(|tail| Diverged { length, draw, tail });
+            self.diverged = self
+                .recorder
+                .tail()
+                .map(|tail| Diverged { length, draw, tail });
             false
         } else {
             self.pay();
@@ -262,8 +307,14 @@ impl Env for Repose {
             Some(End::Terminated)
         } else {
             let time_is_up = self.age >= self.task.config.max_episode_steps();
-            let goal_ends = if reached { self.lesson.goals_end } else { self.gives_up() };
-            time_is_up.then_some(End::Truncated).or(goal_ends.then_some(End::Redirected))
+            let goal_ends = if reached {
+                self.lesson.goals_end
+            } else {
+                self.gives_up()
+            };
+            time_is_up
+                .then_some(End::Truncated)
+                .or(goal_ends.then_some(End::Redirected))
         };
         // When the goal is cut off, its final observation must show the old goal. `redirect` replaces it afterwards.
         if reached && !self.lesson.goals_end {
@@ -271,7 +322,10 @@ impl Env for Repose {
         }
         self.show(observation);
         let reward = self.lesson.total(self.last.reward, self.last.training);
-        Transition { reward: reward as f32, end }
+        Transition {
+            reward: reward as f32,
+            end,
+        }
     }
 
     /// Draws another goal and resets the hold counter.
@@ -292,34 +346,67 @@ impl Resumable for Repose {
         state.counters.push(u64::from(self.episode.randomized));
         state.put_list(self.sim.state());
         state.numbers.extend(self.goal);
-        state.numbers.extend(self.last.action.iter().copied().map(f64::from));
+        state
+            .numbers
+            .extend(self.last.action.iter().copied().map(f64::from));
         state.numbers.extend(&self.servos.targets);
         self.episode.save(state);
         // As long as it can become, so that all environments of a run have equally many values.
-        state.put_list(self.servos.under_way(self.conditions.most_delay(&self.task)));
+        state.put_list(
+            self.servos
+                .under_way(self.conditions.most_delay(&self.task)),
+        );
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
         self.rng = rng::at(state.counters()?);
         self.restore_times(state.counters()?)?;
         let [randomized] = state.counters()?;
-        ensure!(randomized <= 1, "the mark of a randomised episode is {randomized}, not 0 or 1");
-        self.conditions.begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
+        ensure!(
+            randomized <= 1,
+            "the mark of a randomised episode is {randomized}, not 0 or 1"
+        );
+        self.conditions
+            .begin(&self.rng, randomized as f64, &mut self.sim, &self.task);
         self.sim.restore(state.list()?)?;
         // A fork may also have no forces on the object, but its parent's state has one.
         self.sim.push(self.task.hand.object.body, [0.0; 3]);
         self.sim.twist(self.task.hand.object.body, [0.0; 3]);
         self.goal = state.numbers()?;
-        ensure!((quat::length(&self.goal) - 1.0).abs() < 1e-6, "the goal is not a unit quaternion: {:?}", self.goal);
+        ensure!(
+            (quat::length(&self.goal) - 1.0).abs() < 1e-6,
+            "the goal is not a unit quaternion: {:?}",
+            self.goal
+        );
         let actuators = self.task.hand.actuators.len();
-        self.last.action.iter_mut().zip(state.next(actuators)?).for_each(|(own, x)| *own = *x as f32);
-        let clipped = self.last.action.iter().all(|action| (-1.0..=1.0).contains(action));
-        ensure!(clipped, "the previous action is outside [-1, 1]: {:?}", self.last.action);
+        self.last
+            .action
+            .iter_mut()
+            .zip(state.next(actuators)?)
+            .for_each(|(own, x)| *own = *x as f32);
+        let clipped = self
+            .last
+            .action
+            .iter()
+            .all(|action| (-1.0..=1.0).contains(action));
+        ensure!(
+            clipped,
+            "the previous action is outside [-1, 1]: {:?}",
+            self.last.action
+        );
         let targets = state.next(actuators)?;
-        self.episode = EpisodeStats { randomized: self.conditions.draw.is_some(), ..EpisodeStats::saved(state)? };
+        self.episode = EpisodeStats {
+            randomized: self.conditions.draw.is_some(),
+            ..EpisodeStats::saved(state)?
+        };
         let under_way = state.list()?;
-        ensure!(under_way.len().is_multiple_of(actuators), "it has {} targets under way", under_way.len());
-        self.servos.restore(targets, under_way, self.conditions.delay(&self.task));
+        ensure!(
+            under_way.len().is_multiple_of(actuators),
+            "it has {} targets under way",
+            under_way.len()
+        );
+        self.servos
+            .restore(targets, under_way, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
         self.recorder = Recorder::default();
         self.show(observation);

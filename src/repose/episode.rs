@@ -35,8 +35,12 @@ impl EpisodeStats {
     pub(super) fn save(&self, state: &mut EnvState) {
         state.numbers.push(self.rot_dist_sum);
         state.numbers.extend(self.reward);
-        state.counters.extend([self.length, self.goals, self.in_tolerance].map(u64::from));
-        state.counters.extend([self.dropped, self.diverged].map(u64::from));
+        state
+            .counters
+            .extend([self.length, self.goals, self.in_tolerance].map(u64::from));
+        state
+            .counters
+            .extend([self.dropped, self.diverged].map(u64::from));
     }
 
     /// # Errors
@@ -45,11 +49,24 @@ impl EpisodeStats {
         let [rot_dist_sum] = state.numbers()?;
         let reward = state.numbers()?;
         let [length, goals, in_tolerance, dropped, diverged] = state.counters()?;
-        let possible = length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
-        ensure!(possible, "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance");
+        let possible =
+            length <= u64::from(u32::MAX / 2) && goals <= length && in_tolerance <= length;
+        ensure!(
+            possible,
+            "impossible episode: {length} steps, {goals} goals, {in_tolerance} steps in tolerance"
+        );
         let [length, goals, in_tolerance] = [length, goals, in_tolerance].map(|count| count as u32);
         let [dropped, diverged] = [dropped, diverged].map(|flag| flag != 0);
-        Ok(Self { length, goals, in_tolerance, rot_dist_sum, reward, dropped, diverged, ..Self::default() })
+        Ok(Self {
+            length,
+            goals,
+            in_tolerance,
+            rot_dist_sum,
+            reward,
+            dropped,
+            diverged,
+            ..Self::default()
+        })
     }
 }
 
@@ -77,7 +94,11 @@ impl StepSums {
     /// The mean of each term that training adds, by name, and the rotation towards the goal in 100 steps, rad.
     pub fn training_named(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let turned = 100.0 * self.turned / self.steps as f64;
-        named(training_terms(), self.training.map(|sum| sum / self.steps as f64)).chain([("turned", turned)])
+        named(
+            training_terms(),
+            self.training.map(|sum| sum / self.steps as f64),
+        )
+        .chain([("turned", turned)])
     }
 }
 

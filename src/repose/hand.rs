@@ -7,14 +7,14 @@ use crate::sim::{Actuator, Body, Frame, FreeJoint, Hinge, Mocap, Parts, Scene};
 
 /// Joints of the Shadow Hand in observation order, without the prefix that they have in a scene.
 pub const JOINTS: [&str; 24] = [
-    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
-    "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
+    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2",
+    "MFJ1", "RFJ4", "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
 ];
 
 /// Actuators of the Shadow Hand in action order, without the prefix and `A_`. A J0 drives the sum of J2 and J1.
 pub const ACTUATORS: [&str; 20] = [
-    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "RFJ4", "RFJ3", "RFJ0",
-    "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
+    "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ0", "MFJ4", "MFJ3", "MFJ0", "RFJ4",
+    "RFJ3", "RFJ0", "LFJ5", "LFJ4", "LFJ3", "LFJ0", "WRJ2", "WRJ1",
 ];
 
 /// Fingertip bodies of the Shadow Hand in observation order, without the prefix.
@@ -76,17 +76,34 @@ impl Hand {
     pub fn bind(scene: &Scene, parts: Parts) -> Result<Self> {
         let mut problems = Vec::new();
         let joints = each(&parts.joints, |joint| scene.hinge(joint), &mut problems);
-        let actuators = each(&parts.actuators, |actuator| scene.servo(actuator), &mut problems);
+        let actuators = each(
+            &parts.actuators,
+            |actuator| scene.servo(actuator),
+            &mut problems,
+        );
         let fingertips = each(&parts.fingertips, |tip| scene.frame(tip), &mut problems);
-        let object = scene.free_body(&parts.object).map_err(|error| problems.push(error.to_string()));
-        let goal = scene.mocap(&parts.goal).map_err(|error| problems.push(error.to_string()));
-        let keyframe = scene.start(&parts.start).map_err(|error| problems.push(error.to_string()));
-        let driven: Vec<_> = actuators.iter().map(|&actuator| scene.driven(actuator)).collect();
-        let refused = driven.iter().flatten().filter_map(|(joint, _)| scene.hinge(joint).err());
+        let object = scene
+            .free_body(&parts.object)
+            .map_err(|error| problems.push(error.to_string()));
+        let goal = scene
+            .mocap(&parts.goal)
+            .map_err(|error| problems.push(error.to_string()));
+        let keyframe = scene
+            .start(&parts.start)
+            .map_err(|error| problems.push(error.to_string()));
+        let driven: Vec<_> = actuators
+            .iter()
+            .map(|&actuator| scene.driven(actuator))
+            .collect();
+        let refused = driven
+            .iter()
+            .flatten()
+            .filter_map(|(joint, _)| scene.hinge(joint).err());
         problems.extend(refused.map(|error| error.to_string()));
         problems.sort();
         problems.dedup();
-        let (Ok(object), Ok(goal), Ok(keyframe), []) = (object, goal, keyframe, &problems[..]) else {
+        let (Ok(object), Ok(goal), Ok(keyframe), []) = (object, goal, keyframe, &problems[..])
+        else {
             bail!(problems.join("; "))
         };
         let controls = scene.controls();
@@ -100,34 +117,65 @@ impl Hand {
         roots.dedup();
         let start = scene.pose_of(keyframe);
         let layout = Layout::new(joints.len(), fingertips.len(), actuators.len());
-        let hand = Self { parts, joints, actuators, driven, fingertips, roots, object, goal, keyframe, start, layout };
+        let hand = Self {
+            parts,
+            joints,
+            actuators,
+            driven,
+            fingertips,
+            roots,
+            object,
+            goal,
+            keyframe,
+            start,
+            layout,
+        };
         hand.expect_shadow_drives()?;
         Ok(hand)
     }
 
     /// Where an episode starts the object, before noise, m.
     pub fn place(&self) -> [f64; 3] {
-        *self.start[self.object.qpos..].first_chunk().expect("a free joint")
+        *self.start[self.object.qpos..]
+            .first_chunk()
+            .expect("a free joint")
     }
 
     /// The prefix of its names if it has the names of the Shadow Hand.
     pub fn side(&self) -> Option<&str> {
         let prefix = self.parts.joints.first()?.strip_suffix(JOINTS[0])?;
-        let names = self.parts.joints.iter().map(|name| name.strip_prefix(prefix));
+        let names = self
+            .parts
+            .joints
+            .iter()
+            .map(|name| name.strip_prefix(prefix));
         names.eq(JOINTS.map(Some)).then_some(prefix)
     }
 
     /// Checks that a hand with the names of the Shadow Hand has its drives.
     fn expect_shadow_drives(&self) -> Result<()> {
-        let Some(prefix) = self.side() else { return Ok(()) };
+        let Some(prefix) = self.side() else {
+            return Ok(());
+        };
         for (name, driven) in self.parts.actuators.iter().zip(&self.driven) {
-            let Some(actuator) = name.strip_prefix(prefix).and_then(|name| name.strip_prefix("A_")) else { continue };
+            let Some(actuator) = name
+                .strip_prefix(prefix)
+                .and_then(|name| name.strip_prefix("A_"))
+            else {
+                continue;
+            };
             let expected = match actuator.strip_suffix("J0") {
                 Some(finger) => vec![format!("{prefix}{finger}J1"), format!("{prefix}{finger}J2")],
                 None => vec![format!("{prefix}{actuator}")],
             };
-            let all = expected.iter().all(|joint| driven.contains(&(joint.clone(), 1.0)));
-            ensure!(all && driven.len() == expected.len(), "actuator `{name}` must drive {}", expected.join(" + "));
+            let all = expected
+                .iter()
+                .all(|joint| driven.contains(&(joint.clone(), 1.0)));
+            ensure!(
+                all && driven.len() == expected.len(),
+                "actuator `{name}` must drive {}",
+                expected.join(" + ")
+            );
         }
         Ok(())
     }
@@ -138,13 +186,17 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
     let joints = scene.joints();
     let actuators = scene.actuators();
 
-    let with = |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
-    let mut hands = joints.iter().filter_map(|name| name.strip_suffix(JOINTS[0])).map(|prefix| Parts {
-        joints: with(&JOINTS, prefix),
-        actuators: with(&ACTUATORS, &format!("{prefix}A_")),
-        fingertips: with(&FINGERTIPS, prefix),
-        ..Parts::default()
-    });
+    let with =
+        |names: &[&str], prefix: &str| names.iter().map(|name| format!("{prefix}{name}")).collect();
+    let mut hands = joints
+        .iter()
+        .filter_map(|name| name.strip_suffix(JOINTS[0]))
+        .map(|prefix| Parts {
+            joints: with(&JOINTS, prefix),
+            actuators: with(&ACTUATORS, &format!("{prefix}A_")),
+            fingertips: with(&FINGERTIPS, prefix),
+            ..Parts::default()
+        });
     hands.find(|hand| {
         hand.joints.iter().all(|name| joints.contains(name))
             && hand.actuators.iter().all(|name| actuators.contains(name))
@@ -153,8 +205,22 @@ fn shadow_hand(scene: &Scene) -> Option<Parts> {
 }
 
 /// Finds each of these names, and lists what is wrong.
-fn each<T>(names: &[String], find: impl Fn(&str) -> Result<T>, problems: &mut Vec<String>) -> Vec<T> {
-    let twice = names.iter().enumerate().filter(|(i, name)| names[..*i].contains(name));
+fn each<T>(
+    names: &[String],
+    find: impl Fn(&str) -> Result<T>,
+    problems: &mut Vec<String>,
+) -> Vec<T> {
+    let twice = names
+        .iter()
+        .enumerate()
+        .filter(|(i, name)| names[..*i].contains(name));
     problems.extend(twice.map(|(_, name)| format!("`{name}` is named twice")));
-    names.iter().filter_map(|name| find(name).map_err(|error| problems.push(error.to_string())).ok()).collect()
+    names
+        .iter()
+        .filter_map(|name| {
+            find(name)
+                .map_err(|error| problems.push(error.to_string()))
+                .ok()
+        })
+        .collect()
 }

@@ -48,7 +48,11 @@ impl Lesson {
             assist: training.assist.at(env_steps),
             tolerance: training.tolerance.at(env_steps),
             hold: training.hold.at(env_steps).round() as u32,
-            redirect_chance: if training.goal_lifetime == 0 { 0.0 } else { 1.0 / training.goal_lifetime as f64 },
+            redirect_chance: if training.goal_lifetime == 0 {
+                0.0
+            } else {
+                1.0 / training.goal_lifetime as f64
+            },
             goals_end: true,
             randomized: config.randomization.share.at(env_steps),
             task_reward: training.task_reward.at(env_steps),
@@ -59,14 +63,26 @@ impl Lesson {
     fn described(&self) -> Vec<(Description, f64)> {
         let mut all = vec![
             (
-                Description("tolerance", "The rotation error, rad, up to which a goal counts in training."),
+                Description(
+                    "tolerance",
+                    "The rotation error, rad, up to which a goal counts in training.",
+                ),
                 self.tolerance,
             ),
             (
-                Description("hold", "The steps within the tolerance that reach a goal in training."),
+                Description(
+                    "hold",
+                    "The steps within the tolerance that reach a goal in training.",
+                ),
                 f64::from(self.hold),
             ),
-            (Description("task_reward", "The weight of the task's reward in training."), self.task_reward),
+            (
+                Description(
+                    "task_reward",
+                    "The weight of the task's reward in training.",
+                ),
+                self.task_reward,
+            ),
         ];
         all.extend(ramped(&self.weights));
         all.extend([
@@ -85,12 +101,17 @@ impl Lesson {
 
     /// The values that change during training, by name.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, f64)> {
-        self.described().into_iter().map(|(about, value)| (about.0, value))
+        self.described()
+            .into_iter()
+            .map(|(about, value)| (about.0, value))
     }
 
     /// The descriptions of these values.
     pub fn descriptions() -> impl Iterator<Item = Description> {
-        Self::default().described().into_iter().map(|(about, _)| about)
+        Self::default()
+            .described()
+            .into_iter()
+            .map(|(about, _)| about)
     }
 
     /// The reward that training adds to a step.
@@ -115,19 +136,37 @@ mod tests {
     }
 
     fn step(rot_dist_before: f64, rot_dist: f64, within: bool, dropped: bool) -> Step {
-        Step { rot_dist_before, rot_dist, within, dropped, ..Step::default() }
+        Step {
+            rot_dist_before,
+            rot_dist,
+            within,
+            dropped,
+            ..Step::default()
+        }
     }
 
     #[test]
     fn the_task_itself_pays_its_own_reward_alone() {
         let task = Lesson::task(&Config::default().env);
-        assert_eq!(task.total([1.25, 0.0, 0.0, 0.0, 0.0], task.reward(&step(3.0, 0.0, true, true))), 1.25);
-        assert_eq!((task.tolerance, task.hold, task.goals_end), (0.1, 50, false));
+        assert_eq!(
+            task.total(
+                [1.25, 0.0, 0.0, 0.0, 0.0],
+                task.reward(&step(3.0, 0.0, true, true))
+            ),
+            1.25
+        );
+        assert_eq!(
+            (task.tolerance, task.hold, task.goals_end),
+            (0.1, 50, false)
+        );
     }
 
     #[test]
     fn tolerance_and_hold_follow_their_ramps() {
-        let sets = ["training.tolerance={from=0.4,to=0.1,steps=1000}", "training.hold={from=1,to=50,steps=2000}"];
+        let sets = [
+            "training.tolerance={from=0.4,to=0.1,steps=1000}",
+            "training.hold={from=1,to=50,steps=2000}",
+        ];
         let found = [0, 500, 1000, 2000, 9000].map(|steps| at(steps, &sets));
         let tolerances = found.map(|lesson| (lesson.tolerance * 1e6).round() / 1e6);
         assert_eq!(tolerances, [0.4, 0.2, 0.1, 0.1, 0.1]);
@@ -136,25 +175,37 @@ mod tests {
 
     #[test]
     fn what_training_asks_does_not_follow_the_task() {
-        let sets = ["env.success_tolerance=0.3", "env.max_consecutive_successes=7"];
+        let sets = [
+            "env.success_tolerance=0.3",
+            "env.max_consecutive_successes=7",
+        ];
         assert_eq!(at(1 << 40, &sets), at(1 << 40, &[]));
     }
 
     #[test]
     fn training_pays_for_progress_holding_and_drops_besides_the_weighted_task() {
-        let sets = ["training.progress_reward=10", "training.approach_reward=0", "training.hold_reward=2"];
+        let sets = [
+            "training.progress_reward=10",
+            "training.approach_reward=0",
+            "training.hold_reward=2",
+        ];
         let sets = [&sets[..], &["training.task_reward=0.5"]].concat();
         let lesson = at(0, &[&sets[..], &["training.drop_reward=-3"]].concat());
         let reward = lesson.reward(&step(0.0, 0.25, true, false));
         assert_eq!(reward, [-2.5, 0.0, 2.0, 0.0]);
         assert_eq!(lesson.total([4.0, 0.0, 0.0, 0.0, 0.0], reward), 1.5);
-        assert_eq!(lesson.reward(&step(0.25, 0.0, false, true)), [2.5, 0.0, 0.0, -3.0]);
+        assert_eq!(
+            lesson.reward(&step(0.25, 0.0, false, true)),
+            [2.5, 0.0, 0.0, -3.0]
+        );
         let sets = ["training.drop_reward={from=1,to=-3,steps=100}"];
-        let drops = [0, 50, 100, 500].map(|steps| at(steps, &sets).reward(&step(0.0, 0.0, false, true))[3]);
+        let drops =
+            [0, 50, 100, 500].map(|steps| at(steps, &sets).reward(&step(0.0, 0.0, false, true))[3]);
         assert_eq!(drops, [1.0, -1.0, -3.0, -3.0]);
         let sets = ["training.task_reward={from=1,to=0,steps=100}"];
-        let weights =
-            [0, 50, 100, 500].map(|steps| at(steps, &sets).total([1.0, 0.0, 0.0, 0.0, 0.0], TrainingReward::default()));
+        let weights = [0, 50, 100, 500].map(|steps| {
+            at(steps, &sets).total([1.0, 0.0, 0.0, 0.0, 0.0], TrainingReward::default())
+        });
         assert_eq!(weights, [1.0, 0.5, 0.0, 0.0]);
     }
 
@@ -163,7 +214,11 @@ mod tests {
         let lesson = at(0, &["training.approach_reward=20"]);
         let paid = |before, after| lesson.reward(&step(before, after, false, false))[1];
         let factor_e = std::f64::consts::E * (0.3 + 0.1) - 0.1;
-        assert!((paid(factor_e, 0.3) - 20.0).abs() < 1e-9, "{}", paid(factor_e, 0.3));
+        assert!(
+            (paid(factor_e, 0.3) - 20.0).abs() < 1e-9,
+            "{}",
+            paid(factor_e, 0.3)
+        );
         assert!(paid(0.4, 0.2) > 5.0 * paid(2.4, 2.2));
         assert!((paid(1.0, 0.3) + paid(0.3, 2.0) + paid(2.0, 1.0)).abs() < 1e-9);
     }

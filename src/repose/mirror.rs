@@ -37,7 +37,10 @@ impl Mirror {
         let compare = |at: usize| {
             let [x, y, z, own @ ..] = here.tips[at];
             let [a, b, c, other @ ..] = policy.tips[at];
-            let apart = [x - a, -y - b, z - c].into_iter().map(f64::abs).fold(0.0, f64::max);
+            let apart = [x - a, -y - b, z - c]
+                .into_iter()
+                .map(f64::abs)
+                .fold(0.0, f64::max);
             (apart, quat::mul(quat::conj(mirrored(own)), other))
         };
         let mut tips = Vec::new();
@@ -55,20 +58,30 @@ impl Mirror {
             }
             tips.push((start + TIP_QUAT, turn));
         }
-        Ok(Self { signs: layout.mirrored(), tips })
+        Ok(Self {
+            signs: layout.mirrored(),
+            tips,
+        })
     }
 
     /// The mirror between hands whose names do not tell that they are on different sides, if the fingertips are in the same places only in
     /// the mirror.
     pub fn by_fingertips(here: &Record, policy: &Record, layout: &Layout) -> Option<Self> {
-        let is_near = |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
+        let is_near =
+            |(a, b): (&[f64; 7], &[f64; 7])| (0..3).all(|i| (a[i] - b[i]).abs() <= TOLERANCE);
         let is_same = here.tips.iter().zip(&policy.tips).all(is_near);
-        if is_same { None } else { Self::new(here, policy, layout).ok() }
+        if is_same {
+            None
+        } else {
+            Self::new(here, policy, layout).ok()
+        }
     }
 
     /// Mirrors an observation in place.
     pub fn apply(&self, observation: &mut [f32]) {
-        self.signs.iter().for_each(|&i| observation[i] = -observation[i]);
+        self.signs
+            .iter()
+            .for_each(|&i| observation[i] = -observation[i]);
         for &(at, turn) in &self.tips {
             let own: [f32; 4] = *observation[at..].first_chunk().expect("an orientation");
             let turned = quat::mul(own, turn.map(|x| x as f32));

@@ -26,6 +26,9 @@ pub use observation::{Group, Layout};
 pub use physics::{Physics, QUANTITIES, Quantity, add_settings};
 pub use randomization::{EpisodePhysics, Randomization};
 pub use record::Record;
-pub use reward::{Description, Step, TaskReward, TrainingReward, add, named, task_reward, task_terms, training_terms};
+pub use reward::{
+    Description, Step, TaskReward, TrainingReward, add, named, task_reward, task_terms,
+    training_terms,
+};
 pub use score::{Better, HEADLINE, MEASURES, Measure, OF_EVALUATIONS, OF_TRAINING, Score, measure};
 pub use task::Task;

@@ -33,7 +33,8 @@ pub enum Sensing {
 pub const TIP_SIZE: usize = 13;
 /// The index of its quaternion among them.
 pub const TIP_QUAT: usize = 3;
-const OF_FINGERTIPS: &str = "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
+const OF_FINGERTIPS: &str =
+    "each: position 3 m, quaternion 4, linear 3 m/s, angular velocity 3 rad/s";
 
 // The places of groups in the table.
 pub const OBJECT_QUAT: usize = 3;
@@ -64,7 +65,13 @@ impl Layout {
         const TIP: &[usize] = &[1, 4, 6, 8, 10, 12];
         let table = [
             ("joint_pos", Measured, joints, "rad", NOTHING),
-            ("joint_vel", Measured, joints, "rad/s * vel_obs_scale", NOTHING),
+            (
+                "joint_vel",
+                Measured,
+                joints,
+                "rad/s * vel_obs_scale",
+                NOTHING,
+            ),
             ("cube_pos", Measured, 3, "m", POINT),
             ("cube_quat", Measured, 4, "1", QUATERNION),
             ("cube_linvel", Measured, 3, "m/s", POINT),
@@ -72,15 +79,32 @@ impl Layout {
             ("goal_pos", Known, 3, "m", POINT),
             ("goal_quat", Known, 4, "1", QUATERNION),
             ("relative_quat", Known, 4, "1", QUATERNION),
-            ("fingertips", Measured, TIP_SIZE * fingertips, OF_FINGERTIPS, TIP),
+            (
+                "fingertips",
+                Measured,
+                TIP_SIZE * fingertips,
+                OF_FINGERTIPS,
+                TIP,
+            ),
             ("previous_action", Known, actuators, "1", NOTHING),
         ];
         let mut size = 0;
         let groups = table.map(|(name, sensing, length, unit, mirrored)| {
             size += length;
-            Group { name, start: size - length, length, unit, mirrored, sensing }
+            Group {
+                name,
+                start: size - length,
+                length,
+                unit,
+                mirrored,
+                sensing,
+            }
         });
-        Self { groups, size, actions: actuators }
+        Self {
+            groups,
+            size,
+            actions: actuators,
+        }
     }
 
     /// The groups that sensors measure.
@@ -102,7 +126,12 @@ impl Layout {
     /// The indices of the values that change their sign in the mirror, the plane y = 0 of the world.
     pub(super) fn mirrored(&self) -> Vec<usize> {
         // No other group in which something changes is longer than one fingertip.
-        let of_group = |Group { start, length, mirrored, .. }: Group| {
+        let of_group = |Group {
+                            start,
+                            length,
+                            mirrored,
+                            ..
+                        }: Group| {
             let parts = (start..start + length).step_by(TIP_SIZE);
             parts.flat_map(move |part| mirrored.iter().map(move |i| part + i))
         };
@@ -111,11 +140,17 @@ impl Layout {
 
     /// The description of observations and actions for a learner, for an object with these rotations.
     pub fn spaces(&self, rotations: &[usize]) -> Spaces {
-        let [object, goal, relative] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
+        let [object, goal, relative] =
+            [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| self.start(group));
         Spaces {
             observation_size: self.size,
             action_size: self.actions,
-            object_and_goal: Some(ObjectAndGoal { object, goal, relative, rotations: quat::mask(rotations) }),
+            object_and_goal: Some(ObjectAndGoal {
+                object,
+                goal,
+                relative,
+                rotations: quat::mask(rotations),
+            }),
             distance: rotation_error,
         }
     }
@@ -138,13 +173,23 @@ pub struct Writer<'a> {
 impl<'a> Writer<'a> {
     pub fn new(layout: &'a Layout, observation: &'a mut [f32]) -> Self {
         assert_eq!(observation.len(), layout.size, "observation length");
-        Self { layout, cells: observation, written: 0, part: 0 }
+        Self {
+            layout,
+            cells: observation,
+            written: 0,
+            part: 0,
+        }
     }
 
     /// Writes the next values, which must belong to the group `name`. This is the only place where the doubles of the physics
     /// become the floats of the learner.
     pub fn put(&mut self, name: &str, values: impl IntoIterator<Item = f64>) {
-        let Group { name: expected, start, length, .. } = self.layout.groups[self.part];
+        let Group {
+            name: expected,
+            start,
+            length,
+            ..
+        } = self.layout.groups[self.part];
         let end = start + length;
         assert!(name == expected, "{name}: {expected} comes first");
         for value in values {
@@ -157,7 +202,10 @@ impl<'a> Writer<'a> {
 
     /// Checks that every value has been overwritten.
     pub fn finish(self) {
-        assert_eq!(self.written, self.layout.size, "values written to an observation");
+        assert_eq!(
+            self.written, self.layout.size,
+            "values written to an observation"
+        );
     }
 }
 
@@ -168,7 +216,9 @@ mod tests {
     #[test]
     fn the_observation_is_laid_out_as_the_task_says() {
         let layout = Layout::new(24, 5, 20);
-        let found = layout.groups.map(|part| (part.name, part.start, part.length));
+        let found = layout
+            .groups
+            .map(|part| (part.name, part.start, part.length));
         let expected = [
             ("joint_pos", 0, 24),
             ("joint_vel", 24, 24),
@@ -195,8 +245,14 @@ mod tests {
             std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| write(&mut cells))).is_err()
         };
         assert!(!refused(|cells| cells.put("joint_pos", [0.0; 24])));
-        assert!(refused(|cells| cells.put("joint_pos", [0.0; 25])), "too many");
-        assert!(refused(|cells| cells.put("joint_vel", [0.0; 24])), "out of order");
+        assert!(
+            refused(|cells| cells.put("joint_pos", [0.0; 25])),
+            "too many"
+        );
+        assert!(
+            refused(|cells| cells.put("joint_vel", [0.0; 24])),
+            "out of order"
+        );
         let all = |cells: &mut Writer| {
             for part in Layout::new(24, 5, 20).groups {
                 (0..part.length).for_each(|_| cells.put(part.name, [0.0]));
@@ -206,6 +262,9 @@ mod tests {
         let mut cells = Writer::new(&layout, &mut observation);
         all(&mut cells);
         cells.finish();
-        assert!(refused(|cells| Writer::new(cells.layout, &mut [0.0; 157]).finish()), "nothing was written");
+        assert!(
+            refused(|cells| Writer::new(cells.layout, &mut [0.0; 157]).finish()),
+            "nothing was written"
+        );
     }
 }

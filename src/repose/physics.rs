@@ -54,7 +54,11 @@ pub const SHARED: usize = 10;
 
 /// The changes of each of these parts, given one value for all of them or one for each.
 fn each<T: Copy>(parts: &[T], values: &[f64], change: fn(T, f64) -> Change) -> Vec<Change> {
-    parts.iter().zip(values.iter().cycle()).map(|(&part, &value)| change(part, value)).collect()
+    parts
+        .iter()
+        .zip(values.iter().cycle())
+        .map(|(&part, &value)| change(part, value))
+        .collect()
 }
 
 fn vector(values: &[f64]) -> [f64; 3] {
@@ -113,7 +117,12 @@ impl Quantity {
     }
 
     /// Draws the values of an episode.
-    pub(super) fn draw(&self, config: &RandomizationConfig, hand: &Hand, rng: &mut Rng) -> Vec<f64> {
+    pub(super) fn draw(
+        &self,
+        config: &RandomizationConfig,
+        hand: &Hand,
+        rng: &mut Rng,
+    ) -> Vec<f64> {
         let axes = 0..3;
         match &self.law {
             Law::Uniform(range) => {
@@ -128,15 +137,23 @@ impl Quantity {
                 let [low, high] = range(config);
                 vec![f64::from(rng.random_range(low..=high))]
             }
-            Law::Within(limit) => axes.map(|_| rng::uniform(rng, -limit(config), limit(config))).collect(),
+            Law::Within(limit) => axes
+                .map(|_| rng::uniform(rng, -limit(config), limit(config)))
+                .collect(),
             Law::Normal(std) => axes.map(|_| normal(rng, std(config))).collect(),
             // With probability ½ all joints have the same factor. Independent draws alone would leave their mean near the middle.
             // A policy that has seen only such hands fails on one whose joints all have little damping.
             Law::Each(count, range) => {
                 let [low, high] = range(config);
                 let together = rng::uniform(rng, 0.0, 1.0) < 0.5;
-                let own: Vec<f64> = (0..count(hand)).map(|_| rng::uniform(rng, low.ln(), high.ln()).exp()).collect();
-                if together { vec![own[0]; own.len()] } else { own }
+                let own: Vec<f64> = (0..count(hand))
+                    .map(|_| rng::uniform(rng, low.ln(), high.ln()).exp())
+                    .collect();
+                if together {
+                    vec![own[0]; own.len()]
+                } else {
+                    own
+                }
             }
         }
     }
@@ -145,7 +162,11 @@ impl Quantity {
 /// The factors on the lengths of the object that are drawn.
 pub fn sizes([low, high]: [f64; 2]) -> Vec<f64> {
     let place = |i: usize| low + (high - low) * i as f64 / (SIZES - 1) as f64;
-    if low == high { vec![low] } else { (0..SIZES).map(place).collect() }
+    if low == high {
+        vec![low]
+    } else {
+        (0..SIZES).map(place).collect()
+    }
 }
 
 pub fn normal(rng: &mut Rng, std: f64) -> f64 {
@@ -159,18 +180,33 @@ pub struct Physics(pub(super) Vec<Vec<f64>>);
 impl Physics {
     /// The physics of the scene as it is.
     pub(super) fn neutral(hand: &Hand) -> Self {
-        Self(QUANTITIES.iter().map(|quantity| vec![quantity.neutral(); quantity.count(hand)]).collect())
+        Self(
+            QUANTITIES
+                .iter()
+                .map(|quantity| vec![quantity.neutral(); quantity.count(hand)])
+                .collect(),
+        )
     }
 
     /// The physics that a task sets.
     pub(super) fn of_task(config: &EnvConfig) -> Self {
-        Self(QUANTITIES.iter().map(|quantity| (quantity.task)(config)).collect())
+        Self(
+            QUANTITIES
+                .iter()
+                .map(|quantity| (quantity.task)(config))
+                .collect(),
+        )
     }
 
     /// What it changes in a scene.
     pub(super) fn changes(&self, hand: &Hand) -> Vec<Change> {
-        let differ = QUANTITIES.iter().zip(&self.0).filter(|(of, values)| values.iter().any(|x| *x != of.neutral()));
-        differ.flat_map(|(quantity, values)| (quantity.change)(hand, values)).collect()
+        let differ = QUANTITIES
+            .iter()
+            .zip(&self.0)
+            .filter(|(of, values)| values.iter().any(|x| *x != of.neutral()));
+        differ
+            .flat_map(|(quantity, values)| (quantity.change)(hand, values))
+            .collect()
     }
 
     /// The values by name, as a dump reports them.
@@ -201,7 +237,10 @@ impl Index<&str> for Physics {
 /// Adds to a JSON object the settings of a task that vary its physics, what is observed, and when actions take effect.
 pub fn add_settings(config: &EnvConfig, object: &mut Value) {
     let table = Table::try_from(config).expect("settings are a table");
-    let names = QUANTITIES.iter().map(|quantity| quantity.setting).chain(OTHERS);
+    let names = QUANTITIES
+        .iter()
+        .map(|quantity| quantity.setting)
+        .chain(OTHERS);
     names.for_each(|name| object[name] = json!(table[name]));
 }
 
@@ -214,16 +253,32 @@ mod tests {
     fn the_physics_of_the_default_task_are_those_of_the_scene() {
         let config = Config::default();
         for (quantity, values) in QUANTITIES.iter().zip(Physics::of_task(&config.env).0) {
-            assert!(values.iter().all(|x| *x == quantity.neutral()), "{}", quantity.name);
+            assert!(
+                values.iter().all(|x| *x == quantity.neutral()),
+                "{}",
+                quantity.name
+            );
         }
     }
 
     #[test]
     fn every_quantity_has_its_two_settings() {
         let config = Config::default();
-        let [env, drawn] = [Table::try_from(&config.env).unwrap(), Table::try_from(&config.randomization).unwrap()];
-        for Quantity { name, setting, unit, .. } in &QUANTITIES {
-            assert!(env.contains_key(*setting) && drawn.contains_key(*name) && !unit.is_empty(), "{name}, {setting}");
+        let [env, drawn] = [
+            Table::try_from(&config.env).unwrap(),
+            Table::try_from(&config.randomization).unwrap(),
+        ];
+        for Quantity {
+            name,
+            setting,
+            unit,
+            ..
+        } in &QUANTITIES
+        {
+            assert!(
+                env.contains_key(*setting) && drawn.contains_key(*name) && !unit.is_empty(),
+                "{name}, {setting}"
+            );
         }
     }
 }

@@ -52,21 +52,51 @@ impl Randomization {
     /// # Errors
     /// Fails if the scene cannot be varied in this way, or if a setting names an unknown group of the observation.
     pub fn new(task: &Task, config: &RandomizationConfig) -> Result<Option<Arc<Self>>> {
-        let noise = NoiseStd::new(&config.noise, &task.hand.layout).context("randomization.noise")?;
+        let noise =
+            NoiseStd::new(&config.noise, &task.hand.layout).context("randomization.noise")?;
         let bias = NoiseStd::new(&config.bias, &task.hand.layout).context("randomization.bias")?;
         if !config.happens() {
             return Ok(None);
         }
         let shifts = config.cube_com > 0.0;
-        let nominal = if shifts { task.scene_with(1.0, true)? } else { task.scene.clone() };
+        let nominal = if shifts {
+            task.scene_with(1.0, true)?
+        } else {
+            task.scene.clone()
+        };
         let mut sizes = sizes(config.cube_size);
         sizes.push(1.0);
-        let scene = |size| Ok((size, if size == 1.0 { nominal.clone() } else { task.scene_with(size, shifts)? }));
-        let scenes = sizes.into_iter().map(scene).collect::<Result<Vec<_>>>().context("randomization.cube_size")?;
-        let alike = scenes.iter().all(|(_, scene)| scene.has_structure_of(&nominal));
+        let scene = |size| {
+            Ok((
+                size,
+                if size == 1.0 {
+                    nominal.clone()
+                } else {
+                    task.scene_with(size, shifts)?
+                },
+            ))
+        };
+        let scenes = sizes
+            .into_iter()
+            .map(scene)
+            .collect::<Result<Vec<_>>>()
+            .context("randomization.cube_size")?;
+        let alike = scenes
+            .iter()
+            .all(|(_, scene)| scene.has_structure_of(&nominal));
         let file = || origin(task.config.model_file());
-        ensure!(alike, "{}: its structure changes with the size of the object", file());
-        Ok(Some(Arc::new(Self { config: config.clone(), nominal, scenes, noise, bias })))
+        ensure!(
+            alike,
+            "{}: its structure changes with the size of the object",
+            file()
+        );
+        Ok(Some(Arc::new(Self {
+            config: config.clone(),
+            nominal,
+            scenes,
+            noise,
+            bias,
+        })))
     }
 
     /// Draws the physics of the episode that owns `rng`. The generator's position does not matter. Returns `None` if the episode is
@@ -90,13 +120,23 @@ impl Randomization {
             }
         }
         let [.., has_noise, has_bias, has_pushes] = flags;
-        randomized.then_some(EpisodePhysics { physics, has_noise, has_bias, has_pushes })
+        randomized.then_some(EpisodePhysics {
+            physics,
+            has_noise,
+            has_bias,
+            has_pushes,
+        })
     }
 
     /// The scene of an episode: with the physics that it has drawn, or the nominal one.
     pub fn scene_of(&self, draw: Option<&EpisodePhysics>, hand: &Hand) -> Scene {
-        let Some(EpisodePhysics { physics, .. }) = draw else { return self.nominal.clone() };
-        let sized = self.scenes.iter().find(|(size, _)| physics["cube_size"] == [*size]);
+        let Some(EpisodePhysics { physics, .. }) = draw else {
+            return self.nominal.clone();
+        };
+        let sized = self
+            .scenes
+            .iter()
+            .find(|(size, _)| physics["cube_size"] == [*size]);
         let (_, scene) = sized.expect("a size that can be drawn, or the nominal one");
         scene.varied(&physics.changes(hand))
     }

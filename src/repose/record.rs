@@ -39,10 +39,30 @@ pub struct Record {
 impl Record {
     /// The record of a hand in its scene, and of an object with these rotations.
     pub(super) fn of(hand: &Hand, scene: &Scene, symmetry: Vec<usize>) -> Self {
-        let Parts { joints, actuators, fingertips, .. } = hand.parts.clone();
-        let ranges = hand.actuators.iter().map(|actuator| actuator.range).collect();
-        let tips = POSES.iter().flat_map(|fractions| tips_at(hand, scene, fractions)).collect();
-        Self { joints, actuators, ranges, driven: hand.driven.clone(), fingertips, tips, symmetry }
+        let Parts {
+            joints,
+            actuators,
+            fingertips,
+            ..
+        } = hand.parts.clone();
+        let ranges = hand
+            .actuators
+            .iter()
+            .map(|actuator| actuator.range)
+            .collect();
+        let tips = POSES
+            .iter()
+            .flat_map(|fractions| tips_at(hand, scene, fractions))
+            .collect();
+        Self {
+            joints,
+            actuators,
+            ranges,
+            driven: hand.driven.clone(),
+            fingertips,
+            tips,
+            symmetry,
+        }
     }
 
     /// Reads the record in a file.
@@ -50,15 +70,25 @@ impl Record {
     /// # Errors
     /// Fails if it is too long or damaged.
     pub fn parse(text: &str) -> Result<Self> {
-        ensure!(text.len() <= LONGEST, "its metadata `hand` has {} bytes; at most {LONGEST} are read", text.len());
+        ensure!(
+            text.len() <= LONGEST,
+            "its metadata `hand` has {} bytes; at most {LONGEST} are read",
+            text.len()
+        );
         let record = serde_json::from_str::<Self>(text);
-        let record = record.map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
+        let record = record
+            .map_err(|error| anyhow!("its metadata `hand`: {}", shortened(&error.to_string())))?;
         let actuators = record.actuators.len();
         let tips = POSES.len() * record.fingertips.len();
         let sizes = [record.ranges.len(), record.driven.len(), record.tips.len()];
-        let fits = sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
-        let symmetry = record.symmetry.first() == Some(&0) && record.symmetry.iter().all(|&rotation| rotation < 24);
-        ensure!(fits && symmetry, "its metadata `hand` has lists of other lengths than its hand needs");
+        let fits =
+            sizes == [actuators, actuators, tips] && !record.joints.is_empty() && actuators > 0;
+        let symmetry = record.symmetry.first() == Some(&0)
+            && record.symmetry.iter().all(|&rotation| rotation < 24);
+        ensure!(
+            fits && symmetry,
+            "its metadata `hand` has lists of other lengths than its hand needs"
+        );
         Ok(record)
     }
 
@@ -83,7 +113,12 @@ impl Record {
 
     /// The observations and actions of a policy for it.
     pub fn spaces(&self) -> Spaces {
-        Layout::new(self.joints.len(), self.fingertips.len(), self.actuators.len()).spaces(&self.symmetry)
+        Layout::new(
+            self.joints.len(),
+            self.fingertips.len(),
+            self.actuators.len(),
+        )
+        .spaces(&self.symmetry)
     }
 
     /// Checks by the names that a policy for this hand can act with the hand `there` of a scene, and says whether they tell that it is the
@@ -103,7 +138,11 @@ impl Record {
                 differ.push(format!("{} {what}s, not {}", found.len(), own.len()));
                 continue;
             }
-            for (own, found) in own.iter().zip(found).filter(|(own, found)| !is_named(found, own)) {
+            for (own, found) in own
+                .iter()
+                .zip(found)
+                .filter(|(own, found)| !is_named(found, own))
+            {
                 if is_other_side(found, own) {
                     is_other_hand = true;
                 } else {
@@ -112,18 +151,29 @@ impl Record {
             }
         }
         let names = shortened(&differ.join(", "));
-        ensure!(differ.is_empty(), "the policy is for another hand: {scene} has {names}");
+        ensure!(
+            differ.is_empty(),
+            "the policy is for another hand: {scene} has {names}"
+        );
         Ok(is_other_hand)
     }
 
     /// A warning if an action means another angle with the hand `there`.
     pub(super) fn warning(&self, there: &Self) -> Option<String> {
-        let sum = |of: &Self, i: usize| of.driven[i].iter().map(|(_, coefficient)| *coefficient).collect::<Vec<_>>();
+        let sum = |of: &Self, i: usize| {
+            of.driven[i]
+                .iter()
+                .map(|(_, coefficient)| *coefficient)
+                .collect::<Vec<_>>()
+        };
         let apart = |i: &usize| {
             let mut ends = self.ranges[*i].iter().zip(there.ranges[*i]);
             ends.any(|(own, found)| (own - found).abs() > 1e-4) || sum(self, *i) != sum(there, *i)
         };
-        let others: Vec<&str> = (0..self.ranges.len()).filter(apart).map(|i| &*there.actuators[i]).collect();
+        let others: Vec<&str> = (0..self.ranges.len())
+            .filter(apart)
+            .map(|i| &*there.actuators[i])
+            .collect();
         (!others.is_empty()).then(|| {
             let names = shortened(&others.join(" "));
             format!("an action means another angle than in training: the ranges or the tendons of {names} differ")
@@ -133,14 +183,21 @@ impl Record {
 
 /// Whether a name in a scene is the name in a policy, perhaps with an additional prefix.
 fn is_named(found: &str, own: &str) -> bool {
-    found.strip_suffix(own).is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(['/', '_', '-', '.', ':']))
+    found
+        .strip_suffix(own)
+        .is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(['/', '_', '-', '.', ':']))
 }
 
 /// Whether a name differs only in the letter of the side: `lh_` and `rh_`, `left` and `right`.
 fn is_other_side(found: &str, own: &str) -> bool {
-    [("lh_", "rh_"), ("rh_", "lh_"), ("left", "right"), ("right", "left")]
-        .iter()
-        .any(|(here, there)| found.contains(here) && is_named(&found.replace(here, there), own))
+    [
+        ("lh_", "rh_"),
+        ("rh_", "lh_"),
+        ("left", "right"),
+        ("right", "left"),
+    ]
+    .iter()
+    .any(|(here, there)| found.contains(here) && is_named(&found.replace(here, there), own))
 }
 
 /// The poses of the fingertips in a pose of the hand.
@@ -151,7 +208,10 @@ fn tips_at(hand: &Hand, scene: &Scene, fractions: &[f64]) -> Vec<[f64; 7]> {
     }
     sim.refresh();
     let pose = |tip: &Frame| {
-        let Pose { position: [x, y, z], orientation: [qw, qx, qy, qz] } = sim.pose(*tip);
+        let Pose {
+            position: [x, y, z],
+            orientation: [qw, qx, qy, qz],
+        } = sim.pose(*tip);
         [x, y, z, qw, qx, qy, qz]
     };
     hand.fingertips.iter().map(pose).collect()

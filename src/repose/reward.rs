@@ -112,13 +112,18 @@ pub fn training_terms() -> [Description; TRAINING.len()] {
 }
 
 /// The values of these terms by name.
-pub fn named<const N: usize>(terms: [Description; N], values: [f64; N]) -> impl Iterator<Item = (&'static str, f64)> {
+pub fn named<const N: usize>(
+    terms: [Description; N],
+    values: [f64; N],
+) -> impl Iterator<Item = (&'static str, f64)> {
     terms.into_iter().map(|term| term.0).zip(values)
 }
 
 /// Adds rewards to a sum of rewards, term by term.
 pub fn add<const N: usize>(sum: &mut [f64; N], more: [f64; N]) {
-    sum.iter_mut().zip(more).for_each(|(sum, value)| *sum += value);
+    sum.iter_mut()
+        .zip(more)
+        .for_each(|(sum, value)| *sum += value);
 }
 
 /// The task's reward of a step.
@@ -129,24 +134,32 @@ pub fn task_reward(env: &EnvConfig, step: &Step) -> TaskReward {
 /// The reward that training adds to a step, given the weights of its terms.
 pub fn training_reward(weights: &TrainingReward, step: &Step) -> TrainingReward {
     let mut values = *weights;
-    values.iter_mut().zip(&TRAINING).for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
+    values
+        .iter_mut()
+        .zip(&TRAINING)
+        .for_each(|(weight, TrainingTerm(.., value))| *weight *= value(step));
     values
 }
 
 /// The weights of the terms that training adds, after `env_steps` control steps of the whole run.
 pub fn training_weights(training: &TrainingConfig, env_steps: u64) -> TrainingReward {
-    TRAINING.each_ref().map(|TrainingTerm(_, weight, _)| match weight {
-        Weight::Constant(weight) => weight(training),
-        Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
-    })
+    TRAINING
+        .each_ref()
+        .map(|TrainingTerm(_, weight, _)| match weight {
+            Weight::Constant(weight) => weight(training),
+            Weight::Ramp(_, ramp) => ramp(training).at(env_steps),
+        })
 }
 
 /// The weights that change in the course of a training run, with their descriptions.
 pub fn ramped(weights: &TrainingReward) -> impl Iterator<Item = (Description, f64)> {
-    TRAINING.iter().zip(*weights).filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
-        Weight::Constant(_) => None,
-        Weight::Ramp(setting, _) => Some((*setting, value)),
-    })
+    TRAINING
+        .iter()
+        .zip(*weights)
+        .filter_map(|(TrainingTerm(_, weight, _), value)| match weight {
+            Weight::Constant(_) => None,
+            Weight::Ramp(setting, _) => Some((*setting, value)),
+        })
 }
 
 #[cfg(test)]
@@ -157,16 +170,34 @@ mod tests {
     fn terms(rot_dist: f64, goal_dist: f64, action: &[f32]) -> TaskReward {
         let mut config = Config::default().env;
         config.fall_penalty = -7.0;
-        task_reward(&config, &Step { rot_dist, goal_dist, action: action.to_vec(), ..Step::default() })
+        task_reward(
+            &config,
+            &Step {
+                rot_dist,
+                goal_dist,
+                action: action.to_vec(),
+                ..Step::default()
+            },
+        )
     }
 
     #[test]
     fn each_term_is_the_one_of_the_task() {
         // 1 / (0.4 + 0.1), -10 * 0.05, -0.0002 * (1 + 0.25)
         let reward = terms(0.4, 0.05, &[1.0, -0.5]);
-        let expected = [("rotation", 2.0), ("distance", -0.5), ("action", -0.00025), ("bonus", 0.0), ("fall", 0.0)];
-        for ((name, found), (expected_name, expected)) in named(task_terms(), reward).zip(expected) {
-            assert!(name == expected_name && (found - expected).abs() < 1e-12, "{reward:?}");
+        let expected = [
+            ("rotation", 2.0),
+            ("distance", -0.5),
+            ("action", -0.00025),
+            ("bonus", 0.0),
+            ("fall", 0.0),
+        ];
+        for ((name, found), (expected_name, expected)) in named(task_terms(), reward).zip(expected)
+        {
+            assert!(
+                name == expected_name && (found - expected).abs() < 1e-12,
+                "{reward:?}"
+            );
         }
         assert!((reward.iter().sum::<f64>() - 1.49975).abs() < 1e-12);
     }

@@ -80,12 +80,27 @@ pub const MEASURES: [Measure; 11] = [
 ];
 
 /// The measures of a training run's own episodes, in the order of their columns.
-pub const OF_TRAINING: [&str; 7] =
-    ["return", "length", "goals", "in_tolerance", "drop_rate", "rot_dist", "steps_per_goal"];
+pub const OF_TRAINING: [&str; 7] = [
+    "return",
+    "length",
+    "goals",
+    "in_tolerance",
+    "drop_rate",
+    "rot_dist",
+    "steps_per_goal",
+];
 
 /// The measures of an evaluation during training, in the order of their columns.
-pub const OF_EVALUATIONS: [&str; 8] =
-    ["goals", "drop_rate", "rot_dist", "return", "success_rate", "success_rate_5", "seconds_per_goal", "turned"];
+pub const OF_EVALUATIONS: [&str; 8] = [
+    "goals",
+    "drop_rate",
+    "rot_dist",
+    "return",
+    "success_rate",
+    "success_rate_5",
+    "seconds_per_goal",
+    "turned",
+];
 
 /// The measures that summarise an evaluation.
 pub const HEADLINE: [&str; 3] = ["goals", "rot_dist", "drop_rate"];
@@ -149,17 +164,26 @@ impl Played<'_> {
 
     fn steps_per_goal(&self) -> f64 {
         let goals = self.sum(|episode| episode.goals.into());
-        if goals > 0.0 { self.steps() / goals } else { f64::NAN }
+        if goals > 0.0 {
+            self.steps() / goals
+        } else {
+            f64::NAN
+        }
     }
 
     /// The episodes that ended because the physics diverged. Sums leave out the steps on which it did.
     fn diverged(&self) -> usize {
-        self.episodes.iter().filter(|episode| episode.diverged).count()
+        self.episodes
+            .iter()
+            .filter(|episode| episode.diverged)
+            .count()
     }
 
     fn reward(&self) -> TaskReward {
         let mut total = TaskReward::default();
-        self.episodes.iter().for_each(|episode| add(&mut total, episode.reward));
+        self.episodes
+            .iter()
+            .for_each(|episode| add(&mut total, episode.reward));
         total
     }
 
@@ -167,7 +191,10 @@ impl Played<'_> {
     fn goals_ci95(&self) -> [f64; 2] {
         let count = self.count();
         let mean = self.mean(|episode| episode.goals.into());
-        let squares = self.episodes.iter().map(|episode| (f64::from(episode.goals) - mean).powi(2));
+        let squares = self
+            .episodes
+            .iter()
+            .map(|episode| (f64::from(episode.goals) - mean).powi(2));
         let variance = squares.sum::<f64>() / (count - 1.0);
         let margin = 1.96 * (variance / count).sqrt();
         [mean - margin, mean + margin].map(|x| if x.is_nan() { x } else { x.max(0.0) })
@@ -232,7 +259,8 @@ impl Score {
 
     /// All that is known, as an object of JSON in which unknown values are null.
     pub fn as_json(&self) -> Map<String, Value> {
-        let reward = named(task_terms(), self.reward).map(|(term, value)| (term.to_owned(), json!(value)));
+        let reward =
+            named(task_terms(), self.reward).map(|(term, value)| (term.to_owned(), json!(value)));
         let mut object = Map::new();
         let mut put = |key: &str, value: Value| object.insert(key.to_owned(), value);
         put("episodes", json!(self.episodes));
@@ -287,9 +315,15 @@ mod tests {
             ("length", "episode_length", 750.0),
             ("return", "return", 20.0),
         ];
-        let found: Vec<_> = score.measured().map(|(measure, value)| (measure.column, measure.key, value)).collect();
+        let found: Vec<_> = score
+            .measured()
+            .map(|(measure, value)| (measure.column, measure.key, value))
+            .collect();
         assert_eq!(found, by_hand);
-        assert_eq!([score.episodes, score.env_steps as usize, score.diverged], [2, 1500, 0]);
+        assert_eq!(
+            [score.episodes, score.env_steps as usize, score.diverged],
+            [2, 1500, 0]
+        );
         assert_eq!(score.reward[0], 20.0);
         // Standard deviation √8, standard error 2.
         assert!((score.goals_ci95[1] - (3.0 + 1.96 * 2.0)).abs() < 1e-12);
@@ -298,21 +332,44 @@ mod tests {
 
     #[test]
     fn the_step_on_which_physics_diverged_has_no_rotation_error() {
-        let episode = EpisodeStats { length: 11, rot_dist_sum: 5.0, diverged: true, ..Default::default() };
+        let episode = EpisodeStats {
+            length: 11,
+            rot_dist_sum: 5.0,
+            diverged: true,
+            ..Default::default()
+        };
         assert_eq!(Score::of(&[episode], 0.01)["rot_dist"], 0.5);
     }
 
     #[test]
     fn nothing_scores_nothing() {
         let score = Score::of(&[], 0.01);
-        assert!(score["goals"].is_nan() && score["rot_dist"].is_nan() && score.goals_ci95[0].is_nan());
-        let idle = Score::of(&[EpisodeStats { length: 5, ..Default::default() }], 0.01);
-        assert!(idle["steps_per_goal"].is_nan() && idle["seconds_per_goal"].is_nan() && idle["success_rate"] == 0.0);
+        assert!(
+            score["goals"].is_nan() && score["rot_dist"].is_nan() && score.goals_ci95[0].is_nan()
+        );
+        let idle = Score::of(
+            &[EpisodeStats {
+                length: 5,
+                ..Default::default()
+            }],
+            0.01,
+        );
+        assert!(
+            idle["steps_per_goal"].is_nan()
+                && idle["seconds_per_goal"].is_nan()
+                && idle["success_rate"] == 0.0
+        );
     }
 
     #[test]
     fn a_share_is_shown_in_percent_and_the_unit_beside_the_title() {
-        let shown = |column, value| format!("{}: {}", measure(column).label(), measure(column).text(value));
+        let shown = |column, value| {
+            format!(
+                "{}: {}",
+                measure(column).label(),
+                measure(column).text(value)
+            )
+        };
         assert_eq!(shown("drop_rate", 0.125), "drop rate, %: 12.5");
         assert_eq!(shown("goals", 2.0), "goals per episode: 2.000");
         assert_eq!(shown("rot_dist", f64::NAN), "rotation error, rad: -");
@@ -323,11 +380,23 @@ mod tests {
         for column in OF_TRAINING.iter().chain(&OF_EVALUATIONS).chain(&HEADLINE) {
             assert_eq!(measure(column).column, *column);
         }
-        let object = Score::of(&[EpisodeStats { length: 10, ..Default::default() }], 0.01).as_json();
+        let object = Score::of(
+            &[EpisodeStats {
+                length: 10,
+                ..Default::default()
+            }],
+            0.01,
+        )
+        .as_json();
         let keys: Vec<&str> = object.keys().map(String::as_str).collect();
-        assert_eq!(keys[..4], ["episodes", "env_steps", "goals_per_episode", "goals_ci95"]);
+        assert_eq!(
+            keys[..4],
+            ["episodes", "env_steps", "goals_per_episode", "goals_ci95"]
+        );
         assert_eq!(keys[keys.len() - 3..], ["return", "reward", "diverged"]);
         assert_eq!(keys.len(), MEASURES.len() + 5);
-        assert!(object["steps_per_goal"].is_null() && object["reward"].as_object().unwrap().len() == 5);
+        assert!(
+            object["steps_per_goal"].is_null() && object["reward"].as_object().unwrap().len() == 5
+        );
     }
 }

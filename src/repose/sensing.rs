@@ -23,15 +23,35 @@ impl NoiseStd {
         for name in groups.keys() {
             if !measured.contains(&name.as_str()) {
                 let known = layout.groups.iter().any(|group| group.name == name);
-                let what = if known { "is not measured" } else { "is not a group of the observation" };
-                bail!("`{}` {what}; these groups can have noise: {}", shortened(name), measured.join(", "));
+                let what = if known {
+                    "is not measured"
+                } else {
+                    "is not a group of the observation"
+                };
+                bail!(
+                    "`{}` {what}; these groups can have noise: {}",
+                    shortened(name),
+                    measured.join(", ")
+                );
             }
         }
-        let of_group = |Group { name, start, length, .. }: Group| {
+        let of_group = |Group {
+                            name,
+                            start,
+                            length,
+                            ..
+                        }: Group| {
             let std = groups.get(name).copied().unwrap_or(0.0) as f32;
             (start..start + length).map(move |i| (i, std))
         };
-        Ok(Self(layout.groups.into_iter().flat_map(of_group).filter(|&(_, std)| std != 0.0).collect()))
+        Ok(Self(
+            layout
+                .groups
+                .into_iter()
+                .flat_map(of_group)
+                .filter(|&(_, std)| std != 0.0)
+                .collect(),
+        ))
     }
 
     /// Whether nothing is added to any value.
@@ -41,7 +61,9 @@ impl NoiseStd {
 
     /// Draws what is added: independent normal numbers.
     pub fn draw<'a>(&'a self, rng: &'a mut Rng) -> impl Iterator<Item = (usize, f32)> + 'a {
-        self.0.iter().map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
+        self.0
+            .iter()
+            .map(|&(i, std)| (i, std * Distribution::<f32>::sample(&StandardNormal, rng)))
     }
 }
 
@@ -58,13 +80,23 @@ pub fn combine(bias: &mut Vec<(usize, f32)>, more: impl Iterator<Item = (usize, 
 /// Adds the offset of an episode. On an orientation q it is a small rotation q ⊗ (1, v), where v are the last three of its four
 /// numbers. It stays the same however the body turns.
 pub fn offset(observation: &mut [f32], bias: &[(usize, f32)], layout: &Layout) {
-    let orientations = || std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT));
-    let of_value = |i: usize| bias.binary_search_by_key(&i, |&(i, _)| i).map_or(0.0, |at| bias[at].1);
+    let orientations = || {
+        std::iter::once(layout.start(OBJECT_QUAT)).chain(layout.tips().map(|tip| tip + TIP_QUAT))
+    };
+    let of_value = |i: usize| {
+        bias.binary_search_by_key(&i, |&(i, _)| i)
+            .map_or(0.0, |at| bias[at].1)
+    };
     let in_orientation = |i: usize| orientations().any(|at| (at..at + 4).contains(&i));
-    bias.iter().filter(|(i, _)| !in_orientation(*i)).for_each(|&(i, added)| observation[i] += added);
+    bias.iter()
+        .filter(|(i, _)| !in_orientation(*i))
+        .for_each(|&(i, added)| observation[i] += added);
     for at in orientations() {
         let q = [0, 1, 2, 3].map(|i| observation[at + i]);
-        let turned = quat::mul(q, [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)]);
+        let turned = quat::mul(
+            q,
+            [1.0, of_value(at + 1), of_value(at + 2), of_value(at + 3)],
+        );
         observation[at..at + 4].copy_from_slice(&turned);
     }
 }
@@ -76,16 +108,28 @@ pub fn make_consistent(observation: &mut [f32], layout: &Layout) {
         let q = [0, 1, 2, 3].map(|i| f64::from(observation[at + i]));
         let length = quat::length(&q);
         // Noise this close to the negative of a quaternion leaves no orientation.
-        if length > 1e-6 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
+        if length > 1e-6 {
+            q.map(|x| x / length)
+        } else {
+            [1.0, 0.0, 0.0, 0.0]
+        }
     };
     let write = |observation: &mut [f32], at: usize, q: Quat| {
-        observation[at..at + 4].iter_mut().zip(q).for_each(|(cell, x)| *cell = x as f32);
+        observation[at..at + 4]
+            .iter_mut()
+            .zip(q)
+            .for_each(|(cell, x)| *cell = x as f32);
     };
-    let [object_at, goal_at, relative_at] = [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
+    let [object_at, goal_at, relative_at] =
+        [OBJECT_QUAT, GOAL_QUAT, RELATIVE_QUAT].map(|group| layout.start(group));
     let object = quat::canonical(read(observation, object_at));
     let goal = read(observation, goal_at);
     write(observation, object_at, object);
-    write(observation, relative_at, quat::canonical(quat::mul(object, quat::conj(goal))));
+    write(
+        observation,
+        relative_at,
+        quat::canonical(quat::mul(object, quat::conj(goal))),
+    );
     for tip in layout.tips() {
         let orientation = read(observation, tip + TIP_QUAT);
         write(observation, tip + TIP_QUAT, orientation);
@@ -103,24 +147,44 @@ mod tests {
     }
 
     fn spread(groups: &[(&str, f64)]) -> Result<NoiseStd> {
-        NoiseStd::new(&groups.iter().map(|&(name, std)| (name.to_owned(), std)).collect(), &shadow())
+        NoiseStd::new(
+            &groups
+                .iter()
+                .map(|&(name, std)| (name.to_owned(), std))
+                .collect(),
+            &shadow(),
+        )
     }
 
     #[test]
     fn noise_has_the_deviation_that_was_asked_in_the_groups_that_were_named_and_nowhere_else() {
         let spread = spread(&[("joint_pos", 0.5), ("cube_pos", 0.0)]).unwrap();
         let mut rng = rng::stream(1, "noise", 0);
-        let drawn: Vec<(usize, f32)> = (0..1000).flat_map(|_| spread.draw(&mut rng).collect::<Vec<_>>()).collect();
+        let drawn: Vec<(usize, f32)> = (0..1000)
+            .flat_map(|_| spread.draw(&mut rng).collect::<Vec<_>>())
+            .collect();
         assert!(drawn.len() == 24_000 && drawn.iter().all(|&(i, _)| i < 24));
-        let variance = drawn.iter().map(|&(_, x)| f64::from(x).powi(2)).sum::<f64>() / drawn.len() as f64;
+        let variance = drawn
+            .iter()
+            .map(|&(_, x)| f64::from(x).powi(2))
+            .sum::<f64>()
+            / drawn.len() as f64;
         assert!((variance.sqrt() - 0.5).abs() < 0.01, "{variance}");
     }
 
     #[test]
     fn groups_that_do_not_exist_or_are_not_measured_are_refused() {
-        for (name, why) in [("joint_positions", "is not a group"), ("goal_quat", "is not measured")] {
+        for (name, why) in [
+            ("joint_positions", "is not a group"),
+            ("goal_quat", "is not measured"),
+        ] {
             let error = spread(&[(name, 0.1)]).unwrap_err().to_string();
-            assert!(error.contains(name) && error.contains(why) && error.contains("joint_pos, joint_vel"), "{error}");
+            assert!(
+                error.contains(name)
+                    && error.contains(why)
+                    && error.contains("joint_pos, joint_vel"),
+                "{error}"
+            );
         }
     }
 
@@ -130,14 +194,20 @@ mod tests {
         let bias: Vec<(usize, f32)> = bias.draw(&mut rng::stream(1, "bias", 0)).collect();
         let mut turns = rng::stream(2, "turns", 0);
         let mut off = || {
-            let q = quat::canonical(quat::uniform([0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0))));
+            let q = quat::canonical(quat::uniform(
+                [0; 3].map(|_| rng::uniform(&mut turns, 0.0, 1.0)),
+            ));
             let mut observation = vec![0.1; shadow().size];
             observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&q.map(|x| x as f32));
             offset(&mut observation, &bias, &shadow());
             make_consistent(&mut observation, &shadow());
-            assert_eq!(observation[5], 0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1);
+            assert_eq!(
+                observation[5],
+                0.1 + bias.iter().find(|(i, _)| *i == 5).unwrap().1
+            );
             assert_eq!(observation[30], 0.1);
-            let seen = [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(OBJECT_QUAT) + i]));
+            let seen =
+                [0, 1, 2, 3].map(|i| f64::from(observation[shadow().start(OBJECT_QUAT) + i]));
             quat::canonical(quat::mul(quat::conj(q), seen))
         };
         let first = off();
@@ -152,7 +222,11 @@ mod tests {
         let mut observation = vec![0.1; shadow().size];
         observation[shadow().start(GOAL_QUAT)..][..4].copy_from_slice(&[0.0, 1.0, 0.0, 0.0]);
         observation[shadow().start(OBJECT_QUAT)..][..4].copy_from_slice(&[0.2, 0.9, 0.3, -0.2]);
-        for (i, added) in [(shadow().start(OBJECT_QUAT), -0.4), (shadow().start(TIPS) + TIP_QUAT, 3.0), (3, 0.25)] {
+        for (i, added) in [
+            (shadow().start(OBJECT_QUAT), -0.4),
+            (shadow().start(TIPS) + TIP_QUAT, 3.0),
+            (3, 0.25),
+        ] {
             observation[i] += added;
         }
         make_consistent(&mut observation, &shadow());
@@ -168,7 +242,12 @@ mod tests {
             assert!((part(at).iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-6);
         }
         let relative = quat::canonical(quat::mul(object, quat::conj([0.0, 1.0, 0.0, 0.0])));
-        assert!(part(shadow().start(RELATIVE_QUAT)).iter().zip(relative).all(|(a, b)| (a - b).abs() < 1e-6));
+        assert!(
+            part(shadow().start(RELATIVE_QUAT))
+                .iter()
+                .zip(relative)
+                .all(|(a, b)| (a - b).abs() < 1e-6)
+        );
         assert_eq!((observation[3], observation[4]), (0.35, 0.1));
     }
 }

@@ -17,12 +17,19 @@ pub struct Servos {
 
 impl Servos {
     pub fn new(actuators: usize) -> Self {
-        Self { targets: vec![0.0; actuators], due: vec![0.0; actuators], under_way: VecDeque::new() }
+        Self {
+            targets: vec![0.0; actuators],
+            due: vec![0.0; actuators],
+            under_way: VecDeque::new(),
+        }
     }
 
     /// Starts with `targets`, which stay in effect during the delay.
     pub fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
-        self.targets.iter_mut().zip(targets).for_each(|(own, target)| *own = target);
+        self.targets
+            .iter_mut()
+            .zip(targets)
+            .for_each(|(own, target)| *own = target);
         self.under_way.clear();
         for _ in 0..delay {
             self.under_way.extend(&self.targets);
@@ -39,7 +46,10 @@ impl Servos {
             *target = (alpha * asked + (1.0 - alpha) * *target).clamp(low, high);
         }
         self.under_way.extend(&self.targets);
-        self.due.iter_mut().zip(self.under_way.drain(..self.targets.len())).for_each(|(due, target)| *due = target);
+        self.due
+            .iter_mut()
+            .zip(self.under_way.drain(..self.targets.len()))
+            .for_each(|(due, target)| *due = target);
     }
 
     /// `count` sets of targets: those under way and, in front of them, the oldest one again.
@@ -54,12 +64,17 @@ impl Servos {
     /// Resumes with these last targets and the newest `delay` sets that [`Self::under_way`] returned. If there are fewer, because
     /// a fork has a longer delay than its parent, the oldest one is repeated.
     pub fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
-        let oldest = if under_way.is_empty() { last } else { &under_way[..last.len()] };
+        let oldest = if under_way.is_empty() {
+            last
+        } else {
+            &under_way[..last.len()]
+        };
         self.reset(last.iter().copied(), 0);
         let wanted = delay * last.len();
         for _ in 0..wanted.saturating_sub(under_way.len()) / last.len() {
             self.under_way.extend(oldest);
         }
-        self.under_way.extend(&under_way[under_way.len().saturating_sub(wanted)..]);
+        self.under_way
+            .extend(&under_way[under_way.len().saturating_sub(wanted)..]);
     }
 }

@@ -60,13 +60,26 @@ impl Task {
         if parts.goal.is_empty() {
             parts.goal = GOAL.into();
         }
-        let nominal = if compilation.keeps_all() { as_it_is } else { Scene::load(file, &compilation)? };
+        let nominal = if compilation.keeps_all() {
+            as_it_is
+        } else {
+            Scene::load(file, &compilation)?
+        };
         let mut hand = Hand::bind(&nominal, parts).with_context(|| origin(file))?;
         let scene = nominal.varied(&Physics::of_task(&config).changes(&hand));
         hand.object.inertia *= config.cube_mass_scale;
         config.goal_position.settle(hand.place());
-        let near = config.goal_position.value.iter().all(|x| x.abs() <= FARTHEST);
-        ensure!(near, "{}: `{}` starts more than {FARTHEST} m away", origin(file), hand.parts.object);
+        let near = config
+            .goal_position
+            .value
+            .iter()
+            .all(|x| x.abs() <= FARTHEST);
+        ensure!(
+            near,
+            "{}: `{}` starts more than {FARTHEST} m away",
+            origin(file),
+            hand.parts.object
+        );
         settle_sizes(&mut config, &hand, file)?;
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
@@ -93,36 +106,63 @@ impl Task {
         let hand = Hand::bind(&nominal, self.hand.parts.clone())?;
         let mut scene = nominal.varied(&Physics::of_task(&self.config).changes(&hand));
         scene.set_look(look, &nominal);
-        Ok(Arc::new(Self { scene, hand, ..self.clone() }))
+        Ok(Arc::new(Self {
+            scene,
+            hand,
+            ..self.clone()
+        }))
     }
 
     /// The same task at the stage of a run in which `other` is: its actions are smoothed as there.
     #[must_use]
     pub fn at_the_stage_of(&self, other: &EnvConfig) -> Arc<Self> {
         let act_moving_average = other.act_moving_average;
-        Arc::new(Self { config: EnvConfig { act_moving_average, ..self.config.clone() }, ..self.clone() })
+        Arc::new(Self {
+            config: EnvConfig {
+                act_moving_average,
+                ..self.config.clone()
+            },
+            ..self.clone()
+        })
     }
 
     /// Notes on the side of the hand and on a user's scene: what the settings replace in it, and whether the goal and the start of its
     /// cube come from it.
     pub fn notes(&self) -> Vec<String> {
-        let mirrored =
-            self.mirror.iter().map(|_| "the policy is for the hand on the other side: it plays mirrored".to_owned());
+        let mirrored = self
+            .mirror
+            .iter()
+            .map(|_| "the policy is for the hand on the other side: it plays mirrored".to_owned());
         let mut notes: Vec<String> = mirrored.collect();
-        let Some(file) = self.config.model_file() else { return notes };
+        let Some(file) = self.config.model_file() else {
+            return notes;
+        };
         let place = self.config.goal_position.value;
         let own = self.hand.place();
         let scene = file.display();
         let timestep = self.scene.own_timestep;
         let sim_dt = self.config.sim_dt;
         if timestep != sim_dt {
-            notes.push(format!("env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"));
+            notes.push(format!(
+                "env.sim_dt = {sim_dt} s replaces the timestep of {scene}, {timestep} s"
+            ));
         }
-        let mut unused: Vec<String> = self.scene.keyframes().iter().map(|key| format!("`{key}`")).collect();
+        let mut unused: Vec<String> = self
+            .scene
+            .keyframes()
+            .iter()
+            .map(|key| format!("`{key}`"))
+            .collect();
         let used = Vec::from_iter(self.hand.keyframe.map(|keyframe| unused.remove(keyframe)));
-        for (keys, what) in [(used, "episodes start in the keyframe"), (unused, "no episode uses the keyframes")] {
+        for (keys, what) in [
+            (used, "episodes start in the keyframe"),
+            (unused, "no episode uses the keyframes"),
+        ] {
             if !keys.is_empty() {
-                notes.push(format!("{what} {} of {scene}", os::shortened(&keys.join(", "))));
+                notes.push(format!(
+                    "{what} {} of {scene}",
+                    os::shortened(&keys.join(", "))
+                ));
             }
         }
         let alike = self.scene.symmetry(self.hand.object.body).len();
@@ -139,15 +179,26 @@ impl Task {
             ));
         }
         notes.push(match place == own {
-            true => format!("`{object}` starts where {scene} has it: env.goal_position = {place:?}"),
-            false => format!("env.goal_position = {place:?} replaces the place of `{object}` in {scene}, {own:?}"),
+            true => {
+                format!("`{object}` starts where {scene} has it: env.goal_position = {place:?}")
+            }
+            false => format!(
+                "env.goal_position = {place:?} replaces the place of `{object}` in {scene}, {own:?}"
+            ),
         });
         notes
     }
 
     /// A table of what was found in the scene, and in what order.
     pub fn table(&self) -> String {
-        let Parts { joints, actuators, fingertips, object, goal, .. } = &self.hand.parts;
+        let Parts {
+            joints,
+            actuators,
+            fingertips,
+            object,
+            goal,
+            ..
+        } = &self.hand.parts;
         let listed = |names: &[String]| format!("{}: {}", names.len(), names.join(" "));
         let alike = self.symmetry.len();
         let start = match self.hand.keyframe {
@@ -158,7 +209,10 @@ impl Task {
             ("joints", listed(joints)),
             ("actuators", listed(actuators)),
             ("fingertips", listed(fingertips)),
-            ("object", format!("{object}: {alike} of a cube's 24 rotations map it onto itself")),
+            (
+                "object",
+                format!("{object}: {alike} of a cube's 24 rotations map it onto itself"),
+            ),
             ("goal", goal.clone()),
             ("start", start),
         ]
@@ -180,7 +234,11 @@ impl Task {
             false => Mirror::by_fingertips(&here, policy, layout),
         };
         let mut warnings = Vec::from_iter(policy.warning(&here));
-        if !policy.symmetry.iter().all(|rotation| here.symmetry.contains(rotation)) {
+        if !policy
+            .symmetry
+            .iter()
+            .all(|rotation| here.symmetry.contains(rotation))
+        {
             warnings.push(format!(
                 "the policy treats {} orientations of an object as alike, but `{}` of {place} has only {} that are alike",
                 policy.symmetry.len(),
@@ -189,7 +247,12 @@ impl Task {
             ));
         }
         let symmetry = policy.symmetry.clone();
-        Ok(Arc::new(Self { mirror, symmetry, warnings, ..Arc::unwrap_or_clone(self) }))
+        Ok(Arc::new(Self {
+            mirror,
+            symmetry,
+            warnings,
+            ..Arc::unwrap_or_clone(self)
+        }))
     }
 
     /// The record of its hand and object.
@@ -199,7 +262,9 @@ impl Task {
 
     /// What mirrors observations, as a matrix `[O, O]` that is multiplied from the right, if they are mirrored.
     pub fn mirror(&self) -> Option<Vec<f32>> {
-        self.mirror.as_ref().map(|mirror| mirror.matrix(self.hand.layout.size))
+        self.mirror
+            .as_ref()
+            .map(|mirror| mirror.matrix(self.hand.layout.size))
     }
 
     /// Where the goal is shown.
@@ -234,12 +299,26 @@ impl Task {
 /// Fails if another number is named.
 fn settle_sizes(config: &mut EnvConfig, hand: &Hand, file: Option<&Path>) -> Result<()> {
     for (setting, key, what, found) in [
-        (&mut config.num_hand_dofs, "num_hand_dofs", "joints", hand.joints.len()),
-        (&mut config.num_actuators, "num_actuators", "actuators", hand.actuators.len()),
+        (
+            &mut config.num_hand_dofs,
+            "num_hand_dofs",
+            "joints",
+            hand.joints.len(),
+        ),
+        (
+            &mut config.num_actuators,
+            "num_actuators",
+            "actuators",
+            hand.actuators.len(),
+        ),
     ] {
         setting.settle(found);
         let named = setting.value;
-        ensure!(named == found, "env.{key} = {named}: the hand of {} has {found} {what}", origin(file));
+        ensure!(
+            named == found,
+            "env.{key} = {named}: the hand of {} has {found} {what}",
+            origin(file)
+        );
     }
     Ok(())
 }

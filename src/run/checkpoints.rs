@@ -20,7 +20,9 @@ pub struct Checkpoints {
 
 impl Checkpoints {
     pub(super) fn new(run: &Path) -> Self {
-        Self { folder: run.join(CHECKPOINTS) }
+        Self {
+            folder: run.join(CHECKPOINTS),
+        }
     }
 
     /// The path of the newest checkpoint.
@@ -34,7 +36,8 @@ impl Checkpoints {
     }
 
     fn path_of(&self, iteration: u64) -> PathBuf {
-        self.folder.join(format!("iteration-{iteration:08}.safetensors"))
+        self.folder
+            .join(format!("iteration-{iteration:08}.safetensors"))
     }
 
     /// Writes the checkpoint of an iteration, makes it the latest, and then removes all but the newest `keep`.
@@ -48,10 +51,18 @@ impl Checkpoints {
         name_also(&path, &self.latest())?;
         // Later checkpoints exist if the run was resumed from an earlier one. They must not be resumed from, since the logs
         // continue from here, but users who gave the wrong file can still recover them.
-        let (later, earlier): (Vec<_>, Vec<_>) = self.numbered().into_iter().partition(|(of, _)| *of > iteration);
+        let (later, earlier): (Vec<_>, Vec<_>) = self
+            .numbered()
+            .into_iter()
+            .partition(|(of, _)| *of > iteration);
         // Best effort: one checkpoint too many is harmless.
-        earlier.iter().skip(keep).for_each(|(_, path)| drop(fs::remove_file(path)));
-        later.iter().try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
+        earlier
+            .iter()
+            .skip(keep)
+            .for_each(|(_, path)| drop(fs::remove_file(path)));
+        later
+            .iter()
+            .try_for_each(|(_, path)| put_aside(path, "later").map(drop).cannot("rename", path))
     }
 
     /// Writes the checkpoint that scored best.
@@ -73,7 +84,9 @@ impl Checkpoints {
 
     pub(super) fn create_folder(&self) -> Result<()> {
         expect_no_link(&self.folder)?;
-        fs::create_dir_all(&self.folder).and_then(|()| sync_folder(&self.folder)).cannot("create", &self.folder)
+        fs::create_dir_all(&self.folder)
+            .and_then(|()| sync_folder(&self.folder))
+            .cannot("create", &self.folder)
     }
 
     /// All checkpoints that can be resumed from, the newest first. `latest` is a second name of one of the others, or a
@@ -83,7 +96,9 @@ impl Checkpoints {
         let mut found: Vec<PathBuf> = self.numbered().into_iter().map(|(_, path)| path).collect();
         let latest = self.latest();
         if latest.exists() && !found.iter().any(|path| same_file(path, &latest)) {
-            let newer = found.first().is_none_or(|newest| modified(&latest) >= modified(newest));
+            let newer = found
+                .first()
+                .is_none_or(|newest| modified(&latest) >= modified(newest));
             found.insert(if newer { 0 } else { found.len() }, latest);
         }
         found
@@ -100,7 +115,12 @@ impl Checkpoints {
         let files = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
         let numbered = files.filter_map(|entry| {
             let name = entry.file_name();
-            let number = name.to_str()?.strip_prefix("iteration-")?.strip_suffix(".safetensors")?.parse().ok()?;
+            let number = name
+                .to_str()?
+                .strip_prefix("iteration-")?
+                .strip_suffix(".safetensors")?
+                .parse()
+                .ok()?;
             Some((number, entry.path()))
         });
         let mut numbered: Vec<_> = numbered.collect();
@@ -119,7 +139,11 @@ impl Checkpoints {
 /// # Errors
 /// Fails if it is.
 pub fn expect_no_link(folder: &Path) -> Result<()> {
-    ensure!(!folder.is_symlink(), "cannot write {}: links in a run folder are not followed", folder.display());
+    ensure!(
+        !folder.is_symlink(),
+        "cannot write {}: links in a run folder are not followed",
+        folder.display()
+    );
     Ok(())
 }
 
@@ -134,7 +158,9 @@ mod tests {
 
     fn names(checkpoints: &Checkpoints) -> Vec<String> {
         let entries = fs::read_dir(&checkpoints.folder).unwrap();
-        let mut names: Vec<String> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        let mut names: Vec<String> = entries
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
         names.sort();
         names
     }
@@ -144,10 +170,19 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let checkpoints = Checkpoints::new(place.path());
         for iteration in [0, 20, 40, 60] {
-            checkpoints.write(iteration, format!("{iteration}").as_bytes(), 2).unwrap();
-            assert_eq!(fs::read_to_string(checkpoints.latest()).unwrap(), iteration.to_string());
+            checkpoints
+                .write(iteration, format!("{iteration}").as_bytes(), 2)
+                .unwrap();
+            assert_eq!(
+                fs::read_to_string(checkpoints.latest()).unwrap(),
+                iteration.to_string()
+            );
         }
-        let kept = ["iteration-00000040.safetensors", "iteration-00000060.safetensors", "latest.safetensors"];
+        let kept = [
+            "iteration-00000040.safetensors",
+            "iteration-00000060.safetensors",
+            "latest.safetensors",
+        ];
         assert_eq!(names(&checkpoints), kept);
         checkpoints.write(60, b"again", 2).unwrap();
         assert_eq!(
@@ -155,7 +190,10 @@ mod tests {
             (kept.map(String::from).into(), b"again".into())
         );
         let newest: Vec<PathBuf> = checkpoints.newest_first();
-        assert!(newest.len() == 2 && newest[0].ends_with(kept[1]) && newest[1].ends_with(kept[0]), "{newest:?}");
+        assert!(
+            newest.len() == 2 && newest[0].ends_with(kept[1]) && newest[1].ends_with(kept[0]),
+            "{newest:?}"
+        );
         // A crash just before the new one becomes the latest.
         fs::write(checkpoints.path_of(80), "newer").unwrap();
         assert_eq!(checkpoints.newest_first()[0], checkpoints.path_of(80));
@@ -176,8 +214,8 @@ mod tests {
         for iteration in [20, 40, 60, 30] {
             checkpoints.write(iteration, b"", 3).unwrap();
         }
-        let expected =
-            ["20.safetensors", "30.safetensors", "40.later", "60.later"].map(|name| format!("iteration-000000{name}"));
+        let expected = ["20.safetensors", "30.safetensors", "40.later", "60.later"]
+            .map(|name| format!("iteration-000000{name}"));
         assert_eq!(names(&checkpoints)[..4], expected);
         assert_eq!(checkpoints.newest_first().len(), 2);
     }

@@ -7,7 +7,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Result;
 use protobuf::Message;
-use tensorboard_proto::event::{Event, Event_oneof_what as What, SessionLog, SessionLog_SessionStatus};
+use tensorboard_proto::event::{
+    Event, Event_oneof_what as What, SessionLog, SessionLog_SessionStatus,
+};
 use tensorboard_proto::summary::{Summary, Summary_Value, Summary_Value_oneof_value as Content};
 use tensorboard_rs::record_writer::RecordWriter;
 
@@ -37,20 +39,40 @@ impl EventFile {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub fn create(folder: &Path, first_step: u64, tags: &Descriptions, settings: &str) -> Result<Self> {
+    pub fn create(
+        folder: &Path,
+        first_step: u64,
+        tags: &Descriptions,
+        settings: &str,
+    ) -> Result<Self> {
         let [begin, end] = NAME;
         // Readers take the files in the order of their names, and clocks are unreliable.
-        let seconds = event_files(folder)?.iter().map(|(begun, _)| begun + 1).fold(now() as u64, u64::max);
-        let path = folder.join(format!("{begin}{seconds:010}.{:07}{end}", std::process::id()));
+        let seconds = event_files(folder)?
+            .iter()
+            .map(|(begun, _)| begun + 1)
+            .fold(now() as u64, u64::max);
+        let path = folder.join(format!(
+            "{begin}{seconds:010}.{:07}{end}",
+            std::process::id()
+        ));
         let file = File::create_new(&path).cannot("create", &path)?;
-        let mut events = Self { path, file, undescribed: tags.clone() };
+        let mut events = Self {
+            path,
+            file,
+            undescribed: tags.clone(),
+        };
         let begun = events.begin(first_step, settings);
-        begun.inspect_err(|_| drop(fs::remove_file(&events.path))).map(|()| events)
+        begun
+            .inspect_err(|_| drop(fs::remove_file(&events.path)))
+            .map(|()| events)
     }
 
     fn begin(&mut self, first_step: u64, settings: &str) -> Result<()> {
         self.write(What::file_version("brain.Event:2".into()), 0)?;
-        let session = SessionLog { status: SessionLog_SessionStatus::START, ..SessionLog::default() };
+        let session = SessionLog {
+            status: SessionLog_SessionStatus::START,
+            ..SessionLog::default()
+        };
         self.write(What::session_log(session), first_step)?;
         if !settings.is_empty() {
             let settings = Content::tensor(markdown(&format!("```\n{settings}\n```\n")));
@@ -70,13 +92,22 @@ impl EventFile {
         histograms: &[(&'static str, Histogram)],
     ) -> Result<()> {
         let numbers = values.iter().filter(|(_, number)| !number.is_nan());
-        let numbers = numbers.map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
-        let histograms = histograms.iter().map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
+        let numbers =
+            numbers.map(|(tag, number)| (tag.as_ref(), Content::simple_value(*number as f32)));
+        let histograms = histograms
+            .iter()
+            .map(|(tag, histogram)| (*tag, Content::histo(histogram.clone())));
         self.summary(numbers.chain(histograms), step)
     }
 
-    fn summary<'a>(&mut self, values: impl Iterator<Item = (&'a str, Content)>, step: u64) -> Result<()> {
-        let values = values.map(|(tag, content)| value(tag, content, self.undescribed.remove(tag))).collect();
+    fn summary<'a>(
+        &mut self,
+        values: impl Iterator<Item = (&'a str, Content)>,
+        step: u64,
+    ) -> Result<()> {
+        let values = values
+            .map(|(tag, content)| value(tag, content, self.undescribed.remove(tag)))
+            .collect();
         self.values(values, step)
     }
 
@@ -85,14 +116,28 @@ impl EventFile {
     /// # Errors
     /// Fails if the file cannot be written.
     pub fn values(&self, values: Vec<Summary_Value>, step: u64) -> Result<()> {
-        self.write(What::summary(Summary { value: values.into(), ..Summary::default() }), step)
+        self.write(
+            What::summary(Summary {
+                value: values.into(),
+                ..Summary::default()
+            }),
+            step,
+        )
     }
 
     fn write(&self, what: What, step: u64) -> Result<()> {
-        let event = Event { wall_time: now(), step: step as i64, what: Some(what), ..Event::default() };
+        let event = Event {
+            wall_time: now(),
+            step: step as i64,
+            what: Some(what),
+            ..Event::default()
+        };
         let bytes = event.write_to_bytes()?;
         let mut writer = RecordWriter::new(BufWriter::new(&self.file));
-        writer.write(&bytes).and_then(|()| writer.flush()).cannot("write", &self.path)
+        writer
+            .write(&bytes)
+            .and_then(|()| writer.flush())
+            .cannot("write", &self.path)
     }
 
     /// Ensures that all events are on the disk, in a file that still has its name.
@@ -132,9 +177,16 @@ pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let entries = fs::read_dir(folder).cannot("read", folder)?;
     let ours = entries.flatten().filter_map(|entry| {
         let name = entry.file_name();
-        let (seconds, _) = name.to_str()?.strip_prefix(begin)?.strip_suffix(end)?.split_once('.')?;
+        let (seconds, _) = name
+            .to_str()?
+            .strip_prefix(begin)?
+            .strip_suffix(end)?
+            .split_once('.')?;
         // Bounded, so that adding to it cannot overflow.
-        let seconds = seconds.parse().ok().filter(|&seconds: &u64| seconds < 1 << 40)?;
+        let seconds = seconds
+            .parse()
+            .ok()
+            .filter(|&seconds: &u64| seconds < 1 << 40)?;
         Some((seconds, entry.path()))
     });
     Ok(ours.collect())
@@ -142,7 +194,9 @@ pub fn event_files(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
 
 /// The seconds since 1970.
 pub fn now() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |elapsed| elapsed.as_secs_f64())
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
 
 #[cfg(test)]
@@ -171,14 +225,21 @@ mod tests {
     fn steps_after_the_checkpoint_and_half_written_events_are_cut_off() {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 0);
-        (1..=4).for_each(|step| events.iteration(10 * step, &[("a", step as f64)], &[]).unwrap());
+        (1..=4).for_each(|step| {
+            events
+                .iteration(10 * step, &[("a", step as f64)], &[])
+                .unwrap()
+        });
         let path = events.path.clone();
         let half = [fs::read(&path).unwrap(), vec![9; 30]].concat();
         fs::write(&path, half).unwrap();
         for (last, expected) in [(40, 4), (25, 2)] {
             cut_off_after(place.path(), last).unwrap();
             let steps: Vec<i64> = read(&path)[3..].iter().map(Event::get_step).collect();
-            assert_eq!(steps, (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>());
+            assert_eq!(
+                steps,
+                (1..=expected).map(|step| 10 * step).collect::<Vec<i64>>()
+            );
         }
         // A second file of the same second and process.
         let more = create(place.path(), 21);
@@ -186,14 +247,20 @@ mod tests {
     }
 
     #[test]
-    fn an_event_file_holds_its_version_the_settings_and_the_values_that_are_known_each_tag_described_once() {
+    fn an_event_file_holds_its_version_the_settings_and_the_values_that_are_known_each_tag_described_once()
+     {
         let place = tempfile::tempdir().unwrap();
         let mut events = create(place.path(), 7);
         let histograms = vec![("histogram/std", histogram([0.5_f32, 1.5].iter()))];
         let values = [("reward/fall", 0.25), ("eval/goals", f64::NAN)];
         events.iteration(9, &values, &histograms).unwrap();
         events.iteration(11, &values, &[]).unwrap();
-        let path = std::fs::read_dir(place.path()).unwrap().next().unwrap().unwrap().path();
+        let path = std::fs::read_dir(place.path())
+            .unwrap()
+            .next()
+            .unwrap()
+            .unwrap()
+            .path();
         let found = read(&path);
         assert_eq!(found.len(), 5);
         assert_eq!(found[0].get_file_version(), "brain.Event:2");
@@ -202,17 +269,49 @@ mod tests {
             (7, SessionLog_SessionStatus::START)
         );
         let settings = &found[2].get_summary().get_value()[0];
-        let plugin = |value: &Summary_Value| value.get_metadata().get_plugin_data().get_plugin_name().to_owned();
-        assert_eq!((found[2].get_step(), settings.get_tag(), &plugin(settings)[..]), (7, "settings", "text"));
-        assert_eq!(settings.get_tensor().get_string_val()[0], b"```\n[run]\nseed = 3\n\n```\n");
+        let plugin = |value: &Summary_Value| {
+            value
+                .get_metadata()
+                .get_plugin_data()
+                .get_plugin_name()
+                .to_owned()
+        };
+        assert_eq!(
+            (
+                found[2].get_step(),
+                settings.get_tag(),
+                &plugin(settings)[..]
+            ),
+            (7, "settings", "text")
+        );
+        assert_eq!(
+            settings.get_tensor().get_string_val()[0],
+            b"```\n[run]\nseed = 3\n\n```\n"
+        );
         let values = found[3].get_summary().get_value();
         assert_eq!((found[3].get_step(), values.len()), (9, 2));
-        assert_eq!((values[0].get_tag(), values[0].get_simple_value()), ("reward/fall", 0.25));
-        assert_eq!((values[1].get_histo().get_num(), values[1].get_histo().get_max()), (2.0, 1.5));
-        assert_eq!([0, 1].map(|i| plugin(&values[i])), ["scalars", "histograms"]);
+        assert_eq!(
+            (values[0].get_tag(), values[0].get_simple_value()),
+            ("reward/fall", 0.25)
+        );
+        assert_eq!(
+            (
+                values[1].get_histo().get_num(),
+                values[1].get_histo().get_max()
+            ),
+            (2.0, 1.5)
+        );
+        assert_eq!(
+            [0, 1].map(|i| plugin(&values[i])),
+            ["scalars", "histograms"]
+        );
         let metadata = values[1].get_metadata();
         assert_eq!(metadata.get_summary_description(), "of histogram/std");
-        assert_eq!(metadata.get_unknown_fields().get(4).unwrap().varint, [2], "the data class");
+        assert_eq!(
+            metadata.get_unknown_fields().get(4).unwrap().varint,
+            [2],
+            "the data class"
+        );
         let again = &found[4].get_summary().get_value()[0];
         assert!(!again.has_metadata() && again.get_simple_value() == 0.25);
     }

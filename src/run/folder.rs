@@ -10,7 +10,9 @@ use anyhow::{Context, Result, bail, ensure};
 
 use super::checkpoints::{CHECKPOINTS, Checkpoints, expect_no_link, modified};
 use super::hparams::HPARAMS;
-use crate::os::{Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, unused_name, write_whole};
+use crate::os::{
+    Cannot, LOCK, Locked, is_abandoned, read_text, sync_folder, unused_name, write_whole,
+};
 
 /// The default folder of runs.
 pub const RUNS: &str = "runs/shadow-hand-repose";
@@ -47,10 +49,12 @@ pub const METRICS: &str = "metrics.csv";
 /// Whether a name is one of these, in which a star stands for anything.
 pub fn is_one_of(name: &OsStr, patterns: &[&str]) -> bool {
     let name = name.to_string_lossy();
-    patterns.iter().any(|pattern| match pattern.split_once('*') {
-        Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
-        None => name == *pattern,
-    })
+    patterns
+        .iter()
+        .any(|pattern| match pattern.split_once('*') {
+            Some((begin, end)) => name.starts_with(begin) && name.ends_with(end),
+            None => name == *pattern,
+        })
 }
 
 /// A run folder: `config.toml`, `version.txt`, `metrics.csv`, event files, `policy.safetensors`, checkpoints.
@@ -66,7 +70,11 @@ pub struct RunFolder {
 
 impl RunFolder {
     pub(super) fn at(path: PathBuf) -> Self {
-        Self { checkpoints: Checkpoints::new(&path), stop_before: modified(&path.join(STOP)), path }
+        Self {
+            checkpoints: Checkpoints::new(&path),
+            stop_before: modified(&path.join(STOP)),
+            path,
+        }
     }
 
     /// Creates the folder of a new run: `path`, or runs/shadow-hand-repose/DATE-TIME[-NAME].
@@ -90,7 +98,9 @@ impl RunFolder {
     fn expect_free(&self) -> Result<()> {
         let names: Vec<OsString> = self.entries()?.iter().map(DirEntry::file_name).collect();
         // A training run was killed here before its first checkpoint was complete: the same command may begin again.
-        let is_half_begun = names.iter().all(|name| is_one_of(name, &[LOCK, POLICY, CHECKPOINTS, PARTIAL]))
+        let is_half_begun = names
+            .iter()
+            .all(|name| is_one_of(name, &[LOCK, POLICY, CHECKPOINTS, PARTIAL]))
             && self.path.join(LOCK).exists()
             && !self.checkpoints.begun();
         // An unfinished trace does not belong to a run.
@@ -104,11 +114,19 @@ impl RunFolder {
             );
         }
         let whole = std::path::absolute(&self.path).cannot("find", &self.path)?;
-        let there = whole.ancestors().find_map(|folder| folder.canonicalize().ok()).unwrap_or_default();
+        let there = whole
+            .ancestors()
+            .find_map(|folder| folder.canonicalize().ok())
+            .unwrap_or_default();
         let above = there.ancestors().skip(usize::from(whole.exists()));
         for folder in above.map(|path| Self::at(path.to_owned())) {
             let holds_a_run = folder.checkpoints.begun() || folder.path.join(LOCK).exists();
-            ensure!(!holds_a_run, "{} lies inside the run {}", self.path.display(), folder.path.display());
+            ensure!(
+                !holds_a_run,
+                "{} lies inside the run {}",
+                self.path.display(),
+                folder.path.display()
+            );
         }
         Ok(())
     }
@@ -119,7 +137,11 @@ impl RunFolder {
     /// Fails if the folder cannot be created.
     pub fn for_now() -> Result<Self> {
         let folder = tempfile::Builder::new().prefix("shadow-repose-").tempdir();
-        Ok(Self::at(folder.cannot("create a folder in", &std::env::temp_dir())?.keep()))
+        Ok(Self::at(
+            folder
+                .cannot("create a folder in", &std::env::temp_dir())?
+                .keep(),
+        ))
     }
 
     /// Removes the files of a run that could not start, and its folder if nothing else is in it.
@@ -127,7 +149,11 @@ impl RunFolder {
         for entry in self.entries().into_iter().flatten() {
             let _ = fs::remove_file(entry.path());
         }
-        for folder in [&self.checkpoints.folder, &self.path.join(HPARAMS), &self.path] {
+        for folder in [
+            &self.checkpoints.folder,
+            &self.path.join(HPARAMS),
+            &self.path,
+        ] {
             let _ = fs::remove_dir(folder);
         }
     }
@@ -143,13 +169,27 @@ impl RunFolder {
     /// # Errors
     /// Fails if `place` does not exist, or is a file outside a run folder.
     pub fn containing(place: &Path) -> Result<Self> {
-        ensure!(place.exists(), "{}: no such run folder or checkpoint", place.display());
+        ensure!(
+            place.exists(),
+            "{}: no such run folder or checkpoint",
+            place.display()
+        );
         let whole = place.canonicalize().cannot("read", place)?;
-        let folder = if place.is_dir() { Some(&*whole) } else { whole.parent() };
-        let run = match folder.filter(|folder| folder.ends_with(CHECKPOINTS)).and_then(Path::parent) {
+        let folder = if place.is_dir() {
+            Some(&*whole)
+        } else {
+            whole.parent()
+        };
+        let run = match folder
+            .filter(|folder| folder.ends_with(CHECKPOINTS))
+            .and_then(Path::parent)
+        {
             Some(run) => Self::at(run.to_owned()),
             None if place.is_dir() => Self::at(place.to_owned()),
-            None => bail!("{} does not lie in the checkpoints folder of a run", whole.display()),
+            None => bail!(
+                "{} does not lie in the checkpoints folder of a run",
+                whole.display()
+            ),
         };
         // A folder that may not be listed or entered would look empty.
         let folder = &run.checkpoints.folder;
@@ -214,7 +254,8 @@ impl RunFolder {
     /// and one that was there before, is the user's.
     pub fn take_stop(&self) -> bool {
         let path = self.path.join(STOP);
-        let is_request = fs::symlink_metadata(&path).is_ok_and(|facts| facts.is_file() && facts.len() == 0);
+        let is_request =
+            fs::symlink_metadata(&path).is_ok_and(|facts| facts.is_file() && facts.len() == 0);
         is_request && modified(&path) != self.stop_before && fs::remove_file(path).is_ok()
     }
 
@@ -226,7 +267,11 @@ impl RunFolder {
         if fs::metadata(&path).is_ok_and(|facts| facts.len() > 0) {
             return;
         }
-        let _ = if finished { write_whole(&path, b"") } else { fs::remove_file(path).map_err(Into::into) };
+        let _ = if finished {
+            write_whole(&path, b"")
+        } else {
+            fs::remove_file(path).map_err(Into::into)
+        };
     }
 
     /// The path of the policy without its training state: the best one, or the latest if none was scored yet.
@@ -254,7 +299,11 @@ impl RunFolder {
     /// Fails if the file cannot be read.
     pub fn config(&self) -> Result<Option<(PathBuf, String)>> {
         let path = self.path.join(CONFIG);
-        if path.exists() { read_text(&path).map(|text| Some((path, text))) } else { Ok(None) }
+        if path.exists() {
+            read_text(&path).map(|text| Some((path, text)))
+        } else {
+            Ok(None)
+        }
     }
 
     /// Writes the configuration and the facts about the program, each only if the folder does not hold the same text already.
@@ -279,35 +328,58 @@ impl RunFolder {
 /// Fails if there is no checkpoint.
 pub fn resolve_checkpoint(place: &Path) -> Result<PathBuf> {
     if !place.is_dir() {
-        ensure!(place.exists(), "{}: no such checkpoint or run folder", place.display());
+        ensure!(
+            place.exists(),
+            "{}: no such checkpoint or run folder",
+            place.display()
+        );
         return Ok(place.to_owned());
     }
     let checkpoints = RunFolder::containing(place)?.checkpoints;
-    let found = [checkpoints.best(), checkpoints.latest()].into_iter().find(|path| path.exists());
+    let found = [checkpoints.best(), checkpoints.latest()]
+        .into_iter()
+        .find(|path| path.exists());
     found.with_context(|| format!("{} holds no checkpoint", place.display()))
 }
 
 /// The folder of the newest run that has a checkpoint, if any.
 pub fn newest_run() -> Option<PathBuf> {
-    let runs = fs::read_dir(RUNS).into_iter().flatten().flatten().map(|entry| RunFolder::at(entry.path()));
+    let runs = fs::read_dir(RUNS)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| RunFolder::at(entry.path()));
     // Ordered by the time of the latest checkpoint, so that a resumed run counts as new.
-    runs.filter_map(|run| Some((modified(&run.checkpoints.latest())?, run.path))).max().map(|(_, path)| path)
+    runs.filter_map(|run| Some((modified(&run.checkpoints.latest())?, run.path)))
+        .max()
+        .map(|(_, path)| path)
 }
 
 /// Creates a run folder in the default folder of runs, under a name from the current time that no other run has.
 fn create_unused(name: Option<&str>) -> Result<PathBuf> {
     let plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     let name = name.unwrap_or_default();
-    ensure!(name.chars().all(plain), "the name {name} of a run may contain only letters, digits, `-`, `_` and `.`");
+    ensure!(
+        name.chars().all(plain),
+        "the name {name} of a run may contain only letters, digits, `-`, `_` and `.`"
+    );
     fs::create_dir_all(RUNS).cannot("create the folder of runs", Path::new(RUNS))?;
     let time = jiff::Zoned::now().strftime("%Y-%m-%d_%H-%M-%S").to_string();
-    let suffix = if name.is_empty() { String::new() } else { format!("-{name}") };
+    let suffix = if name.is_empty() {
+        String::new()
+    } else {
+        format!("-{name}")
+    };
     let path = Path::new(RUNS).join(format!("{time}{suffix}"));
     loop {
         let path = unused_name(&path);
         match fs::create_dir(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
-            created => return created.cannot("create the run folder", &path).map(|()| path),
+            created => {
+                return created
+                    .cannot("create the run folder", &path)
+                    .map(|()| path);
+            }
         }
     }
 }
@@ -321,10 +393,19 @@ mod tests {
     fn a_folder_that_holds_a_run_is_not_taken_again() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("run");
-        RunFolder::create(Some(&path), None).unwrap().0.describe("a = 1", "1").unwrap();
-        let refusal = RunFolder::create(Some(&path), None).unwrap_err().to_string();
+        RunFolder::create(Some(&path), None)
+            .unwrap()
+            .0
+            .describe("a = 1", "1")
+            .unwrap();
+        let refusal = RunFolder::create(Some(&path), None)
+            .unwrap_err()
+            .to_string();
         assert!(refusal.contains("already holds a run"), "{refusal}");
-        assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), "a = 1");
+        assert_eq!(
+            fs::read_to_string(path.join("config.toml")).unwrap(),
+            "a = 1"
+        );
     }
 
     #[test]
@@ -332,17 +413,27 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let victim = place.path().join("victim");
         fs::write(&victim, "precious").unwrap();
-        for name in ["run.lock", "metrics.csv", "events.out.tfevents.1.2.shadow-repose", "checkpoints/x.partial"] {
+        for name in [
+            "run.lock",
+            "metrics.csv",
+            "events.out.tfevents.1.2.shadow-repose",
+            "checkpoints/x.partial",
+        ] {
             let run = RunFolder::at(place.path().join("run"));
             run.checkpoints.create_folder().unwrap();
             std::os::unix::fs::symlink(&victim, run.path.join(name)).unwrap();
             let refusal = run.lock().unwrap_err().to_string();
-            assert!(refusal.contains(name) && refusal.contains("not followed"), "{refusal}");
+            assert!(
+                refusal.contains(name) && refusal.contains("not followed"),
+                "{refusal}"
+            );
             fs::remove_dir_all(&run.path).unwrap();
         }
         // A link that appears later is replaced, not written through.
         std::os::unix::fs::symlink(&victim, place.path().join("config.toml.partial")).unwrap();
-        RunFolder::at(place.path().into()).describe("a = 1", "1").unwrap();
+        RunFolder::at(place.path().into())
+            .describe("a = 1", "1")
+            .unwrap();
         assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
     }
 
@@ -352,14 +443,20 @@ mod tests {
         fs::write(place.path().join("download.partial"), "mine").unwrap();
         std::os::unix::fs::symlink("/nowhere", place.path().join("link")).unwrap();
         RunFolder::create(Some(place.path()), None).unwrap();
-        assert_eq!(fs::read_to_string(place.path().join("download.partial")).unwrap(), "mine");
+        assert_eq!(
+            fs::read_to_string(place.path().join("download.partial")).unwrap(),
+            "mine"
+        );
     }
 
     #[test]
     fn what_a_crash_left_half_written_is_removed() {
         let place = tempfile::tempdir().unwrap();
         let (run, lock) = RunFolder::create(Some(place.path()), None).unwrap();
-        let left = run.checkpoints.folder.join(".shadow-repose-999999999-0.partial");
+        let left = run
+            .checkpoints
+            .folder
+            .join(".shadow-repose-999999999-0.partial");
         fs::write(&left, "half").unwrap();
         let living = crate::os::OutputFile::create(&place.path().join("trace")).unwrap();
         assert!(run.checkpoints.newest_first().is_empty());
@@ -374,12 +471,21 @@ mod tests {
     #[test]
     fn a_folder_with_any_part_of_a_run_or_inside_one_is_not_taken() {
         let place = tempfile::tempdir().unwrap();
-        for name in ["policy.safetensors", "metrics.csv", "events.out.tfevents.1.1.x"] {
+        for name in [
+            "policy.safetensors",
+            "metrics.csv",
+            "events.out.tfevents.1.1.x",
+        ] {
             let folder = place.path().join(format!("has-{name}"));
             fs::create_dir(&folder).unwrap();
             fs::write(folder.join(name), "foreign").unwrap();
-            let refusal = RunFolder::create(Some(&folder), None).unwrap_err().to_string();
-            assert!(refusal.contains("already holds a run") && refusal.contains(name), "{refusal}");
+            let refusal = RunFolder::create(Some(&folder), None)
+                .unwrap_err()
+                .to_string();
+            assert!(
+                refusal.contains("already holds a run") && refusal.contains(name),
+                "{refusal}"
+            );
             assert_eq!(fs::read_to_string(folder.join(name)).unwrap(), "foreign");
             assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
         }
@@ -394,8 +500,13 @@ mod tests {
         let relative = up.join(run.path.strip_prefix("/").unwrap()).join("new");
         assert!(RunFolder::create(Some(&relative), None).is_err() && !relative.exists());
         for inside in ["checkpoints", "new/deeper"] {
-            let refusal = RunFolder::create(Some(&run.path.join(inside)), None).unwrap_err().to_string();
-            assert!(refusal.contains("lies inside the run") && !run.path.join("new").exists(), "{refusal}");
+            let refusal = RunFolder::create(Some(&run.path.join(inside)), None)
+                .unwrap_err()
+                .to_string();
+            assert!(
+                refusal.contains("lies inside the run") && !run.path.join("new").exists(),
+                "{refusal}"
+            );
         }
     }
 
@@ -406,7 +517,10 @@ mod tests {
         write_whole(&run.checkpoints.latest(), b"latest").unwrap();
         let found = RunFolder::containing(&run.checkpoints.folder).unwrap();
         assert!(same_file(&found.path, &run.path), "{found:?}");
-        assert!(same_file(&resolve_checkpoint(&run.checkpoints.folder).unwrap(), &run.checkpoints.latest()));
+        assert!(same_file(
+            &resolve_checkpoint(&run.checkpoints.folder).unwrap(),
+            &run.checkpoints.latest()
+        ));
     }
 
     #[test]
@@ -416,10 +530,19 @@ mod tests {
         assert!(resolve_checkpoint(place.path()).is_err());
         let checkpoints = &run.checkpoints;
         write_whole(&checkpoints.latest(), b"latest").unwrap();
-        assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.latest());
+        assert_eq!(
+            resolve_checkpoint(place.path()).unwrap(),
+            checkpoints.latest()
+        );
         write_whole(&checkpoints.best(), b"best").unwrap();
-        assert_eq!(resolve_checkpoint(place.path()).unwrap(), checkpoints.best());
-        assert_eq!(RunFolder::containing(&checkpoints.latest()).unwrap().path, place.path().canonicalize().unwrap());
+        assert_eq!(
+            resolve_checkpoint(place.path()).unwrap(),
+            checkpoints.best()
+        );
+        assert_eq!(
+            RunFolder::containing(&checkpoints.latest()).unwrap().path,
+            place.path().canonicalize().unwrap()
+        );
     }
 
     #[test]

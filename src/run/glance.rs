@@ -30,8 +30,13 @@ impl Glance {
     /// Looks at a folder. Returns `None` if it holds no run.
     pub fn of(folder: &Path) -> Option<Self> {
         // Any other kind of file, e.g. a link, is not one of a run.
-        let facts = |name: &str| fs::symlink_metadata(folder.join(name)).ok().filter(Metadata::is_file);
-        let written = |facts: &Option<Metadata>| facts.as_ref().and_then(|facts| facts.modified().ok());
+        let facts = |name: &str| {
+            fs::symlink_metadata(folder.join(name))
+                .ok()
+                .filter(Metadata::is_file)
+        };
+        let written =
+            |facts: &Option<Metadata>| facts.as_ref().and_then(|facts| facts.modified().ok());
         let [config, metrics, lock, mark] = [CONFIG, METRICS, LOCK, FINISHED].map(facts);
         if config.is_none() && metrics.is_none() && lock.is_none() {
             return None;
@@ -56,10 +61,17 @@ impl Glance {
 pub fn folders_of_runs(folder: Option<&Path>, waits: bool) -> Result<Vec<PathBuf>> {
     let path = folder.unwrap_or(Path::new(RUNS));
     if folder.is_none() && !path.exists() {
-        ensure!(waits, "there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder");
+        ensure!(
+            waits,
+            "there are no runs in {RUNS}; begin one with `shadow-repose train`, or name another folder"
+        );
         return Ok(Vec::new());
     }
     let entries = fs::read_dir(path).cannot("read the folder", path)?;
     let is_folder = |entry: &fs::DirEntry| entry.file_type().is_ok_and(|kind| kind.is_dir());
-    Ok(entries.flatten().filter(is_folder).map(|entry| entry.path()).collect())
+    Ok(entries
+        .flatten()
+        .filter(is_folder)
+        .map(|entry| entry.path())
+        .collect())
 }

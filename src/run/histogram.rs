@@ -12,14 +12,36 @@ pub type Histogram = HistogramProto;
 /// Counts `values`, which must be finite.
 pub fn histogram<'a>(values: impl Iterator<Item = &'a f32> + Clone) -> Histogram {
     let values = values.map(|&x| f64::from(x));
-    let (min, max) = values.clone().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
+    let (min, max) = values
+        .clone()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| {
+            (a.min(x), b.max(x))
+        });
     // All values may be the same.
     let bins = if max > min { BINS } else { 1 };
     let width = (max - min) / bins as f64;
-    let bucket_limit = (1..=bins).map(|i| if i == bins { max } else { min + width * i as f64 }).collect();
-    let mut found = Histogram { min, max, bucket_limit, bucket: vec![0.0; bins], ..Histogram::default() };
+    let bucket_limit = (1..=bins)
+        .map(|i| {
+            if i == bins {
+                max
+            } else {
+                min + width * i as f64
+            }
+        })
+        .collect();
+    let mut found = Histogram {
+        min,
+        max,
+        bucket_limit,
+        bucket: vec![0.0; bins],
+        ..Histogram::default()
+    };
     for x in values {
-        let bin = if width > 0.0 { ((x - min) / width) as usize } else { 0 };
+        let bin = if width > 0.0 {
+            ((x - min) / width) as usize
+        } else {
+            0
+        };
         found.bucket[bin.min(bins - 1)] += 1.0;
         found.num += 1.0;
         found.sum += x;
@@ -36,11 +58,23 @@ mod tests {
     fn every_value_is_counted_in_the_bin_between_whose_limits_it_lies() {
         let values: Vec<f32> = (0..=120).map(|i| (i as f32 - 60.0) / 60.0).collect();
         let found = histogram(values.iter());
-        assert_eq!((found.min, found.max, found.bucket_limit.len()), (-1.0, 1.0, BINS));
+        assert_eq!(
+            (found.min, found.max, found.bucket_limit.len()),
+            (-1.0, 1.0, BINS)
+        );
         assert_eq!(found.bucket.iter().sum::<f64>(), 121.0);
         // Two values in each bin, and the largest in the last.
-        assert!(found.bucket[..BINS - 1].iter().all(|count| (1.0..=3.0).contains(count)), "{:?}", found.bucket);
-        assert!(found.sum.abs() < 1e-6 && (found.sum_squares - 2.0 * 73_810.0 / 3600.0).abs() < 1e-6, "{found:?}");
+        assert!(
+            found.bucket[..BINS - 1]
+                .iter()
+                .all(|count| (1.0..=3.0).contains(count)),
+            "{:?}",
+            found.bucket
+        );
+        assert!(
+            found.sum.abs() < 1e-6 && (found.sum_squares - 2.0 * 73_810.0 / 3600.0).abs() < 1e-6,
+            "{found:?}"
+        );
         assert!(found.bucket_limit.is_sorted() && found.bucket_limit[BINS - 1] == 1.0);
     }
 

@@ -39,7 +39,14 @@ pub fn begin(folder: &Path, step: u64, settings: &Table) -> Result<EventFile> {
         fs::remove_file(&old).cannot("remove", &old)?;
     }
     let events = EventFile::create(&folder, step, &Descriptions::new(), "")?;
-    events.values(vec![session_value("session_start_info", 3, &start_info(settings)?)?], step)?;
+    events.values(
+        vec![session_value(
+            "session_start_info",
+            3,
+            &start_info(settings)?,
+        )?],
+        step,
+    )?;
     Ok(events)
 }
 
@@ -55,10 +62,15 @@ pub fn end(succeeded: bool) -> Result<Vec<Summary_Value>> {
 
 /// The message `SessionStartInfo`.
 fn start_info(settings: &Table) -> Result<Vec<u8>> {
-    let entries: Result<Vec<_>> = settings.iter().map(|(key, value)| entry(key, value)).collect();
+    let entries: Result<Vec<_>> = settings
+        .iter()
+        .map(|(key, value)| entry(key, value))
+        .collect();
     let entries = entries?;
     message(|out| {
-        entries.iter().try_for_each(|entry| out.write_bytes(1, entry))?;
+        entries
+            .iter()
+            .try_for_each(|entry| out.write_bytes(1, entry))?;
         out.write_double(5, now())
     })
 }
@@ -82,9 +94,17 @@ fn entry(key: &str, value: &Value) -> Result<Vec<u8>> {
 fn session_value(name: &str, field: u32, info: &[u8]) -> Result<Summary_Value> {
     let content = message(|out| out.write_bytes(field, info))?;
     // The value itself is empty: a list of no numbers.
-    let mut nothing = TensorProto { dtype: DataType::DT_FLOAT, ..TensorProto::default() };
+    let mut nothing = TensorProto {
+        dtype: DataType::DT_FLOAT,
+        ..TensorProto::default()
+    };
     nothing.mut_tensor_shape().mut_dim().push_default();
-    let mut value = with_metadata(&format!("_hparams_/{name}"), Content::tensor(nothing), HPARAMS, TENSOR);
+    let mut value = with_metadata(
+        &format!("_hparams_/{name}"),
+        Content::tensor(nothing),
+        HPARAMS,
+        TENSOR,
+    );
     value.mut_metadata().mut_plugin_data().set_content(content);
     Ok(value)
 }
@@ -111,7 +131,9 @@ mod tests {
         while !stream.eof().unwrap() {
             let (field, kind) = stream.read_tag_unpack().unwrap();
             found.push(match kind {
-                WireType::WireTypeFixed64 => (field, stream.read_double().unwrap().to_le_bytes().to_vec()),
+                WireType::WireTypeFixed64 => {
+                    (field, stream.read_double().unwrap().to_le_bytes().to_vec())
+                }
                 WireType::WireTypeVarint => (field, vec![stream.read_uint64().unwrap() as u8]),
                 _ => (field, stream.read_bytes().unwrap()),
             });
@@ -120,7 +142,10 @@ mod tests {
     }
 
     fn content(value: &Summary_Value) -> (u32, Vec<u8>) {
-        assert_eq!(value.get_metadata().get_plugin_data().get_plugin_name(), "hparams");
+        assert_eq!(
+            value.get_metadata().get_plugin_data().get_plugin_name(),
+            "hparams"
+        );
         let mut fields = fields(value.get_metadata().get_plugin_data().get_content());
         assert_eq!(fields.len(), 1);
         fields.remove(0)
@@ -128,16 +153,23 @@ mod tests {
 
     #[test]
     fn the_start_of_a_row_holds_each_setting_as_a_number_a_truth_or_a_text() {
-        let settings: Table =
-            toml::from_str("a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 1, to = 2, steps = 3}")
-                .unwrap();
-        let value = session_value("session_start_info", 3, &start_info(&settings).unwrap()).unwrap();
+        let settings: Table = toml::from_str(
+            "a = 3\nb = 0.5\nc = true\nd = 'tanh'\ne = [1, 2]\nf = {from = 1, to = 2, steps = 3}",
+        )
+        .unwrap();
+        let value =
+            session_value("session_start_info", 3, &start_info(&settings).unwrap()).unwrap();
         let (field, info) = content(&value);
-        assert_eq!((value.get_tag(), field), ("_hparams_/session_start_info", 3));
+        assert_eq!(
+            (value.get_tag(), field),
+            ("_hparams_/session_start_info", 3)
+        );
         let entries = fields(&info).into_iter().filter(|(field, _)| *field == 1);
         let entries: Vec<_> = entries
             .map(|(_, entry)| {
-                let [(1, key), (2, value)] = &fields(&entry)[..] else { panic!("{entry:?}") };
+                let [(1, key), (2, value)] = &fields(&entry)[..] else {
+                    panic!("{entry:?}")
+                };
                 let (kind, value) = fields(value).remove(0);
                 let shown = match kind {
                     2 => f64::from_le_bytes(value.try_into().unwrap()).to_string(),
@@ -157,7 +189,10 @@ mod tests {
         for (succeeded, status) in [(true, 1), (false, 2)] {
             let values = end(succeeded).unwrap();
             let (field, info) = content(&values[0]);
-            assert_eq!((values[0].get_tag(), field), ("_hparams_/session_end_info", 4));
+            assert_eq!(
+                (values[0].get_tag(), field),
+                ("_hparams_/session_end_info", 4)
+            );
             assert_eq!(fields(&info)[0], (1, vec![status]));
         }
     }

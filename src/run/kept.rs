@@ -25,19 +25,48 @@ const INSIDE: [&str; 7] = [
 ///
 /// # Errors
 /// Fails if it does, even through links.
-pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, scene: Option<&Path>) -> Result<()> {
-    let mut read = read.into_iter().map(PathBuf::from).chain(scene.map(scene_files).unwrap_or_default());
+pub fn expect_output<'a>(
+    path: &Path,
+    read: impl IntoIterator<Item = &'a Path>,
+    scene: Option<&Path>,
+) -> Result<()> {
+    let mut read = read
+        .into_iter()
+        .map(PathBuf::from)
+        .chain(scene.map(scene_files).unwrap_or_default());
     if let Some(read) = read.find(|read| same_file(path, read)) {
-        bail!("{}: would replace the input {}; choose another name", path.display(), read.display());
+        bail!(
+            "{}: would replace the input {}; choose another name",
+            path.display(),
+            read.display()
+        );
     }
-    let Some(whole) = final_path(path) else { return Ok(()) };
-    let Some((folder, name)) = whole.parent().zip(whole.file_name()) else { return Ok(()) };
+    let Some(whole) = final_path(path) else {
+        return Ok(());
+    };
+    let Some((folder, name)) = whole.parent().zip(whole.file_name()) else {
+        return Ok(());
+    };
     let inside = folder.ends_with(CHECKPOINTS) || folder.ends_with(DIVERGED);
-    let run = RunFolder::at(folder.parent().filter(|_| inside).unwrap_or(folder).to_owned());
+    let run = RunFolder::at(
+        folder
+            .parent()
+            .filter(|_| inside)
+            .unwrap_or(folder)
+            .to_owned(),
+    );
     let is_run = run.checkpoints.begun() || run.path.join(LOCK).exists();
-    let is_kept = if inside { is_one_of(name, &INSIDE) } else { name == FINISHED || is_one_of(name, &OURS) };
+    let is_kept = if inside {
+        is_one_of(name, &INSIDE)
+    } else {
+        name == FINISHED || is_one_of(name, &OURS)
+    };
     let place = run.path.display();
-    ensure!(!is_run || !is_kept, "{}: the run {place} reserves this file name; choose another name", path.display());
+    ensure!(
+        !is_run || !is_kept,
+        "{}: the run {place} reserves this file name; choose another name",
+        path.display()
+    );
     Ok(())
 }
 
@@ -48,6 +77,10 @@ pub fn expect_output<'a>(path: &Path, read: impl IntoIterator<Item = &'a Path>, 
 pub fn expect_other_policy(folder: &Path, init: &Path) -> Result<()> {
     let own = RunFolder::at(folder.to_owned()).policy();
     let replaces = same_file(&own, init);
-    ensure!(!replaces, "{}: would replace the policy that the run starts from; choose another folder", own.display());
+    ensure!(
+        !replaces,
+        "{}: would replace the policy that the run starts from; choose another folder",
+        own.display()
+    );
     Ok(())
 }

@@ -29,14 +29,22 @@ impl Metrics {
     ///
     /// # Errors
     /// Fails if the file cannot be written.
-    pub fn open(path: &Path, header: &str, iterations: Range<u64>, mut tell: impl FnMut(&str)) -> Result<Self> {
+    pub fn open(
+        path: &Path,
+        header: &str,
+        iterations: Range<u64>,
+        mut tell: impl FnMut(&str),
+    ) -> Result<Self> {
         let found = match File::open(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Some(Rows::default()),
-            file => file.and_then(|file| rows(file, header, iterations.end)).cannot("write", path)?,
+            file => file
+                .and_then(|file| rows(file, header, iterations.end))
+                .cannot("write", path)?,
         };
         let mut expected = iterations.end - iterations.start;
         if found.is_none() {
-            let aside = put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
+            let aside =
+                put_aside(path, &format!("before-{}.csv", iterations.end)).cannot("write", path)?;
             let aside = aside.display();
             tell(&format!(
                 "{METRICS} has a different header from the one this program writes; it was renamed to {aside}"
@@ -45,15 +53,30 @@ impl Metrics {
         }
         let found = found.unwrap_or_default();
         if found.dropped > 0 {
-            tell(&format!("{} rows of {METRICS} after iteration {} are dropped", found.dropped, iterations.end));
+            tell(&format!(
+                "{} rows of {METRICS} after iteration {} are dropped",
+                found.dropped, iterations.end
+            ));
         }
         make_own(path).cannot("write", path)?;
-        let file = OpenOptions::new().write(true).create(true).truncate(false).open(path).cannot("write", path)?;
+        let file = OpenOptions::new()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(path)
+            .cannot("write", path)?;
         if found.kept < expected && path.is_file() {
             let lacking = expected - found.kept;
-            tell(&format!("{METRICS} lacks {lacking} of the {expected} rows up to iteration {}", iterations.end));
+            tell(&format!(
+                "{METRICS} lacks {lacking} of the {expected} rows up to iteration {}",
+                iterations.end
+            ));
         }
-        let mut metrics = Self { path: path.to_owned(), file, length: found.length };
+        let mut metrics = Self {
+            path: path.to_owned(),
+            file,
+            length: found.length,
+        };
         metrics.repair().cannot("write", path)?;
         if found.length == 0 {
             metrics.row(&format!("{header}\n"))?;
@@ -67,7 +90,9 @@ impl Metrics {
     /// # Errors
     /// Fails if the file cannot be written. [`Metrics::repair`] must succeed before the next row.
     pub fn row(&mut self, row: &str) -> Result<()> {
-        self.file.write_all(row.as_bytes()).cannot("write", &self.path)?;
+        self.file
+            .write_all(row.as_bytes())
+            .cannot("write", &self.path)?;
         self.length += row.len() as u64;
         Ok(())
     }
@@ -86,7 +111,9 @@ impl Metrics {
     /// Fails if the file cannot be written, or was deleted.
     pub fn sync(&mut self) -> Result<()> {
         expect_named(&self.path, &self.file)?;
-        self.repair().and_then(|()| self.file.sync_data()).cannot("write", &self.path)
+        self.repair()
+            .and_then(|()| self.file.sync_data())
+            .cannot("write", &self.path)
     }
 }
 
@@ -119,9 +146,15 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
     }
     let commas = |line: &[u8]| line.iter().filter(|&&byte| byte == b',').count();
     let columns = commas(&line);
-    let mut found = Rows { length, ..Rows::default() };
+    let mut found = Rows {
+        length,
+        ..Rows::default()
+    };
     while let read @ 1.. = next_row(&mut reader, &mut line)? {
-        let number = line.split(|&byte| byte == b',').next().and_then(|cell| str::from_utf8(cell).ok()?.parse().ok());
+        let number = line
+            .split(|&byte| byte == b',')
+            .next()
+            .and_then(|cell| str::from_utf8(cell).ok()?.parse().ok());
         let whole = line.ends_with(b"\n") && commas(&line) == columns;
         if found.dropped == 0 && whole && number.is_some_and(|number: u64| number <= iterations) {
             found.length += read;
@@ -137,7 +170,10 @@ fn rows(file: File, header: &str, iterations: u64) -> std::io::Result<Option<Row
 /// long is read as another one.
 pub fn next_row(reader: &mut impl BufRead, row: &mut Vec<u8>) -> std::io::Result<u64> {
     row.clear();
-    reader.take(LONGEST_ROW).read_until(b'\n', row).map(|length| length as u64)
+    reader
+        .take(LONGEST_ROW)
+        .read_until(b'\n', row)
+        .map(|length| length as u64)
 }
 
 #[cfg(test)]
@@ -155,7 +191,8 @@ mod tests {
 
     fn open(path: &Path, header: &str, iterations: Range<u64>) -> (Metrics, Vec<String>) {
         let mut notes = Vec::new();
-        let metrics = Metrics::open(path, header, iterations, |note| notes.push(note.to_owned())).unwrap();
+        let metrics =
+            Metrics::open(path, header, iterations, |note| notes.push(note.to_owned())).unwrap();
         (metrics, notes)
     }
 
@@ -173,8 +210,15 @@ mod tests {
             let said = |text: &str| notes.iter().any(|note| note.contains(text));
             assert_eq!(said("dropped"), dropped > 0, "{notes:?}");
             let lacking = iterations - kept.lines().count() as u64;
-            assert_eq!(said(&format!("lacks {lacking} of the {iterations} rows")), lacking > 0, "{notes:?}");
-            assert_eq!(fs::read_to_string(&path).unwrap(), format!("iteration,loss\n{kept}9,9\n"));
+            assert_eq!(
+                said(&format!("lacks {lacking} of the {iterations} rows")),
+                lacking > 0,
+                "{notes:?}"
+            );
+            assert_eq!(
+                fs::read_to_string(&path).unwrap(),
+                format!("iteration,loss\n{kept}9,9\n")
+            );
         }
     }
 
@@ -183,7 +227,10 @@ mod tests {
         let (place, path) = table("1,0.5\n");
         for columns in ["iteration,return", "iteration,loss"] {
             let (_, notes) = open(&path, columns, 0..1);
-            assert!(notes.len() == 1 && notes[0].contains("different header"), "{notes:?}");
+            assert!(
+                notes.len() == 1 && notes[0].contains("different header"),
+                "{notes:?}"
+            );
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("{columns}\n"));
         }
         // Both tables are kept, although they were replaced at the same iteration.

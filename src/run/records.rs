@@ -31,7 +31,9 @@ pub fn length_up_to(mut reader: impl BufRead, last_step: u64) -> Result<u64> {
 
 /// Reads the next event. Returns `None` at the end of the file, or if no whole record follows.
 fn next_event(reader: &mut impl BufRead) -> Result<Option<Vec<u8>>> {
-    let Some(length) = checked(reader, 8)? else { return Ok(None) };
+    let Some(length) = checked(reader, 8)? else {
+        return Ok(None);
+    };
     match length.try_into().map(u64::from_le_bytes) {
         Ok(length) if length <= LARGEST => checked(reader, length as usize),
         _ => Ok(None),
@@ -47,7 +49,8 @@ fn checked(reader: &mut impl BufRead, count: usize) -> Result<Option<Vec<u8>>> {
     }
     match reader.read_exact(&mut checksum) {
         Err(error) if error.kind() == ErrorKind::UnexpectedEof => Ok(None),
-        result => result.map(|()| (masked_crc32c(&bytes) == u32::from_le_bytes(checksum)).then_some(bytes)),
+        result => result
+            .map(|()| (masked_crc32c(&bytes) == u32::from_le_bytes(checksum)).then_some(bytes)),
     }
 }
 
@@ -105,9 +108,13 @@ mod tests {
         assert_eq!(step_of(&[]), Some(0));
         // A file version, a group, a string longer than the event, a varint that does not end.
         assert_eq!(step_of(b"\x1a\x01x"), Some(0));
-        for bad in
-            [&b"\x0b\x0c"[..], b"\x1a\x09x", b"\x10\xff", &[0xff; 12], b"\x1a\xff\xff\xff\xff\xff\xff\xff\xff\xff\x01"]
-        {
+        for bad in [
+            &b"\x0b\x0c"[..],
+            b"\x1a\x09x",
+            b"\x10\xff",
+            &[0xff; 12],
+            b"\x1a\xff\xff\xff\xff\xff\xff\xff\xff\xff\x01",
+        ] {
             assert_eq!(step_of(bad), None, "{bad:?}");
         }
     }
@@ -117,15 +124,29 @@ mod tests {
         let whole = [record(&event(1, 2)), record(&event(2, 2))].concat();
         let first = whole.len() as u64 / 2;
         let length = |bytes: &[u8]| length_up_to(bytes, 5).unwrap();
-        assert_eq!((length(&whole), length(&[]), length_up_to(&whole[..], 1).unwrap()), (2 * first, 0, first));
+        assert_eq!(
+            (
+                length(&whole),
+                length(&[]),
+                length_up_to(&whole[..], 1).unwrap()
+            ),
+            (2 * first, 0, first)
+        );
         for end in 0..whole.len() {
-            assert_eq!(length(&whole[..end]), if end as u64 >= first { first } else { 0 });
+            assert_eq!(
+                length(&whole[..end]),
+                if end as u64 >= first { first } else { 0 }
+            );
         }
         // A flipped bit, or a block that a crash left empty.
         for place in 0..whole.len() {
             let mut damaged = whole.clone();
             damaged[place] ^= 8;
-            assert_eq!(length(&damaged), if place as u64 >= first { first } else { 0 }, "byte {place}");
+            assert_eq!(
+                length(&damaged),
+                if place as u64 >= first { first } else { 0 },
+                "byte {place}"
+            );
         }
         assert_eq!(length(&[&whole[..], &[0; 4096]].concat()), 2 * first);
         assert_eq!(

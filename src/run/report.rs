@@ -56,7 +56,13 @@ struct Log<W> {
 
 impl<W> Log<W> {
     fn new(name: &'static str) -> Self {
-        Self { name, writer: None, failing: false, lost: 0, unsynced: 0 }
+        Self {
+            name,
+            writer: None,
+            failing: false,
+            lost: 0,
+            unsynced: 0,
+        }
     }
 
     /// Opens the log if it is not open. Reports if that fails.
@@ -76,7 +82,9 @@ impl<W> Log<W> {
                 self.unsynced += 1;
                 if std::mem::take(&mut self.failing) {
                     let Self { name, lost, .. } = self;
-                    progress.warn(&format!("logging to {name} has resumed; it lacks {lost} iterations so far"));
+                    progress.warn(&format!(
+                        "logging to {name} has resumed; it lacks {lost} iterations so far"
+                    ));
                 }
             }
             Some(Err(error)) => self.give_up(progress, 1, &error),
@@ -86,7 +94,9 @@ impl<W> Log<W> {
 
     /// Ensures that everything is on the disk. Reports if it is not.
     fn sync(&mut self, progress: &StatusLine, sync: impl FnOnce(&mut W) -> Result<()>) {
-        let Some(result) = self.writer.as_mut().map(sync) else { return };
+        let Some(result) = self.writer.as_mut().map(sync) else {
+            return;
+        };
         let unsynced = std::mem::take(&mut self.unsynced);
         result.unwrap_or_else(|error| self.give_up(progress, unsynced, &error));
     }
@@ -104,8 +114,10 @@ impl<W> Log<W> {
 impl Report {
     /// Creates the report of a run in `folder`, for numbers with these names. Writes nothing yet.
     pub fn new(folder: &Path, names: &[impl AsRef<str>], progress: StatusLine) -> Self {
-        let columns: Vec<&str> =
-            ["iteration", "env_steps"].into_iter().chain(names.iter().map(AsRef::as_ref)).collect();
+        let columns: Vec<&str> = ["iteration", "env_steps"]
+            .into_iter()
+            .chain(names.iter().map(AsRef::as_ref))
+            .collect();
         Self {
             folder: folder.to_owned(),
             header: columns.join(","),
@@ -131,7 +143,13 @@ impl Report {
 
     /// Opens the logs that are not open.
     fn open(&mut self) {
-        let Self { progress, folder, env_steps, iterations, .. } = self;
+        let Self {
+            progress,
+            folder,
+            env_steps,
+            iterations,
+            ..
+        } = self;
         self.events.open(progress, || {
             // A session that ended before its next checkpoint may have logged later steps. These are made again.
             cut_off_after(folder, *env_steps)?;
@@ -145,9 +163,16 @@ impl Report {
                     progress.say(note);
                 }
             };
-            Metrics::open(&folder.join(METRICS), &self.header, iterations.clone(), tell)
+            Metrics::open(
+                &folder.join(METRICS),
+                &self.header,
+                iterations.clone(),
+                tell,
+            )
         });
-        self.session.open(progress, || hparams::begin(folder, *env_steps, &self.hparams));
+        self.session.open(progress, || {
+            hparams::begin(folder, *env_steps, &self.hparams)
+        });
     }
 
     /// Logs the values of an iteration, whose names and order are those given at the beginning, and shows the status.
@@ -160,18 +185,37 @@ impl Report {
     ) {
         self.iterations.end = iteration;
         self.env_steps = status.env_steps;
-        let cell = |value: f64| if value.is_nan() { String::new() } else { value.to_string() };
+        let cell = |value: f64| {
+            if value.is_nan() {
+                String::new()
+            } else {
+                value.to_string()
+            }
+        };
         let cells: Vec<String> = values.iter().map(|(_, value)| cell(*value)).collect();
         let row = format!("{iteration},{},{}\n", status.env_steps, cells.join(","));
-        self.events.write(&self.progress, |events| events.iteration(status.env_steps, values, histograms));
-        self.metrics.write(&self.progress, |metrics| metrics.row(&row));
+        self.events.write(&self.progress, |events| {
+            events.iteration(status.env_steps, values, histograms)
+        });
+        self.metrics
+            .write(&self.progress, |metrics| metrics.row(&row));
         if !status.evaluation.is_nan() {
-            let best = self.best.map_or(status.evaluation, |goals| goals.max(status.evaluation));
+            let best = self
+                .best
+                .map_or(status.evaluation, |goals| goals.max(status.evaluation));
             self.best = Some(best);
-            let drop_rate = values.iter().find(|(name, _)| name.as_ref() == "eval/drop_rate");
+            let drop_rate = values
+                .iter()
+                .find(|(name, _)| name.as_ref() == "eval/drop_rate");
             let drop_rate = drop_rate.map_or(f64::NAN, |(_, value)| *value);
-            let metrics = [("best_goals", best), ("drop_rate", drop_rate), ("steps_per_s", status.steps_per_s)];
-            self.session.write(&self.progress, |events| events.iteration(status.env_steps, &metrics, &[]));
+            let metrics = [
+                ("best_goals", best),
+                ("drop_rate", drop_rate),
+                ("steps_per_s", status.steps_per_s),
+            ];
+            self.session.write(&self.progress, |events| {
+                events.iteration(status.env_steps, &metrics, &[])
+            });
         }
         self.progress.show(status);
     }
@@ -189,16 +233,22 @@ impl Report {
     /// Says in the row of TensorBoard's HPARAMS that the run has made all its steps, or has failed.
     pub fn end(&mut self, succeeded: bool) {
         let step = self.env_steps;
-        self.session.write(&self.progress, |events| events.values(hparams::end(succeeded)?, step));
+        self.session.write(&self.progress, |events| {
+            events.values(hparams::end(succeeded)?, step)
+        });
     }
 
     /// Ends the progress line, and reports the iterations that the logs lack.
     pub fn finish(&self) {
         self.progress.end();
-        for (name, lost) in [(self.metrics.name, self.metrics.lost), (self.events.name, self.events.lost)] {
+        for (name, lost) in [
+            (self.metrics.name, self.metrics.lost),
+            (self.events.name, self.events.lost),
+        ] {
             if lost > 0 {
-                self.progress
-                    .warn(&format!("{name} lacks {lost} iterations of this session, which could not be written"));
+                self.progress.warn(&format!(
+                    "{name} lacks {lost} iterations of this session, which could not be written"
+                ));
             }
         }
     }
@@ -209,7 +259,13 @@ mod tests {
     use super::*;
 
     fn status(env_steps: u64) -> Status {
-        Status { env_steps, steps_per_s: 10.0, goals: f64::NAN, drop_rate: 0.5, evaluation: f64::NAN }
+        Status {
+            env_steps,
+            steps_per_s: 10.0,
+            goals: f64::NAN,
+            drop_rate: 0.5,
+            evaluation: f64::NAN,
+        }
     }
 
     fn open(folder: &Path, tags: &[&str], iteration: u64, env_steps: u64) -> Report {
@@ -224,13 +280,24 @@ mod tests {
         let tags = ["loss/policy", "eval/goals"];
         let mut report = open(place.path(), &tags, 0, 0);
         for iteration in 1..=3 {
-            let values = [("loss/policy", 0.5 * iteration as f64), ("eval/goals", f64::NAN)];
+            let values = [
+                ("loss/policy", 0.5 * iteration as f64),
+                ("eval/goals", f64::NAN),
+            ];
             report.iteration(iteration, &values, &[], &status(10 * iteration));
         }
         let mut resumed = open(place.path(), &tags, 2, 20);
-        resumed.iteration(3, &[("loss/policy", 7.0), ("eval/goals", 1.0)], &[], &status(30));
+        resumed.iteration(
+            3,
+            &[("loss/policy", 7.0), ("eval/goals", 1.0)],
+            &[],
+            &status(30),
+        );
         let text = std::fs::read_to_string(place.path().join("metrics.csv")).unwrap();
-        assert_eq!(text, "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n");
+        assert_eq!(
+            text,
+            "iteration,env_steps,loss/policy,eval/goals\n1,10,0.5,\n2,20,1,\n3,30,7,1\n"
+        );
     }
 
     #[test]
@@ -242,14 +309,24 @@ mod tests {
         assert_eq!((report.metrics.lost, report.events.lost), (1, 1));
         report.sync();
         report.iteration(2, &[("a", 2.0)], &[], &status(20));
-        assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n2,20,2\n");
+        assert_eq!(
+            fs::read_to_string(folder.join(METRICS)).unwrap(),
+            "iteration,env_steps,a\n2,20,2\n"
+        );
         // Deleted during the run, which is noticed at the next checkpoint.
         fs::remove_dir_all(&folder).unwrap();
         report.iteration(3, &[("a", 3.0)], &[], &status(30));
         report.sync();
-        assert_eq!((report.metrics.lost, report.events.lost), (3, 3), "deleted iterations are lost too");
+        assert_eq!(
+            (report.metrics.lost, report.events.lost),
+            (3, 3),
+            "deleted iterations are lost too"
+        );
         report.iteration(4, &[("a", 4.0)], &[], &status(40));
-        assert_eq!(fs::read_to_string(folder.join(METRICS)).unwrap(), "iteration,env_steps,a\n4,40,4\n");
+        assert_eq!(
+            fs::read_to_string(folder.join(METRICS)).unwrap(),
+            "iteration,env_steps,a\n4,40,4\n"
+        );
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 3);
     }
 

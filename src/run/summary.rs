@@ -34,16 +34,27 @@ pub fn value(tag: &str, content: Content, description: Option<String>) -> Summar
 
 /// A value of a tag that says which plugin shows it, and of which class its data are.
 pub fn with_metadata(tag: &str, content: Content, plugin: &str, data_class: u32) -> Summary_Value {
-    let mut value = Summary_Value { tag: tag.to_owned(), value: Some(content), ..Summary_Value::default() };
+    let mut value = Summary_Value {
+        tag: tag.to_owned(),
+        value: Some(content),
+        ..Summary_Value::default()
+    };
     let metadata = value.mut_metadata();
-    metadata.mut_plugin_data().set_plugin_name(plugin.to_owned());
-    metadata.mut_unknown_fields().add_varint(DATA_CLASS, data_class.into());
+    metadata
+        .mut_plugin_data()
+        .set_plugin_name(plugin.to_owned());
+    metadata
+        .mut_unknown_fields()
+        .add_varint(DATA_CLASS, data_class.into());
     value
 }
 
 /// A text in Markdown.
 pub fn markdown(text: &str) -> TensorProto {
-    let mut tensor = TensorProto { dtype: DataType::DT_STRING, ..TensorProto::default() };
+    let mut tensor = TensorProto {
+        dtype: DataType::DT_STRING,
+        ..TensorProto::default()
+    };
     // A shape without dimensions: a single string.
     tensor.mut_tensor_shape();
     tensor.mut_string_val().push(text.as_bytes().to_vec());

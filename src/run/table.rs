@@ -35,7 +35,11 @@ pub struct MetricsTable {
 
 /// The table that `place` means: a file, or the table of a run folder.
 pub fn table_of(place: &Path) -> PathBuf {
-    if place.is_dir() { place.join(METRICS) } else { place.to_owned() }
+    if place.is_dir() {
+        place.join(METRICS)
+    } else {
+        place.to_owned()
+    }
 }
 
 /// Reads these columns of a table. A value is `NaN` if its cell is empty or cannot be drawn: infinite, or beyond 1e30. `place`
@@ -54,24 +58,50 @@ pub fn read_metrics(place: &Path, required: &[&str], wanted: &[&str]) -> Result<
     let header = String::from_utf8_lossy(&line).trim_end().to_owned();
     let names: Vec<&str> = header.split(',').collect();
     if let Some(column) = required.iter().find(|column| !names.contains(column)) {
-        bail!("{} has no column {column}; it has {}", path.display(), shortened(&header));
+        bail!(
+            "{} has no column {column}; it has {}",
+            path.display(),
+            shortened(&header)
+        );
     }
-    let asked = required.iter().chain(wanted).map(|column| names.iter().position(|name| name == column));
+    let asked = required
+        .iter()
+        .chain(wanted)
+        .map(|column| names.iter().position(|name| name == column));
     let places: Vec<usize> = asked.flatten().collect();
     let columns = read_columns(reader, &path, &places, names.len())?;
-    let columns = places.iter().map(|&place| names[place].to_owned()).zip(columns).collect();
-    let known = names.iter().filter(|name| name.len() <= LONGEST_NAME).take(MOST_NAMES);
-    Ok(MetricsTable { names: known.map(|name| (*name).to_owned()).collect(), columns })
+    let columns = places
+        .iter()
+        .map(|&place| names[place].to_owned())
+        .zip(columns)
+        .collect();
+    let known = names
+        .iter()
+        .filter(|name| name.len() <= LONGEST_NAME)
+        .take(MOST_NAMES);
+    Ok(MetricsTable {
+        names: known.map(|name| (*name).to_owned()).collect(),
+        columns,
+    })
 }
 
 /// Reads the cells at these places of all rows of `path` that have this number of cells.
-fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: usize) -> Result<Vec<Vec<f64>>> {
+fn read_columns(
+    mut reader: impl BufRead,
+    path: &Path,
+    places: &[usize],
+    count: usize,
+) -> Result<Vec<Vec<f64>>> {
     let mut columns = vec![Vec::new(); places.len()];
     let mut line = Vec::new();
     let mut row = 0;
     while next_row(&mut reader, &mut line).cannot("read", path)? > 0 {
         row += 1;
-        ensure!(row <= MOST_ROWS, "{}: more than {MOST_ROWS} rows", path.display());
+        ensure!(
+            row <= MOST_ROWS,
+            "{}: more than {MOST_ROWS} rows",
+            path.display()
+        );
         let cells: Vec<&[u8]> = line.trim_ascii_end().split(|&byte| byte == b',').collect();
         // Skips incomplete rows: the last row of a run in progress may be one.
         if cells.len() != count {
@@ -81,7 +111,11 @@ fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: 
             let cell = cells[place];
             column.push(number(cell).with_context(|| {
                 let cell = String::from_utf8_lossy(cell);
-                format!("{}, row {row}: not a number: `{}`", path.display(), shortened(&cell))
+                format!(
+                    "{}, row {row}: not a number: `{}`",
+                    path.display(),
+                    shortened(&cell)
+                )
             })?);
         }
     }
@@ -90,8 +124,16 @@ fn read_columns(mut reader: impl BufRead, path: &Path, places: &[usize], count: 
 
 /// The number in a cell, NaN where there is none or it cannot be drawn.
 fn number(cell: &[u8]) -> Result<f64> {
-    let number: f64 = if cell.is_empty() { f64::NAN } else { str::from_utf8(cell)?.parse()? };
-    Ok(if number.abs() <= LARGEST_VALUE { number } else { f64::NAN })
+    let number: f64 = if cell.is_empty() {
+        f64::NAN
+    } else {
+        str::from_utf8(cell)?.parse()?
+    };
+    Ok(if number.abs() <= LARGEST_VALUE {
+        number
+    } else {
+        f64::NAN
+    })
 }
 
 /// The value at `x` on the straight lines between `points`, or `None` outside of them.
@@ -117,12 +159,26 @@ mod tests {
         let path = place.path().join(METRICS);
         fs::write(&path, "iteration,loss\n1,0.5\n2,\n3").unwrap();
         let read = read_metrics(&path, &["loss", "iteration"], &["iteration", "goals"]).unwrap();
-        assert!(read.columns["loss"][0] == 0.5 && read.columns["loss"][1].is_nan(), "{read:?}");
-        assert!(read.columns["iteration"] == [1.0, 2.0] && !read.columns.contains_key("goals"), "{read:?}");
+        assert!(
+            read.columns["loss"][0] == 0.5 && read.columns["loss"][1].is_nan(),
+            "{read:?}"
+        );
+        assert!(
+            read.columns["iteration"] == [1.0, 2.0] && !read.columns.contains_key("goals"),
+            "{read:?}"
+        );
         assert_eq!(read.names, ["iteration", "loss"]);
-        assert_eq!(read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(), 2);
-        let refusal = read_metrics(&path, &["goals"], &[]).unwrap_err().to_string();
-        assert!(refusal.contains("no column goals; it has iteration,loss"), "{refusal}");
+        assert_eq!(
+            read_metrics(place.path(), &["loss"], &[]).unwrap().columns["loss"].len(),
+            2
+        );
+        let refusal = read_metrics(&path, &["goals"], &[])
+            .unwrap_err()
+            .to_string();
+        assert!(
+            refusal.contains("no column goals; it has iteration,loss"),
+            "{refusal}"
+        );
     }
 
     #[test]
@@ -131,10 +187,14 @@ mod tests {
         let path = place.path().join(METRICS);
         fs::write(&path, "iteration,loss\n1,1.7e308\r\n2,-inf\n3,7\n").unwrap();
         let read = &read_metrics(&path, &["loss"], &[]).unwrap().columns["loss"];
-        assert!(read[0].is_nan() && read[1].is_nan() && read[2] == 7.0, "{read:?}");
-        for text in
-            [format!("{{{}\n", "\"a\": 1,".repeat(100_000)), format!("iteration,loss\n1,{}\n", "x".repeat(99_999))]
-        {
+        assert!(
+            read[0].is_nan() && read[1].is_nan() && read[2] == 7.0,
+            "{read:?}"
+        );
+        for text in [
+            format!("{{{}\n", "\"a\": 1,".repeat(100_000)),
+            format!("iteration,loss\n1,{}\n", "x".repeat(99_999)),
+        ] {
             fs::write(&path, text).unwrap();
             let refusal = format!("{:#}", read_metrics(&path, &["loss"], &[]).unwrap_err());
             assert!(refusal.len() < 500 + path.as_os_str().len(), "{refusal}");

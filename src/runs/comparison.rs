@@ -12,8 +12,12 @@ use crate::run::{read_metrics, value_at};
 const MOST_MARKS: usize = 12;
 
 /// The measures that are compared: the group of columns, and the column in it.
-const COMPARED: [(&str, &str); 4] =
-    [("eval", "goals"), ("eval", "drop_rate"), ("eval", "rot_dist"), ("training", "turned")];
+const COMPARED: [(&str, &str); 4] = [
+    ("eval", "goals"),
+    ("eval", "drop_rate"),
+    ("eval", "rot_dist"),
+    ("training", "turned"),
+];
 
 /// Two runs, A and B.
 pub struct Comparison {
@@ -47,23 +51,43 @@ impl Comparison {
             (step, figures)
         };
         let rows = marks(&curves).into_iter().map(row).collect();
-        Ok(Self { settings: configs.map(|(a, b)| a.compared_with(b)), rows })
+        Ok(Self {
+            settings: configs.map(|(a, b)| a.compared_with(b)),
+            rows,
+        })
     }
 
     /// The lines that follow the table of both runs.
     pub fn lines(&self) -> Vec<String> {
-        let words = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<String>>();
+        let words = |words: &[&str]| {
+            words
+                .iter()
+                .map(|word| (*word).to_owned())
+                .collect::<Vec<String>>()
+        };
         let settings = match self.settings.as_deref() {
             None => vec![words(&["the settings of one run are not known"])],
             Some([]) => vec![words(&["the settings are the same"])],
             Some(all) => {
-                let row = |(key, both): &Difference| [key.clone()].into_iter().chain(both.iter().map(short)).collect();
-                [words(&["setting", "A", "B"])].into_iter().chain(all.iter().map(row)).collect()
+                let row = |(key, both): &Difference| {
+                    [key.clone()]
+                        .into_iter()
+                        .chain(both.iter().map(short))
+                        .collect()
+                };
+                [words(&["setting", "A", "B"])]
+                    .into_iter()
+                    .chain(all.iter().map(row))
+                    .collect()
             }
         };
-        let settings = settings.into_iter().map(|row| row.iter().map(|cell| harmless(cell)).collect());
+        let settings = settings
+            .into_iter()
+            .map(|row| row.iter().map(|cell| harmless(cell)).collect());
         let settings: Vec<Vec<String>> = settings.collect();
-        let heads = COMPARED.iter().flat_map(|(_, column)| [format!("{column} A"), "B".to_owned()]);
+        let heads = COMPARED
+            .iter()
+            .flat_map(|(_, column)| [format!("{column} A"), "B".to_owned()]);
         let heads = ["steps".to_owned()].into_iter().chain(heads).collect();
         let figures = self.rows.iter().map(|(step, figures)| {
             let cells = figures.iter().flatten().map(|value| number(*value, 2));
@@ -74,7 +98,13 @@ impl Comparison {
         } else {
             aligned(&[heads].into_iter().chain(figures).collect::<Vec<_>>(), 0)
         };
-        [vec![String::new()], aligned(&settings, 2), vec![String::new()], figures].concat()
+        [
+            vec![String::new()],
+            aligned(&settings, 2),
+            vec![String::new()],
+            figures,
+        ]
+        .concat()
     }
 
     /// Its object of JSON, with these objects of both runs.
@@ -84,7 +114,10 @@ impl Comparison {
             both.collect::<Map<String, Value>>()
         });
         let row = |(step, figures): &(f64, [[f64; 2]; COMPARED.len()])| {
-            let figures = COMPARED.iter().zip(figures).map(|((_, column), both)| ((*column).to_owned(), json!(both)));
+            let figures = COMPARED
+                .iter()
+                .zip(figures)
+                .map(|((_, column), both)| ((*column).to_owned(), json!(both)));
             let steps = ("env_steps".to_owned(), json!(*step as u64));
             Value::Object([steps].into_iter().chain(figures).collect())
         };
@@ -107,21 +140,35 @@ fn curves(run: &Run) -> Result<Curves> {
     let steps = &table.columns["env_steps"];
     Ok(columns.map(|column| {
         let values = table.columns.get(&column).map_or(&[][..], |values| values);
-        let points = steps.iter().zip(values).map(|(step, value)| [*step, *value]);
-        points.filter(|point| point.iter().all(|x| !x.is_nan())).collect()
+        let points = steps
+            .iter()
+            .zip(values)
+            .map(|(step, value)| [*step, *value]);
+        points
+            .filter(|point| point.iter().all(|x| !x.is_nan()))
+            .collect()
     }))
 }
 
 /// The steps at which A was evaluated within the evaluations of B: the last one, and others evenly before it.
 fn marks([a, b]: &[Curves; 2]) -> Vec<f64> {
-    let common: Vec<f64> = a[0].iter().map(|[step, _]| *step).filter(|step| value_at(&b[0], *step).is_some()).collect();
+    let common: Vec<f64> = a[0]
+        .iter()
+        .map(|[step, _]| *step)
+        .filter(|step| value_at(&b[0], *step).is_some())
+        .collect();
     let count = common.len().min(MOST_MARKS);
-    (1..=count).map(|mark| common[mark * common.len() / count - 1]).collect()
+    (1..=count)
+        .map(|mark| common[mark * common.len() / count - 1])
+        .collect()
 }
 
 /// The mean of the values after `begin` up to `end`, or NaN if there are none.
 fn mean_between(points: &[[f64; 2]], begin: f64, end: f64) -> f64 {
-    let inside = points.iter().filter(|[step, _]| *step > begin && *step <= end).map(|[_, value]| *value);
+    let inside = points
+        .iter()
+        .filter(|[step, _]| *step > begin && *step <= end)
+        .map(|[_, value]| *value);
     let (sum, count) = inside.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
     sum / count
 }

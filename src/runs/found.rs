@@ -61,27 +61,51 @@ pub struct Figures {
 
 impl Run {
     /// Reads what the files of a run show at the time `now`. Figures that are `known` are read again only if the table has changed.
-    pub fn of(path: &Path, glance: &Glance, default: &Config, known: Option<&&Figures>, now: SystemTime) -> Self {
-        let config =
-            glance.config.as_ref().map(|path| Settings::new().file(Source::new(path, os::read_text(path)?)).resolve());
+    pub fn of(
+        path: &Path,
+        glance: &Glance,
+        default: &Config,
+        known: Option<&&Figures>,
+        now: SystemTime,
+    ) -> Self {
+        let config = glance.config.as_ref().map(|path| {
+            Settings::new()
+                .file(Source::new(path, os::read_text(path)?))
+                .resolve()
+        });
         let (config, problem) = match config.transpose() {
             Ok(config) => (config, None),
-            Err(error) => (None, Some(format!("config.toml does not fit this version: {error:#}"))),
+            Err(error) => (
+                None,
+                Some(format!("config.toml does not fit this version: {error:#}")),
+            ),
         };
         let stamp = glance.metrics.as_deref().and_then(os::stamp);
         let figures = match known.filter(|known| known.stamp == stamp) {
             Some(known) => (*known).clone(),
-            None => Figures { stamp, ..Figures::of(path, glance.metrics.is_some()) },
+            None => Figures {
+                stamp,
+                ..Figures::of(path, glance.metrics.is_some())
+            },
         };
         let total_steps = config.as_ref().map(|config| config.run.total_steps);
         // A run that waits for evaluations to rise may end before, and its mark says so.
-        let needed = config.as_ref().filter(|config| config.run.patience == 0).and(total_steps);
+        let needed = config
+            .as_ref()
+            .filter(|config| config.run.patience == 0)
+            .and(total_steps);
         let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         Self {
-            name: whole.file_name().unwrap_or(whole.as_os_str()).to_string_lossy().into_owned(),
+            name: whole
+                .file_name()
+                .unwrap_or(whole.as_os_str())
+                .to_string_lossy()
+                .into_owned(),
             state: RunState::of(glance, figures.env_steps, needed, now),
             total_steps,
-            changed: config.as_ref().map_or(Vec::new(), |config| default.compared_with(config)),
+            changed: config
+                .as_ref()
+                .map_or(Vec::new(), |config| default.compared_with(config)),
             problems: problem.into_iter().chain(figures.problem.clone()).collect(),
             path: path.to_owned(),
             figures,
@@ -103,7 +127,13 @@ impl Run {
 
     /// The cells of its row.
     pub fn cells(&self) -> Vec<String> {
-        let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
+        let Figures {
+            env_steps,
+            steps_per_s,
+            goals,
+            best_goals,
+            ..
+        } = self.figures;
         let steps = match (env_steps, self.total_steps) {
             (Some(made), Some(all)) => steps_of_all(made, all),
             (Some(made), None) => made.to_string(),
@@ -111,10 +141,18 @@ impl Run {
         };
         let settings = match (&self.problems[..], &self.config) {
             ([], None) => "no config.toml".into(),
-            ([], _) => {
-                self.changed.iter().map(|(key, [_, own])| format!("{key}={}", short(own))).collect::<Vec<_>>().join(" ")
-            }
-            (problems, _) => problems.join("; ").lines().map(str::trim).collect::<Vec<_>>().join(" "),
+            ([], _) => self
+                .changed
+                .iter()
+                .map(|(key, [_, own])| format!("{key}={}", short(own)))
+                .collect::<Vec<_>>()
+                .join(" "),
+            (problems, _) => problems
+                .join("; ")
+                .lines()
+                .map(str::trim)
+                .collect::<Vec<_>>()
+                .join(" "),
         };
         let name = match self.name.char_indices().nth(LONGEST_NAME) {
             Some((end, _)) => format!("{}…", &self.name[..end]),
@@ -134,8 +172,17 @@ impl Run {
 
     /// Its object of JSON.
     pub fn as_json(&self) -> Value {
-        let changed = self.changed.iter().map(|(key, [_, own])| (key.clone(), json!(own)));
-        let Figures { env_steps, steps_per_s, goals, best_goals, .. } = self.figures;
+        let changed = self
+            .changed
+            .iter()
+            .map(|(key, [_, own])| (key.clone(), json!(own)));
+        let Figures {
+            env_steps,
+            steps_per_s,
+            goals,
+            best_goals,
+            ..
+        } = self.figures;
         json!({
             "name": self.name,
             "path": self.path.to_string_lossy(),
@@ -170,8 +217,15 @@ impl Figures {
         let read = || -> Result<Self> {
             let names = ["env_steps", "time/steps_per_s", "eval/goals"];
             let table = read_metrics(run, &names[..1], &names[1..])?;
-            let [steps, speeds, goals] = names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
-            let known = |values: &[f64]| values.iter().copied().filter(|value| !value.is_nan()).collect::<Vec<f64>>();
+            let [steps, speeds, goals] =
+                names.map(|name| table.columns.get(name).map_or(&[][..], |values| values));
+            let known = |values: &[f64]| {
+                values
+                    .iter()
+                    .copied()
+                    .filter(|value| !value.is_nan())
+                    .collect::<Vec<f64>>()
+            };
             let speeds = known(&speeds[speeds.len().saturating_sub(LAST)..]);
             let goals = known(goals);
             Ok(Self {
@@ -182,15 +236,25 @@ impl Figures {
                 ..none.clone()
             })
         };
-        read().unwrap_or_else(|error| Self { problem: Some(format!("{error:#}")), ..none })
+        read().unwrap_or_else(|error| Self {
+            problem: Some(format!("{error:#}")),
+            ..none
+        })
     }
 }
 
 impl RunState {
     /// The state of a run with these files and steps.
-    fn of(glance: &Glance, env_steps: Option<u64>, total_steps: Option<u64>, now: SystemTime) -> Self {
+    fn of(
+        glance: &Glance,
+        env_steps: Option<u64>,
+        total_steps: Option<u64>,
+        now: SystemTime,
+    ) -> Self {
         let all = env_steps.zip(total_steps).map(|(made, all)| made >= all);
-        let age = glance.logged.map(|logged| now.duration_since(logged).unwrap_or_default());
+        let age = glance
+            .logged
+            .map(|logged| now.duration_since(logged).unwrap_or_default());
         match glance.hold {
             Hold::Held => Self::Training,
             _ if all.unwrap_or(glance.is_marked) => Self::Finished,
@@ -220,7 +284,14 @@ mod tests {
         let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1000);
         let state = |hold, is_marked, made: Option<u64>, age| {
             let logged = Some(now - Duration::from_secs(age));
-            let glance = Glance { begun: None, hold, is_marked, config: None, metrics: None, logged };
+            let glance = Glance {
+                begun: None,
+                hold,
+                is_marked,
+                config: None,
+                metrics: None,
+                logged,
+            };
             RunState::of(&glance, made, Some(9), now)
         };
         use Hold::{Elsewhere, Held, Left, Released};
@@ -230,10 +301,21 @@ mod tests {
             "resumed with more steps, before its first iteration"
         );
         assert_eq!(state(Left, false, Some(9), 500), RunState::Finished);
-        assert_eq!(state(Released, true, None, 500), RunState::Finished, "a table that cannot be read");
-        assert_eq!(state(Released, true, Some(5), 500), RunState::Stopped, "by a file");
+        assert_eq!(
+            state(Released, true, None, 500),
+            RunState::Finished,
+            "a table that cannot be read"
+        );
+        assert_eq!(
+            state(Released, true, Some(5), 500),
+            RunState::Stopped,
+            "by a file"
+        );
         assert_eq!(state(Released, false, Some(5), 500), RunState::Stopped);
-        assert_eq!([state(Left, false, Some(5), 3), state(Left, false, None, 3)], [RunState::Failed; 2]);
+        assert_eq!(
+            [state(Left, false, Some(5), 3), state(Left, false, None, 3)],
+            [RunState::Failed; 2]
+        );
         assert_eq!(state(Elsewhere, false, Some(5), 3), RunState::Training);
         assert_eq!(state(Elsewhere, false, Some(5), 500), RunState::Failed);
     }

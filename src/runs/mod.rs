@@ -23,7 +23,16 @@ use found::{Figures, Run};
 const EVERY: Duration = Duration::from_secs(5);
 
 /// The heads of the columns. The first [`WORDS`] columns hold words.
-const HEADS: [&str; 8] = ["run", "state", "left", "steps", "steps/s", "goals", "best", "differs from the default in"];
+const HEADS: [&str; 8] = [
+    "run",
+    "state",
+    "left",
+    "steps",
+    "steps/s",
+    "goals",
+    "best",
+    "differs from the default in",
+];
 const WORDS: usize = 2;
 
 /// Prints the runs in a folder, or the comparison of two runs. With `--watch`, prints again and again.
@@ -49,7 +58,11 @@ pub fn runs(args: &RunsArgs) -> Result<()> {
         if runs.is_empty() && !args.watch {
             os::say!("there are no runs in this folder");
         }
-        let letters = if compared.is_some() { &["A", "B"][..] } else { &[] };
+        let letters = if compared.is_some() {
+            &["A", "B"][..]
+        } else {
+            &[]
+        };
         let mut lines = table(&runs, letters);
         lines.extend(compared.iter().flat_map(Comparison::lines));
         if !args.watch {
@@ -69,7 +82,10 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     let seen = |path: PathBuf| Glance::of(&path).map(|glance| (path, glance));
     let places = &args.places;
     let all = |folder| -> Result<Vec<_>> {
-        Ok(run::folders_of_runs(folder, args.watch)?.into_iter().filter_map(seen).collect())
+        Ok(run::folders_of_runs(folder, args.watch)?
+            .into_iter()
+            .filter_map(seen)
+            .collect())
     };
     let mut found: Vec<(PathBuf, Glance)> = match &places[..] {
         [] => all(None)?,
@@ -77,7 +93,12 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
         places => {
             let runs = places.iter().map(|place| {
                 ensure!(place.exists(), "{}: no such folder", place.display());
-                let no_run = || format!("{} holds no run; to list a folder of runs, name it alone", place.display());
+                let no_run = || {
+                    format!(
+                        "{} holds no run; to list a folder of runs, name it alone",
+                        place.display()
+                    )
+                };
                 seen(place.clone()).with_context(no_run)
             });
             runs.collect::<Result<_>>()?
@@ -86,19 +107,31 @@ fn read(args: &RunsArgs, default: &Config, before: &[Run]) -> Result<Vec<Run>> {
     if places.len() < 2 {
         found.sort_by(|(a, of_a), (b, of_b)| (of_b.begun, b).cmp(&(of_a.begun, a)));
     }
-    let known: HashMap<&Path, &Figures> = before.iter().map(|run| (&*run.path, &run.figures)).collect();
+    let known: HashMap<&Path, &Figures> = before
+        .iter()
+        .map(|run| (&*run.path, &run.figures))
+        .collect();
     let now = SystemTime::now();
-    Ok(found.into_par_iter().map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now)).collect())
+    Ok(found
+        .into_par_iter()
+        .map(|(path, glance)| Run::of(&path, &glance, default, known.get(&*path), now))
+        .collect())
 }
 
 /// The runs as lines, each with its letter if they have some.
 fn table(runs: &[Run], letters: &[&str]) -> Vec<String> {
     let heads = HEADS.map(String::from).to_vec();
     let rows = [heads].into_iter().chain(runs.iter().map(Run::cells));
-    let marks = [""].iter().chain(letters).map(|letter| vec![(*letter).to_owned()]);
+    let marks = [""]
+        .iter()
+        .chain(letters)
+        .map(|letter| vec![(*letter).to_owned()]);
     let rows: Vec<Vec<String>> = match letters.len() {
         0 => rows.collect(),
-        _ => marks.zip(rows).map(|(mark, row)| [mark, row].concat()).collect(),
+        _ => marks
+            .zip(rows)
+            .map(|(mark, row)| [mark, row].concat())
+            .collect(),
     };
     aligned(&rows, WORDS + usize::from(!letters.is_empty()))
 }

@@ -15,14 +15,19 @@ pub struct Clock {
 
 impl Clock {
     pub fn new(ctrl_dt: f64) -> Self {
-        Self { ctrl_dt, last: Instant::now(), owed: 0.0 }
+        Self {
+            ctrl_dt,
+            last: Instant::now(),
+            owed: 0.0,
+        }
     }
 
     /// The steps since the last call, at this multiple of real time.
     pub fn steps_due(&mut self, speed: f64) -> u32 {
         let passed = self.last.elapsed().as_secs_f64();
         self.last = Instant::now();
-        self.owed = (self.owed + passed * speed).min((LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt));
+        self.owed =
+            (self.owed + passed * speed).min((LARGEST_LAG * speed.max(1.0)).max(self.ctrl_dt));
         let steps = (self.owed / self.ctrl_dt).floor();
         self.owed -= steps * self.ctrl_dt;
         steps as u32
@@ -55,6 +60,10 @@ mod tests {
         assert_eq!(clock.steps_due(1.0), 25);
         let mut slow = Clock::new(0.3);
         slow.last -= Duration::from_secs(60);
-        assert_eq!(slow.steps_due(0.5), 1, "a control step may be longer than the lag");
+        assert_eq!(
+            slow.steps_due(0.5),
+            1,
+            "a control step may be longer than the lag"
+        );
     }
 }

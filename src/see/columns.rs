@@ -34,7 +34,9 @@ pub struct Columns {
 impl Columns {
     pub fn new(task: &Arc<Task>, camera: Option<Camera>) -> Self {
         let is_builtin = task.config.model_file().is_none();
-        let mut drawing = task.scene.drawing(task.hand.side().filter(|_| is_builtin), camera);
+        let mut drawing = task
+            .scene
+            .drawing(task.hand.side().filter(|_| is_builtin), camera);
         if is_builtin && camera.is_none() {
             // Near enough for hand, cube and goal to fill the picture.
             drawing.scene["camera"] = json!({
@@ -48,7 +50,11 @@ impl Columns {
         }
         let goal = drawing.positions + 7 * task.hand.goal.0;
         drawing.start[goal..goal + 3].copy_from_slice(&task.goal_place());
-        Self { task: task.clone(), drawing, goal: goal + 3 }
+        Self {
+            task: task.clone(),
+            drawing,
+            goal: goal + 3,
+        }
     }
 
     /// How many numbers give the poses.
@@ -70,8 +76,17 @@ impl Columns {
     pub fn of(&self, env: &Repose, reward: TaskReward) -> Vec<f64> {
         let last = &env.last;
         let episode = env.episode();
-        let (goal, error) = if episode.length == 0 { (env.goal, env.rot_dist()) } else { (last.goal, last.rot_dist) };
-        let scalars = [episode.length.into(), error, env.held.into(), episode.goals.into()];
+        let (goal, error) = if episode.length == 0 {
+            (env.goal, env.rot_dist())
+        } else {
+            (last.goal, last.rot_dist)
+        };
+        let scalars = [
+            episode.length.into(),
+            error,
+            env.held.into(),
+            episode.goals.into(),
+        ];
         self.row(env.sim.qpos(), &goal, scalars, &reward)
     }
 
@@ -82,9 +97,13 @@ impl Columns {
     pub fn of_record(&self, record: &Value) -> Result<Vec<f64>> {
         let number = |value: &Value| value.as_f64().filter(|x| x.abs() < LARGEST);
         let list = |key: &str, length: usize| {
-            let found: Option<Vec<f64>> = record[key].as_array().and_then(|list| list.iter().map(number).collect());
+            let found: Option<Vec<f64>> = record[key]
+                .as_array()
+                .and_then(|list| list.iter().map(number).collect());
             let fits = found.filter(|found| found.len() == length);
-            fits.with_context(|| format!("`{key}` is not a list of {length} numbers, as in this scene"))
+            fits.with_context(|| {
+                format!("`{key}` is not a list of {length} numbers, as in this scene")
+            })
         };
         // A reset has no errors, no counts and no reward.
         let is_reset = record["reset"] == true;
@@ -93,24 +112,56 @@ impl Columns {
             found => found.with_context(|| format!("`{what}` is not a number")),
         };
         let count = |key: &str| {
-            let count = if is_reset && key != "step" { Some(0) } else { record[key].as_u64() };
+            let count = if is_reset && key != "step" {
+                Some(0)
+            } else {
+                record[key].as_u64()
+            };
             let count = count.filter(|count| *count <= MOST.into());
-            count.map(|count| count as f64).with_context(|| format!("`{key}` is not a count up to {MOST}"))
+            count
+                .map(|count| count as f64)
+                .with_context(|| format!("`{key}` is not a count up to {MOST}"))
         };
-        let scalars = [count("step")?, value(&record["rot_dist"], "rot_dist")?, count("held")?, count("goals")?];
-        let reward: Result<Vec<f64>> = Self::terms().map(|term| value(&record["reward"][term], term)).collect();
-        Ok(self.row(&list("qpos", self.drawing.positions)?, &list("goal", 4)?, scalars, &reward?))
+        let scalars = [
+            count("step")?,
+            value(&record["rot_dist"], "rot_dist")?,
+            count("held")?,
+            count("goals")?,
+        ];
+        let reward: Result<Vec<f64>> = Self::terms()
+            .map(|term| value(&record["reward"][term], term))
+            .collect();
+        Ok(self.row(
+            &list("qpos", self.drawing.positions)?,
+            &list("goal", 4)?,
+            scalars,
+            &reward?,
+        ))
     }
 
-    fn row(&self, qpos: &[f64], goal: &[f64], scalars: [f64; SCALARS.len()], reward: &[f64]) -> Vec<f64> {
+    fn row(
+        &self,
+        qpos: &[f64],
+        goal: &[f64],
+        scalars: [f64; SCALARS.len()],
+        reward: &[f64],
+    ) -> Vec<f64> {
         let mut row = self.drawing.start.clone();
         row[..self.drawing.positions].copy_from_slice(qpos);
         row[self.goal..self.goal + 4].copy_from_slice(goal);
         row.extend(scalars.iter().chain(reward));
         // The physics of the last step of an episode may have diverged.
         for (place, x) in row.iter_mut().enumerate() {
-            let most = if place < self.poses() { FARTHEST } else { LARGEST };
-            *x = if x.is_nan() { 0.0 } else { x.clamp(-most, most) };
+            let most = if place < self.poses() {
+                FARTHEST
+            } else {
+                LARGEST
+            };
+            *x = if x.is_nan() {
+                0.0
+            } else {
+                x.clamp(-most, most)
+            };
         }
         row
     }
@@ -154,10 +205,21 @@ impl Columns {
             meta[key] = value.clone();
         }
         let counts = [0, 2, 3].map(|scalar| self.poses() + scalar).to_vec();
-        let Drawing { scene, start, meshes, .. } = &mut self.drawing;
+        let Drawing {
+            scene,
+            start,
+            meshes,
+            ..
+        } = &mut self.drawing;
         let mut scene = scene.take();
         scene["start"] = json!(start);
-        Page { meta, scene, meshes: std::mem::take(meshes), rows, counts }
+        Page {
+            meta,
+            scene,
+            meshes: std::mem::take(meshes),
+            rows,
+            counts,
+        }
     }
 }
 

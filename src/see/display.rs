@@ -17,10 +17,20 @@ use crate::sim::Look;
 pub fn task_for_display(task: &Task, look: &Look) -> Result<Arc<Task>> {
     let note = |error: &Error| os::say!("note: {error:#}; primitives are shown instead");
     // Only the built-in hand has meshes.
-    let prefix = task.hand.side().filter(|_| !look.plain && task.config.model_file().is_none());
-    let meshes =
-        |prefix: &str| os::hand_meshes(&mesh_files()).inspect_err(note).ok().map(|meshes| dress(prefix, meshes));
-    let dressed = Look { dress: prefix.and_then(meshes), ..look.clone() };
+    let prefix = task
+        .hand
+        .side()
+        .filter(|_| !look.plain && task.config.model_file().is_none());
+    let meshes = |prefix: &str| {
+        os::hand_meshes(&mesh_files())
+            .inspect_err(note)
+            .ok()
+            .map(|meshes| dress(prefix, meshes))
+    };
+    let dressed = Look {
+        dress: prefix.and_then(meshes),
+        ..look.clone()
+    };
     let shown = task.for_display(&dressed);
     match &shown {
         Err(error) if dressed.dress.is_some() => note(error),

@@ -6,8 +6,13 @@ use crate::sim::{Dress, Piece};
 type MeshPart = (&'static str, &'static str, &'static str, f64);
 
 /// The parts, by what the bodies' names begin with after the hand's prefix. The values come from MuJoCo Menagerie's Shadow Hand.
-const PARTS: [(&str, &[MeshPart]); 5] =
-    [("", &HAND), ("ff", &FINGER), ("mf", &FINGER), ("rf", &FINGER), ("lf", &FINGER)];
+const PARTS: [(&str, &[MeshPart]); 5] = [
+    ("", &HAND),
+    ("ff", &FINGER),
+    ("mf", &FINGER),
+    ("rf", &FINGER),
+    ("lf", &FINGER),
+];
 
 const HAND: [MeshPart; 8] = [
     ("forearm", "forearm_0.obj", "metal", 0.0),
@@ -29,7 +34,10 @@ const FINGER: [MeshPart; 4] = [
 
 /// The mesh files of the hand, sorted and without duplicates.
 pub fn mesh_files() -> Vec<&'static str> {
-    let mut files: Vec<&str> = PARTS.iter().flat_map(|(_, parts)| parts.iter().map(|part| part.1)).collect();
+    let mut files: Vec<&str> = PARTS
+        .iter()
+        .flat_map(|(_, parts)| parts.iter().map(|part| part.1))
+        .collect();
     files.sort_unstable();
     files.dedup();
     files
@@ -40,7 +48,12 @@ pub fn dress(prefix: &str, contents: Vec<Vec<u8>>) -> Dress {
     let pieces = PARTS.iter().flat_map(|(finger, parts)| {
         parts.iter().map(move |&(part, file, material, height)| {
             let body = format!("{prefix}{finger}{part}");
-            Piece { body, file, material, height }
+            Piece {
+                body,
+                file,
+                material,
+                height,
+            }
         })
     });
     Dress {

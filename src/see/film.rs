@@ -34,9 +34,23 @@ impl Film {
         let longest = ((seconds * f64::from(fps)).ceil() as u64).saturating_add(1);
         let all = episodes.saturating_mul(longest);
         let renderer = Renderer::new(&task.scene)?;
-        let writer = FilmWriter::create(to, FilmFormat { size: renderer.size(), fps, longest: all as usize })?;
+        let writer = FilmWriter::create(
+            to,
+            FilmFormat {
+                size: renderer.size(),
+                fps,
+                longest: all as usize,
+            },
+        )?;
         let bar = progress_bar(all, "frames", "film");
-        Ok(Self { renderer, writer, fps, longest, drawn: 0, bar })
+        Ok(Self {
+            renderer,
+            writer,
+            fps,
+            longest,
+            drawn: 0,
+            bar,
+        })
     }
 
     /// Adds the frames that are due at `moment`, each with a caption.
@@ -53,13 +67,18 @@ impl Film {
         let until = time + if moment.ends() { -1e-9 } else { 1e-9 };
         while self.drawn < self.longest && self.drawn as f64 / f64::from(self.fps) <= until {
             let picture = self.renderer.draw(&env.sim)?.to_vec();
-            self.writer.push((picture, caption(env, moment.episode, time)))?;
+            self.writer
+                .push((picture, caption(env, moment.episode, time)))?;
             self.drawn += 1;
             self.bar.inc(1);
         }
         if moment.ends() {
             self.bar.dec_length(self.longest.saturating_sub(self.drawn));
-            self.bar.set_message(format!("{} goals in episode {}", env.episode().goals, moment.episode));
+            self.bar.set_message(format!(
+                "{} goals in episode {}",
+                env.episode().goals,
+                moment.episode
+            ));
         }
         Ok(())
     }
@@ -79,7 +98,9 @@ impl Film {
         let frames = self.bar.position();
         let seconds = frames as f64 / f64::from(self.fps);
         let rate = frames as f64 / self.bar.elapsed().as_secs_f64();
-        Ok(format!("{width}x{height}, {frames} frames, {seconds:.2} s, rendered at {rate:.1} frames/s"))
+        Ok(format!(
+            "{width}x{height}, {frames} frames, {seconds:.2} s, rendered at {rate:.1} frames/s"
+        ))
     }
 }
 
@@ -88,8 +109,16 @@ fn caption(env: &Repose, episode: usize, time: f64) -> Vec<String> {
     let tolerance = env.task.config.success_tolerance.to_degrees();
     vec![
         format!("episode {episode}  {time:5.2} s"),
-        format!("goals {}  held {}/{}", env.episode().goals, env.held, env.task.config.max_consecutive_successes),
-        format!("error {:5.1}° (goal {tolerance:.1}°)", env.rot_dist().to_degrees()),
+        format!(
+            "goals {}  held {}/{}",
+            env.episode().goals,
+            env.held,
+            env.task.config.max_consecutive_successes
+        ),
+        format!(
+            "error {:5.1}° (goal {tolerance:.1}°)",
+            env.rot_dist().to_degrees()
+        ),
     ]
 }
 

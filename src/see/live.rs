@@ -83,16 +83,31 @@ impl Live {
         let page = columns.page(about, more, Vec::new());
         let key = page.key();
         let episodes = Episodes::scored(about.seed.unwrap_or(0), usize::MAX);
-        let hands: Vec<_> = (0..hands).map(|episode| LiveHand::new(acting.clone(), episode, episodes)).collect();
+        let hands: Vec<_> = (0..hands)
+            .map(|episode| LiveHand::new(acting.clone(), episode, episodes))
+            .collect();
         let hello = hello(&key, &hands, sliders.as_ref());
-        let server = Server::open(port, page.html(), &hello, sliders.as_ref().map(Sliders::on_post))?;
+        let server = Server::open(
+            port,
+            page.html(),
+            &hello,
+            sliders.as_ref().map(Sliders::on_post),
+        )?;
         let port = server.port;
         let machine = Machine::this().name;
         os::say!(
             "the hand is at http://127.0.0.1:{port}/ (Ctrl-C ends)\n\
              from another machine: ssh -L {port}:127.0.0.1:{port} {machine}, and the same address there"
         );
-        Ok(Self { columns, server, sliders, key, every, episodes, hands })
+        Ok(Self {
+            columns,
+            server,
+            sliders,
+            key,
+            every,
+            episodes,
+            hands,
+        })
     }
 
     /// Shows the hands for as long as the program runs. `next` says who acts in each further episode.
@@ -121,7 +136,10 @@ impl Live {
                 steps += 1;
                 if steps.is_multiple_of(self.every) {
                     let row = self.row();
-                    self.server.send(&format!("id: {}\ndata: {row}\n\n", start.elapsed().as_millis()));
+                    self.server.send(&format!(
+                        "id: {}\ndata: {row}\n\n",
+                        start.elapsed().as_millis()
+                    ));
                 }
             }
             sleep(TICK);
@@ -138,7 +156,8 @@ impl Live {
     }
 
     fn greet(&self) {
-        self.server.greet(&hello(&self.key, &self.hands, self.sliders.as_ref()));
+        self.server
+            .greet(&hello(&self.key, &self.hands, self.sliders.as_ref()));
     }
 
     /// The row of all hands, as the page reads it.
@@ -147,7 +166,9 @@ impl Live {
             let reward = std::mem::take(&mut hand.reward);
             self.columns.of(&hand.player.lane.env, reward)
         });
-        let bytes: Vec<u8> = rows.flat_map(|value| (value as f32).to_le_bytes()).collect();
+        let bytes: Vec<u8> = rows
+            .flat_map(|value| (value as f32).to_le_bytes())
+            .collect();
         BASE64_STANDARD.encode(bytes)
     }
 }
@@ -155,12 +176,24 @@ impl Live {
 impl LiveHand {
     /// Begins one of these episodes, by its number.
     fn new(acting: LiveActor, episode: usize, episodes: Episodes) -> Self {
-        let player = Player::new(&acting.task, Episodes { first: episode, ..episodes });
+        let player = Player::new(
+            &acting.task,
+            Episodes {
+                first: episode,
+                ..episodes
+            },
+        );
         let mut about = json!({ "seed": format!("{}, episode {episode}", episodes.seed) });
         if let Some(policy) = &acting.policy {
             about["policy"] = policy.as_str().into();
         }
-        Self { player, acting, about, has_ended: false, reward: TaskReward::default() }
+        Self {
+            player,
+            acting,
+            about,
+            has_ended: false,
+            reward: TaskReward::default(),
+        }
     }
 
     fn step(&mut self) {
@@ -197,11 +230,27 @@ mod tests {
             let config = Settings::new().sets(&sets).resolve().unwrap();
             Task::new(&config).unwrap()
         };
-        let acting = |task: &Arc<Task>| LiveActor { step: Rc::new(|_| None), policy: None, task: task.clone() };
-        let about = About { title: "A hand".into(), policy: None, seed: None };
+        let acting = |task: &Arc<Task>| LiveActor {
+            step: Rc::new(|_| None),
+            policy: None,
+            task: task.clone(),
+        };
+        let about = About {
+            title: "A hand".into(),
+            policy: None,
+            seed: None,
+        };
         let [first, second] = [task(&[]), task(&["env.max_episode_seconds=3"])];
         let mut live = Live::open(0, (&about, None), 1, &acting(&first), None).unwrap();
-        let seconds = |live: &Live| live.hands[0].player.lane.env.task.config.max_episode_seconds;
+        let seconds = |live: &Live| {
+            live.hands[0]
+                .player
+                .lane
+                .env
+                .task
+                .config
+                .max_episode_seconds
+        };
         assert_eq!(seconds(&live), 10.0);
         live.begin(0, 1, acting(&second));
         assert_eq!(seconds(&live), 3.0);

@@ -27,7 +27,9 @@ pub use sliders::Sliders;
 pub use window::Window;
 
 /// The message of a build without films and pictures.
-pub const NO_FILMS: &str = "this build cannot make films or pictures: it was built without the feature `video`";
+pub const NO_FILMS: &str =
+    "this build cannot make films or pictures: it was built without the feature `video`";
 
 /// The message of a build without windows.
-pub const NO_WINDOWS: &str = "this build cannot open windows: it was built without the feature `viewer`";
+pub const NO_WINDOWS: &str =
+    "this build cannot open windows: it was built without the feature `viewer`";

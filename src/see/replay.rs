@@ -36,20 +36,37 @@ impl Replay {
         let task = task_for_display(task, look)?;
         let steps = task.config.max_episode_steps();
         let all = steps as usize * episodes;
-        ensure!(episodes <= MOST_EPISODES, "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}");
+        ensure!(
+            episodes <= MOST_EPISODES,
+            "an HTML file shows at most {MOST_EPISODES} episodes, not {episodes}"
+        );
         ensure!(
             steps <= MOST,
             "env.max_episode_seconds: an HTML file shows episodes of at most {MOST} steps, not {steps}"
         );
-        ensure!(all <= MOST_STEPS, "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes");
-        Ok(Self { output, columns: Columns::new(&task, look.camera), episodes: BTreeMap::new() })
+        ensure!(
+            all <= MOST_STEPS,
+            "an HTML file shows at most {MOST_STEPS} steps, not {all}: play fewer episodes"
+        );
+        Ok(Self {
+            output,
+            columns: Columns::new(&task, look.camera),
+            episodes: BTreeMap::new(),
+        })
     }
 
     /// Records a moment of an episode.
     pub fn observe(&mut self, moment: &Moment) {
         let last = &moment.env.last;
         let begins = moment.step.is_none();
-        let row = self.columns.of(moment.env, if begins { TaskReward::default() } else { last.reward });
+        let row = self.columns.of(
+            moment.env,
+            if begins {
+                TaskReward::default()
+            } else {
+                last.reward
+            },
+        );
         let end = moment.step.and_then(|(_, end)| end).map(|end| match end {
             End::Terminated if last.diverged => "diverged",
             End::Terminated => "terminated",
@@ -65,18 +82,34 @@ impl Replay {
     pub fn read(&mut self, trace: &str) -> Result<usize> {
         let mut begun = 0;
         let mut rows = 0;
-        let lines = trace.lines().enumerate().skip(1).filter(|(_, line)| !line.is_empty());
+        let lines = trace
+            .lines()
+            .enumerate()
+            .skip(1)
+            .filter(|(_, line)| !line.is_empty());
         for (number, line) in lines {
             let what = || format!("line {}", number + 1);
-            let record: Value = serde_json::from_str(line).ok().context("it is not JSON").with_context(what)?;
+            let record: Value = serde_json::from_str(line)
+                .ok()
+                .context("it is not JSON")
+                .with_context(what)?;
             begun += usize::from(record["reset"] == true);
-            ensure!(begun > 0, "{}: it is not the first record of an episode", what());
+            ensure!(
+                begun > 0,
+                "{}: it is not the first record of an episode",
+                what()
+            );
             if begun <= MOST_EPISODES {
                 let row = self.columns.of_record(&record).with_context(what)?;
-                let end = ["diverged", "terminated", "truncated"].into_iter().find(|end| record[end] == true);
+                let end = ["diverged", "terminated", "truncated"]
+                    .into_iter()
+                    .find(|end| record[end] == true);
                 self.add(begun - 1, row, end);
                 rows += 1;
-                ensure!(rows <= MOST_STEPS + MOST_EPISODES, "it has more than {MOST_STEPS} steps");
+                ensure!(
+                    rows <= MOST_STEPS + MOST_EPISODES,
+                    "it has more than {MOST_STEPS} steps"
+                );
             }
         }
         Ok(begun.saturating_sub(MOST_EPISODES))
@@ -120,7 +153,10 @@ impl Replay {
             episodes.push(json!({ "row": rows.len(), "hand": 0, "end": end }));
             rows.extend(own);
         }
-        let html = self.columns.page(about, json!({ "episodes": episodes }), rows).html();
+        let html = self
+            .columns
+            .page(about, json!({ "episodes": episodes }), rows)
+            .html();
         let path = self.output.path.display().to_string();
         self.output.finish(html.as_bytes())?;
         say!("{path}: {} kB", html.len().div_ceil(1000));

@@ -38,8 +38,15 @@ impl Sliders {
     pub fn new(task: &Task) -> Self {
         let hand = &task.hand;
         let sliders = hand.parts.actuators.iter().zip(&hand.actuators);
-        let sliders = sliders.map(|(name, actuator)| Slider { name: name.clone(), range: actuator.range, value: None });
-        Self(Arc::new(Mutex::new(SliderStates { sliders: sliders.collect(), moved: false })))
+        let sliders = sliders.map(|(name, actuator)| Slider {
+            name: name.clone(),
+            range: actuator.range,
+            value: None,
+        });
+        Self(Arc::new(Mutex::new(SliderStates {
+            sliders: sliders.collect(),
+            moved: false,
+        })))
     }
 
     /// Changes an action to what the sliders ask for: -1 and 1 are the ends of the range of an actuator.
@@ -58,7 +65,9 @@ impl Sliders {
         Box::new(move |body| {
             let moves: Vec<(usize, f64)> = serde_json::from_slice(body).map_err(|_| MALFORMED)?;
             let mut state = own.state();
-            let sound = |(actuator, value): &(usize, f64)| *actuator < state.sliders.len() && value.is_finite();
+            let sound = |(actuator, value): &(usize, f64)| {
+                *actuator < state.sliders.len() && value.is_finite()
+            };
             if !moves.iter().all(sound) {
                 return Err(MALFORMED);
             }
@@ -113,10 +122,23 @@ mod tests {
             action
         };
         assert!(acted() == [0.25; 20] && !sliders.take_moved());
-        for bad in ["", "[]x", "[[20,0]]", "[[-1,0]]", "[[0,null]]", "[[0]]", "[[0,1e999]]", "{}", "[[3,0],[99,0]]"] {
+        for bad in [
+            "",
+            "[]x",
+            "[[20,0]]",
+            "[[-1,0]]",
+            "[[0,null]]",
+            "[[0]]",
+            "[[0,1e999]]",
+            "{}",
+            "[[3,0],[99,0]]",
+        ] {
             assert!(post(bad.as_bytes()).is_err(), "{bad}");
         }
-        assert!(acted() == [0.25; 20] && !sliders.take_moved(), "a request is taken whole or not at all");
+        assert!(
+            acted() == [0.25; 20] && !sliders.take_moved(),
+            "a request is taken whole or not at all"
+        );
         post(format!("[[3,{}]]", low + 0.75 * (high - low)).as_bytes()).unwrap();
         assert!(sliders.take_moved() && !sliders.take_moved());
         assert!((acted()[3] - 0.5).abs() < 1e-6 && acted()[4] == 0.25);

@@ -49,8 +49,15 @@ impl<'a> Window<'a> {
         let mut tally = Tally::default();
         let level = Some(task.config.success_tolerance.to_degrees());
         let mut curves = [
-            Trend { name: "rotation error, degrees (line: tolerance)", level, ..Trend::default() },
-            Trend { name: "reward of a step", ..Trend::default() },
+            Trend {
+                name: "rotation error, degrees (line: tolerance)",
+                level,
+                ..Trend::default()
+            },
+            Trend {
+                name: "reward of a step",
+                ..Trend::default()
+            },
         ];
         let mut clock = Clock::new(task.config.ctrl_dt);
         // Ends the episode and starts the next one, if there is one.
@@ -64,7 +71,12 @@ impl<'a> Window<'a> {
         };
         while self.viewer.is_open() {
             let frame = Instant::now();
-            let readout = readout(&player.lane.env, episodes.first + tally.episodes, &tally, &curves);
+            let readout = readout(
+                &player.lane.env,
+                episodes.first + tally.episodes,
+                &tally,
+                &curves,
+            );
             let asked = self.viewer.show(&mut player.lane.env.sim, readout)?;
             if asked.reset && !next(&mut player, &mut tally, false) {
                 return Ok(tally.summary());
@@ -117,16 +129,29 @@ impl Tally {
     }
 
     fn summary(&self) -> String {
-        let Self { steps, completed, drops, goals, .. } = self;
-        format!("shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached")
+        let Self {
+            steps,
+            completed,
+            drops,
+            goals,
+            ..
+        } = self;
+        format!(
+            "shown: {steps} steps, {completed} episodes completed, {drops} drops, {goals} goals reached"
+        )
     }
 }
 
 /// Adds the last of so many steps to the curves of the error and the reward.
 fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
     let step = &env.last;
-    for (curve, value) in curves.iter_mut().zip([step.rot_dist.to_degrees(), step.reward.iter().sum()]) {
-        curve.points.push_back([steps as f64 * env.task.config.ctrl_dt, value]);
+    for (curve, value) in curves
+        .iter_mut()
+        .zip([step.rot_dist.to_degrees(), step.reward.iter().sum()])
+    {
+        curve
+            .points
+            .push_back([steps as f64 * env.task.config.ctrl_dt, value]);
         if curve.points.len() > HISTORY {
             curve.points.pop_front();
         }
@@ -136,21 +161,48 @@ fn extend(curves: &mut [Trend; 2], env: &Repose, steps: u64) {
 fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Readout {
     let config = &env.task.config;
     let stats = env.episode();
-    let reward = if stats.length == 0 { TaskReward::default() } else { env.last.reward };
+    let reward = if stats.length == 0 {
+        TaskReward::default()
+    } else {
+        env.last.reward
+    };
     let asked = config.max_consecutive_successes;
     // The largest value of each term in a step, positive or negative.
-    let extreme = Step { goal_dist: config.fall_dist, action: vec![1.0; env.spaces().action_size], ..Step::default() };
+    let extreme = Step {
+        goal_dist: config.fall_dist,
+        action: vec![1.0; env.spaces().action_size],
+        ..Step::default()
+    };
     let largest = task_reward(config, &extreme);
-    let terms = named(task_terms(), reward).zip(largest).map(|((name, value), largest)| {
-        let fraction = if largest == 0.0 { 0.0 } else { (value / largest.abs()) as f32 };
-        Gauge { name, fraction, signed: true, text: format!("{value:+.3}") }
-    });
+    let terms = named(task_terms(), reward)
+        .zip(largest)
+        .map(|((name, value), largest)| {
+            let fraction = if largest == 0.0 {
+                0.0
+            } else {
+                (value / largest.abs()) as f32
+            };
+            Gauge {
+                name,
+                fraction,
+                signed: true,
+                text: format!("{value:+.3}"),
+            }
+        });
     let fraction = env.held as f32 / asked as f32;
-    let hold = Gauge { name: "held", fraction, signed: false, text: format!("{} of {asked} steps", env.held) };
+    let hold = Gauge {
+        name: "held",
+        fraction,
+        signed: false,
+        text: format!("{} of {asked} steps", env.held),
+    };
     // The episodes before the current one, including episodes that the user ended.
     let before = match tally.episodes {
         0 => "nothing yet".to_owned(),
-        count => format!("{} goals, {} drops in {count} episodes", tally.goals, tally.drops),
+        count => format!(
+            "{} goals, {} drops in {count} episodes",
+            tally.goals, tally.drops
+        ),
     };
     let angle = |radians: f64| format!("{:.1}° = {radians:.3} rad", radians.to_degrees());
     Readout {
@@ -158,10 +210,19 @@ fn readout(env: &Repose, episode: usize, tally: &Tally, curves: &[Trend]) -> Rea
             ("goals reached", stats.goals.to_string()),
             ("rotation error", angle(env.rot_dist())),
             ("tolerance", angle(config.success_tolerance)),
-            ("episode", format!("{episode}, {:.2} s", f64::from(stats.length) * config.ctrl_dt)),
+            (
+                "episode",
+                format!(
+                    "{episode}, {:.2} s",
+                    f64::from(stats.length) * config.ctrl_dt
+                ),
+            ),
             ("before", before),
         ],
-        bars: vec![("within the tolerance", vec![hold]), ("reward of this step", terms.collect())],
+        bars: vec![
+            ("within the tolerance", vec![hold]),
+            ("reward of this step", terms.collect()),
+        ],
         curves: curves.to_vec(),
     }
 }

@@ -1,6 +1,9 @@
 //! How a scene is compiled: what MuJoCo cannot change in a compiled model, and the options.
 
-#![expect(unsafe_code, reason = "the wrapper cuts off what MuJoCo says of a file")]
+#![expect(
+    unsafe_code,
+    reason = "the wrapper cuts off what MuJoCo says of a file"
+)]
 
 use std::ffi::{CStr, CString};
 use std::fmt::Display;
@@ -57,7 +60,14 @@ pub struct Compilation {
 impl Compilation {
     /// The compilation that keeps all of a scene but its timestep in s and its friction cones.
     pub fn plain(timestep: f64, cone: Cone) -> Self {
-        Self { timestep, cone, object: String::new(), size: 1.0, shifts: false, adds_goal: None }
+        Self {
+            timestep,
+            cone,
+            object: String::new(),
+            size: 1.0,
+            shifts: false,
+            adds_goal: None,
+        }
     }
 
     /// Whether it keeps all of a scene but its options.
@@ -70,8 +80,14 @@ impl Compilation {
     /// # Errors
     /// Fails with MuJoCo's own message if MuJoCo refuses the scene, or if the object cannot be resized.
     pub(super) fn compile(&self, file: Option<&Path>) -> Result<MjModel> {
-        ensure!(!file.is_some_and(Path::is_dir), "env.model must name a MuJoCo scene, but this is a folder");
-        ensure!(file.is_none_or(Path::is_file), "env.model must name a MuJoCo scene, but there is no such file");
+        ensure!(
+            !file.is_some_and(Path::is_dir),
+            "env.model must name a MuJoCo scene, but this is a folder"
+        );
+        ensure!(
+            file.is_none_or(Path::is_file),
+            "env.model must name a MuJoCo scene, but there is no such file"
+        );
         self.spec(file)?.compile().map_err(refused)
     }
 
@@ -82,12 +98,15 @@ impl Compilation {
     pub(super) fn spec(&self, file: Option<&Path>) -> Result<MjSpec> {
         let spec = file.map_or_else(|| MjSpec::from_xml_string(BUILTIN), MjSpec::from_xml);
         let whole = || file.and_then(parse_error);
-        let mut spec = spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;
+        let mut spec =
+            spec.map_err(|error| refused(whole().unwrap_or_else(|| error.to_string())))?;
         if self.keeps_all() {
             return Ok(spec);
         }
         let name = &self.object;
-        let body = spec.body_mut(name).with_context(|| format!("has no body `{name}`"))?;
+        let body = spec
+            .body_mut(name)
+            .with_context(|| format!("has no body `{name}`"))?;
         if self.shifts {
             body.set_simple(false);
         }
@@ -95,7 +114,10 @@ impl Compilation {
             resize(body, self.size).map_err(|error| anyhow!("body `{name}` {error}"))?;
         }
         if let Some(goal) = self.adds_goal {
-            let without_goal = Self { adds_goal: None, ..self.clone() };
+            let without_goal = Self {
+                adds_goal: None,
+                ..self.clone()
+            };
             add_goal(&mut spec, &without_goal.compile(file)?, name, goal)?;
         }
         Ok(spec)
@@ -108,7 +130,12 @@ fn parse_error(file: &Path) -> Option<String> {
     let mut message = [0_u8; 4096];
     // SAFETY: the name ends with a zero, and MuJoCo writes no more than so many bytes. What it returns is deleted once.
     unsafe {
-        let spec = mj_parseXML(name.as_ptr(), ptr::null(), message.as_mut_ptr().cast(), message.len() as i32);
+        let spec = mj_parseXML(
+            name.as_ptr(),
+            ptr::null(),
+            message.as_mut_ptr().cast(),
+            message.len() as i32,
+        );
         if !spec.is_null() {
             mj_deleteSpec(spec);
             return None;
@@ -120,22 +147,35 @@ fn parse_error(file: &Path) -> Option<String> {
 
 fn refused(error: impl Display) -> Error {
     // A name in the scene may have several lines.
-    anyhow!("MuJoCo refuses this scene: {}", error.to_string().replace('\n', "\n  "))
+    anyhow!(
+        "MuJoCo refuses this scene: {}",
+        error.to_string().replace('\n', "\n  ")
+    )
 }
 
 /// The name of a scene's file, for messages.
 pub fn origin(file: Option<&Path>) -> String {
-    file.map_or("the built-in scene".into(), |path| path.display().to_string())
+    file.map_or("the built-in scene".into(), |path| {
+        path.display().to_string()
+    })
 }
 
 /// Adds a mocap body that touches nothing, in the shape and at the place of the body `name` of the compiled scene. Only there do
 /// all shapes have a position and an orientation: a file can give them in many ways.
 fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Result<()> {
-    ensure!(spec.body_mut(goal).is_none(), "has a body `{goal}` that is no mocap body");
-    let object = compiled.name_to_id(mjOBJ_BODY, name).context("a body of the compiled scene")?;
+    ensure!(
+        spec.body_mut(goal).is_none(),
+        "has a body `{goal}` that is no mocap body"
+    );
+    let object = compiled
+        .name_to_id(mjOBJ_BODY, name)
+        .context("a body of the compiled scene")?;
     let frames = frames_within(compiled, object);
     let shown = spec.world_body_mut().add_body();
-    shown.with_name(goal).with_pos(compiled.body_pos()[object]).with_mocap(true);
+    shown
+        .with_name(goal)
+        .with_pos(compiled.body_pos()[object])
+        .with_mocap(true);
     for (geom, (mut pos, mut quat)) in geoms_within(compiled, &frames) {
         let kind = compiled.geom_type()[geom];
         let mut mesh_name = "";
@@ -147,16 +187,23 @@ fn add_goal(spec: &mut MjSpec, compiled: &MjModel, name: &str, goal: &str) -> Re
             let moved = quat::rotate(quat, compiled.mesh_pos()[mesh]);
             pos = [0, 1, 2].map(|axis| pos[axis] - moved[axis]);
         }
-        let copy = only_seen(shown).with_type(kind).with_size(compiled.geom_size()[geom]);
+        let copy = only_seen(shown)
+            .with_type(kind)
+            .with_size(compiled.geom_size()[geom]);
         copy.with_pos(pos).with_quat(quat).with_meshname(mesh_name);
-        copy.with_group(compiled.geom_group()[geom]).with_rgba([0.2, 0.8, 0.2, 0.4]);
+        copy.with_group(compiled.geom_group()[geom])
+            .with_rgba([0.2, 0.8, 0.2, 0.4]);
     }
     Ok(())
 }
 
 /// Adds a geom that touches nothing and has no mass.
 pub fn only_seen(body: &mut MjsBody) -> &mut MjsGeom {
-    body.add_geom().with_contype(0).with_conaffinity(0).with_mass(0.0).with_density(0.0)
+    body.add_geom()
+        .with_contype(0)
+        .with_conaffinity(0)
+        .with_mass(0.0)
+        .with_density(0.0)
 }
 
 /// Multiplies the lengths of a body and its descendants by `factor` and leaves their masses as they are.
@@ -174,12 +221,19 @@ fn resize(body: &mut MjsBody, factor: f64) -> Result<()> {
         scale(geom.pos_mut(), factor);
         scale(geom.size_mut(), factor);
         scale(geom.fromto_mut(), factor);
-        let dimensions = if geom.typeinertia() == mjINERTIA_SHELL { 2 } else { 3 };
+        let dimensions = if geom.typeinertia() == mjINERTIA_SHELL {
+            2
+        } else {
+            3
+        };
         geom.set_density(geom.density() / factor.powi(dimensions));
     }
-    body.frame_iter_mut(false).for_each(|frame| scale(frame.pos_mut(), factor));
-    body.site_iter_mut(false).for_each(|site| scale(site.pos_mut(), factor));
-    body.joint_iter_mut(false).for_each(|joint| scale(joint.pos_mut(), factor));
+    body.frame_iter_mut(false)
+        .for_each(|frame| scale(frame.pos_mut(), factor));
+    body.site_iter_mut(false)
+        .for_each(|site| scale(site.pos_mut(), factor));
+    body.joint_iter_mut(false)
+        .for_each(|joint| scale(joint.pos_mut(), factor));
     for child in body.body_iter_mut() {
         scale(child.pos_mut(), factor);
         resize(child, factor)?;
@@ -200,11 +254,33 @@ mod tests {
             (1.0, box_in("pos='.01 0 0' quat='.6 .8 0 0'")),
             (1.0, box_in("axisangle='0 0 1 30'")),
             (1.2, box_in("pos='.01 0 0' xyaxes='0 1 0 1 0 0'")),
-            (1.2, "<geom type='capsule' size='.02 .04' euler='90 0 0'/>".into()),
-            (1.2, "<geom type='capsule' size='.02' fromto='0 0 0 .02 .03 .01'/>".into()),
-            (1.2, format!("<frame pos='.05 0 0' euler='0 90 0'>{}</frame>", box_in("euler='10 20 30'"))),
-            (1.2, format!("{}<body pos='0 .03 0' euler='0 0 40'>{}</body>", box_in(""), box_in("pos='.01 0 0'"))),
-            (1.0, "<geom type='mesh' mesh='part' pos='.01 .02 0' axisangle='0 0 1 90'/>".into()),
+            (
+                1.2,
+                "<geom type='capsule' size='.02 .04' euler='90 0 0'/>".into(),
+            ),
+            (
+                1.2,
+                "<geom type='capsule' size='.02' fromto='0 0 0 .02 .03 .01'/>".into(),
+            ),
+            (
+                1.2,
+                format!(
+                    "<frame pos='.05 0 0' euler='0 90 0'>{}</frame>",
+                    box_in("euler='10 20 30'")
+                ),
+            ),
+            (
+                1.2,
+                format!(
+                    "{}<body pos='0 .03 0' euler='0 0 40'>{}</body>",
+                    box_in(""),
+                    box_in("pos='.01 0 0'")
+                ),
+            ),
+            (
+                1.0,
+                "<geom type='mesh' mesh='part' pos='.01 .02 0' axisangle='0 0 1 90'/>".into(),
+            ),
             (1.0, "<geom type='box' mesh='part' euler='0 0 45'/>".into()),
         ] {
             let text = format!(
@@ -215,23 +291,37 @@ mod tests {
             let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
             file.write_all(text.as_bytes()).unwrap();
             let plain = Compilation::plain(0.01, Cone::Scene);
-            let compilation = Compilation { object: "cube".into(), size, adds_goal: Some("goal"), ..plain };
+            let compilation = Compilation {
+                object: "cube".into(),
+                size,
+                adds_goal: Some("goal"),
+                ..plain
+            };
             let model = compilation.compile(Some(file.path())).unwrap();
             let shapes_of = |name: &str| -> Vec<_> {
                 let body = model.name_to_id(mjOBJ_BODY, name).unwrap();
                 let frames = frames_within(&model, body);
-                let placed = geoms_within(&model, &frames).into_iter().map(|(geom, (pos, quat))| {
-                    let turn = quat::rotation_vector(quat::canonical(quat));
-                    let kind = (model.geom_type()[geom], model.geom_dataid()[geom]);
-                    (kind, [model.geom_size()[geom], pos, turn].concat())
-                });
+                let placed =
+                    geoms_within(&model, &frames)
+                        .into_iter()
+                        .map(|(geom, (pos, quat))| {
+                            let turn = quat::rotation_vector(quat::canonical(quat));
+                            let kind = (model.geom_type()[geom], model.geom_dataid()[geom]);
+                            (kind, [model.geom_size()[geom], pos, turn].concat())
+                        });
                 placed.collect()
             };
             let (object, goal) = (shapes_of("cube"), shapes_of("goal"));
             assert!(!object.is_empty() && object.len() == goal.len(), "{shapes}");
             for ((kind, place), (same_kind, same_place)) in object.iter().zip(&goal) {
-                let near = place.iter().zip(same_place).all(|(a, b)| (a - b).abs() < 1e-9);
-                assert!(near && kind.0 == same_kind.0, "{shapes}: {place:?} {same_place:?}");
+                let near = place
+                    .iter()
+                    .zip(same_place)
+                    .all(|(a, b)| (a - b).abs() < 1e-9);
+                assert!(
+                    near && kind.0 == same_kind.0,
+                    "{shapes}: {place:?} {same_place:?}"
+                );
             }
         }
     }

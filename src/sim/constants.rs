@@ -1,7 +1,7 @@
 //! MuJoCo's constants, by the names that its documentation uses.
 
 pub(super) use mujoco_rs::mujoco_c::{
-    _mjtGeomBase::*, _mjtObjBase::*, mjtBias::*, mjtBuiltin::*, mjtCone::*, mjtDisableBit::*, mjtDyn::*,
-    mjtEnableBit::*, mjtGain::*, mjtGeomInertia::*, mjtIntegrator::*, mjtJoint::*, mjtLightType::*, mjtState::*,
-    mjtTexture::*, mjtTrn::*, mjtWarning::*, mjtWrap::*,
+    _mjtGeomBase::*, _mjtObjBase::*, mjtBias::*, mjtBuiltin::*, mjtCone::*, mjtDisableBit::*,
+    mjtDyn::*, mjtEnableBit::*, mjtGain::*, mjtGeomInertia::*, mjtIntegrator::*, mjtJoint::*,
+    mjtLightType::*, mjtState::*, mjtTexture::*, mjtTrn::*, mjtWarning::*, mjtWrap::*,
 };

@@ -39,7 +39,9 @@ impl Scene {
         let floor = (0..model.ngeom() as usize).find(|&geom| is_floor(model, geom));
         let (geoms, meshes) = drawn_geoms(model, dressed, floor);
         let floor = floor.map(|geom| model.geom_pos()[geom][2]);
-        let bodies: Value = (0..model.nbody() as usize).map(|body| drawn_body(model, body)).collect();
+        let bodies: Value = (0..model.nbody() as usize)
+            .map(|body| drawn_body(model, body))
+            .collect();
         let scene = json!({ "bodies": bodies, "geoms": geoms, "floor": floor, "camera": camera(model, from) });
         let positions = model.nq() as usize;
         let mut start = model.qpos0().to_vec();
@@ -47,23 +49,38 @@ impl Scene {
             start.extend(model.body_pos()[body]);
             start.extend(model.body_quat()[body]);
         }
-        let of_joints = (0..model.njnt() as usize).filter_map(|joint| match model.jnt_type()[joint] {
-            mjJNT_FREE => Some(model.jnt_qposadr()[joint] as usize + 3),
-            mjJNT_BALL => Some(model.jnt_qposadr()[joint] as usize),
-            _ => None,
-        });
-        let quaternions = of_joints.chain((positions + 3..start.len()).step_by(7)).collect();
-        Drawing { scene, start, positions, quaternions, meshes }
+        let of_joints =
+            (0..model.njnt() as usize).filter_map(|joint| match model.jnt_type()[joint] {
+                mjJNT_FREE => Some(model.jnt_qposadr()[joint] as usize + 3),
+                mjJNT_BALL => Some(model.jnt_qposadr()[joint] as usize),
+                _ => None,
+            });
+        let quaternions = of_joints
+            .chain((positions + 3..start.len()).step_by(7))
+            .collect();
+        Drawing {
+            scene,
+            start,
+            positions,
+            quaternions,
+            meshes,
+        }
     }
 }
 
 /// The shapes but for the floor, and the meshes of those that have one.
-fn drawn_geoms(model: &MjModel, dressed: Option<&str>, floor: Option<usize>) -> (Vec<Value>, Vec<Mesh>) {
+fn drawn_geoms(
+    model: &MjModel,
+    dressed: Option<&str>,
+    floor: Option<usize>,
+) -> (Vec<Value>, Vec<Mesh>) {
     let mut geoms = Vec::new();
     let mut meshes = Vec::new();
     let mut parts = BTreeMap::new();
     for geom in (0..model.ngeom() as usize).filter(|geom| Some(*geom) != floor) {
-        let Some(drawn) = drawn_geom(model, geom, dressed) else { continue };
+        let Some(drawn) = drawn_geom(model, geom, dressed) else {
+            continue;
+        };
         if model.geom_type()[geom] != mjGEOM_MESH {
             geoms.push(drawn);
             continue;
@@ -100,7 +117,9 @@ fn drawn_body(model: &MjModel, body: usize) -> Value {
         let axis = model.jnt_axis()[joint];
         json!({ "type": kind, "at": at, "pos": model.jnt_pos()[joint], "axis": axis, "rest": model.qpos0()[at] })
     };
-    let joints: Value = (first..first + model.body_jntnum()[body] as usize).map(joint).collect();
+    let joints: Value = (first..first + model.body_jntnum()[body] as usize)
+        .map(joint)
+        .collect();
     let mut drawn = json!({
         "parent": model.body_parentid()[body],
         "pos": model.body_pos()[body],
@@ -141,7 +160,9 @@ fn drawn_geom(model: &MjModel, geom: usize, dressed: Option<&str>) -> Option<Val
     let shine = |of: &[f32]| material.map_or(0.5, |material| of[material]);
     // As MuJoCo draws it: a colour of the shape's own goes before the material's.
     let own = model.geom_rgba()[geom];
-    let of_material = material.filter(|_| own == UNCOLOURED).map(|material| model.mat_rgba()[material]);
+    let of_material = material
+        .filter(|_| own == UNCOLOURED)
+        .map(|material| model.mat_rgba()[material]);
     let mut drawn = json!({
         "type": kind,
         "body": model.geom_bodyid()[geom],
@@ -167,17 +188,28 @@ fn drawn_mesh(model: &MjModel, mesh: usize) -> Vec<Mesh> {
     let faces = first as usize..(first + model.mesh_facenum()[mesh]) as usize;
     let mut places = BTreeMap::new();
     let mut parts = vec![Mesh::default()];
-    for (face, directions) in model.mesh_face()[faces.clone()].iter().zip(&model.mesh_facenormal()[faces]) {
-        if parts.last().is_some_and(|(corners, _)| corners.len() + 3 > MOST_CORNERS) {
+    for (face, directions) in model.mesh_face()[faces.clone()]
+        .iter()
+        .zip(&model.mesh_facenormal()[faces])
+    {
+        if parts
+            .last()
+            .is_some_and(|(corners, _)| corners.len() + 3 > MOST_CORNERS)
+        {
             parts.push(Mesh::default());
             places.clear();
         }
-        let Some((corners, triangles)) = parts.last_mut() else { continue };
+        let Some((corners, triangles)) = parts.last_mut() else {
+            continue;
+        };
         triangles.push([0, 1, 2].map(|corner| {
             let point = model.mesh_vert()[(points + face[corner]) as usize];
             let normal = model.mesh_normal()[(normals + directions[corner]) as usize];
             // Points of one place and direction, as a picture shows them, are one corner.
-            let key = (point.map(|x| (x * 5e4).round() as i64), normal.map(|x| (x * 16.0).round() as i64));
+            let key = (
+                point.map(|x| (x * 5e4).round() as i64),
+                normal.map(|x| (x * 16.0).round() as i64),
+            );
             *places.entry(key).or_insert_with(|| {
                 corners.push((point, normal));
                 corners.len() - 1

@@ -48,7 +48,9 @@ fn report_fatal(message: &MjLogMessage) {
     if message.level() != MjtLogLevel::mjLOG_ERROR {
         return;
     }
-    let whose = STEPPED.get().map_or(String::new(), |(kind, number)| format!("{kind} {number}: "));
+    let whose = STEPPED
+        .get()
+        .map_or(String::new(), |(kind, number)| format!("{kind} {number}: "));
     let said = format!("{whose}MuJoCo cannot continue: {}", message.subject());
     let mut rescue = RESCUE.lock().unwrap_or_else(PoisonError::into_inner);
     // A panic must not unwind through MuJoCo's frames.

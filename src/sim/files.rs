@@ -31,8 +31,12 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
                 names.extend(Path::new(value).file_name().map(PathBuf::from));
             }
         }
-        let found = folders.iter().flat_map(|folder| names.iter().map(|name| folder.join(name)));
-        let found: Vec<PathBuf> = found.filter(|path| !known.contains(path) && path.is_file()).collect();
+        let found = folders
+            .iter()
+            .flat_map(|folder| names.iter().map(|name| folder.join(name)));
+        let found: Vec<PathBuf> = found
+            .filter(|path| !known.contains(path) && path.is_file())
+            .collect();
         known.extend(found.iter().cloned());
         files.extend(found);
     }
@@ -42,7 +46,10 @@ pub fn scene_files(scene: &Path) -> Vec<PathBuf> {
 /// The names and values of all attributes.
 fn attributes(text: &str) -> impl Iterator<Item = (&str, &str)> {
     text.match_indices('=').filter_map(|(at, _)| {
-        let name = text[..at].trim_end().rsplit(|c: char| !c.is_alphanumeric()).next()?;
+        let name = text[..at]
+            .trim_end()
+            .rsplit(|c: char| !c.is_alphanumeric())
+            .next()?;
         let value = text[at + 1..].trim_start();
         let quote = value.chars().next().filter(|c| "\"'".contains(*c))?;
         Some((name, value[1..].split(quote).next()?))

@@ -28,8 +28,11 @@ impl Scene {
     pub fn fingerprint(&self) -> String {
         let model = &*self.model;
         let mut hasher = crc32fast::Hasher::new();
-        let mut take =
-            |parts: &[&dyn Debug]| parts.iter().for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()));
+        let mut take = |parts: &[&dyn Debug]| {
+            parts
+                .iter()
+                .for_each(|part| hasher.update(format!("{part:?}\n").as_bytes()))
+        };
         take(arrays! { model:
             opt qpos0 qpos_spring
             body_parentid body_mocapid body_pos body_quat body_ipos body_iquat body_mass body_inertia body_gravcomp
@@ -58,7 +61,9 @@ impl Scene {
             pair_solimp solimp, pair_solreffriction none
         };
         for (name, array) in unusual {
-            array.into_iter().for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
+            array
+                .into_iter()
+                .for_each(|array| hasher.update(format!("{name} {array}\n").as_bytes()));
         }
         format!("{:08x}", hasher.finalize())
     }
@@ -82,7 +87,10 @@ fn take_geoms(model: &MjModel, take: &mut dyn FnMut(&[&dyn Debug])) {
             let field = model.geom_dataid()[geom] as usize;
             let first = model.hfield_adr()[field] as usize;
             let count = model.hfield_nrow()[field] * model.hfield_ncol()[field];
-            take(&[&model.hfield_size()[field], &&model.hfield_data()[first..][..count as usize]]);
+            take(&[
+                &model.hfield_size()[field],
+                &&model.hfield_data()[first..][..count as usize],
+            ]);
         }
     }
 }
@@ -98,16 +106,41 @@ mod tests {
             let text = include_str!("../../assets/shadow_hand/scene.xml");
             assert!(from.is_empty() || text.contains(from), "{from}");
             let path = place.path().join(name);
-            let text = if from.is_empty() { text.to_owned() } else { text.replacen(from, to, 1) };
+            let text = if from.is_empty() {
+                text.to_owned()
+            } else {
+                text.replacen(from, to, 1)
+            };
             crate::os::write_whole(&path, text.as_bytes()).unwrap();
-            Scene::load(Some(&path), &Compilation::plain(0.01, Cone::Scene)).unwrap().fingerprint()
+            Scene::load(Some(&path), &Compilation::plain(0.01, Cone::Scene))
+                .unwrap()
+                .fingerprint()
         };
         let original = print("a.xml", "", "");
-        assert_eq!(original, Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap().fingerprint());
+        assert_eq!(
+            original,
+            Scene::load(None, &Compilation::plain(0.01, Cone::Scene))
+                .unwrap()
+                .fingerprint()
+        );
         assert_eq!(print("b.xml", "name=\"cube\"", "name=\"die\""), original);
         let unseen = "<geom type='sphere' size='.1' pos='9 9 9' contype='0' conaffinity='0' rgba='1 0 0 1'/>";
-        assert_eq!(print("c.xml", "<worldbody>", &format!("<worldbody><light pos='0 0 9'/>{unseen}")), original);
-        assert_ne!(print("d.xml", "<worldbody>", "<worldbody><geom type='sphere' size='.1' pos='9 9 9'/>"), original);
+        assert_eq!(
+            print(
+                "c.xml",
+                "<worldbody>",
+                &format!("<worldbody><light pos='0 0 9'/>{unseen}")
+            ),
+            original
+        );
+        assert_ne!(
+            print(
+                "d.xml",
+                "<worldbody>",
+                "<worldbody><geom type='sphere' size='.1' pos='9 9 9'/>"
+            ),
+            original
+        );
         assert_ne!(print("e.xml", "mass=\".028\"", "mass=\".029\""), original);
     }
 }

@@ -15,7 +15,9 @@ use crate::os::{self, shortened};
 pub fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let printed = || {
         let file = NamedTempFile::new()?;
-        model.print(file.path()).map_err(|error| anyhow!("{error}"))?;
+        model
+            .print(file.path())
+            .map_err(|error| anyhow!("{error}"))?;
         os::read_bytes(file.path())
     };
     let text: Result<Vec<u8>> = printed();
@@ -25,28 +27,62 @@ pub fn not_finite(model: &MjModel) -> Result<Option<String>> {
     let found = first_in(&String::from_utf8_lossy(&text));
     let found = found.map(|(quantity, object)| {
         // A degree of freedom has no name, but it belongs to a joint that may have one.
-        let of_joint = object.strip_prefix("DOF ").and_then(|dof| model.dof_jntid().get(dof.parse::<usize>().ok()?));
+        let of_joint = object
+            .strip_prefix("DOF ")
+            .and_then(|dof| model.dof_jntid().get(dof.parse::<usize>().ok()?));
         let joint = of_joint.and_then(|&joint| model.id_to_name(mjOBJ_JOINT, joint as usize));
         let object = joint.map_or(object, |name| format!("joint `{}`", shortened(name)));
-        if object.is_empty() { quantity } else { format!("{quantity} of {object}") }
+        if object.is_empty() {
+            quantity
+        } else {
+            format!("{quantity} of {object}")
+        }
     });
     Ok(found.or_else(|| first_in_assets(model)))
 }
 
 /// The same for the arrays that MuJoCo does not print.
 fn first_in_assets(model: &MjModel) -> Option<String> {
-    let of = |starts: &[i32], at: usize| starts.iter().rposition(|&start| start as usize <= at).unwrap_or_default();
+    let of = |starts: &[i32], at: usize| {
+        starts
+            .iter()
+            .rposition(|&start| start as usize <= at)
+            .unwrap_or_default()
+    };
     let height = model.hfield_data().iter().position(|x| !x.is_finite());
-    let height = height.map(|at| ("hfield_data", "hfield", mjOBJ_HFIELD, of(model.hfield_adr(), at)));
-    let vertex = model.mesh_vert().iter().position(|vertex| !vertex.iter().all(|x| x.is_finite()));
-    let vertex = vertex.map(|at| ("mesh_vert", "mesh", mjOBJ_MESH, of(model.mesh_vertadr(), at)));
+    let height = height.map(|at| {
+        (
+            "hfield_data",
+            "hfield",
+            mjOBJ_HFIELD,
+            of(model.hfield_adr(), at),
+        )
+    });
+    let vertex = model
+        .mesh_vert()
+        .iter()
+        .position(|vertex| !vertex.iter().all(|x| x.is_finite()));
+    let vertex = vertex.map(|at| {
+        (
+            "mesh_vert",
+            "mesh",
+            mjOBJ_MESH,
+            of(model.mesh_vertadr(), at),
+        )
+    });
     let (quantity, kind, object, id) = height.or(vertex)?;
     let name = model.id_to_name(object, id).unwrap_or_default();
     Some(format!("{quantity} of {kind} `{}`", shortened(name)))
 }
 
 /// Quantities that MuJoCo computes when it compiles a model, in addition to the names that end with 0.
-const DERIVED: [&str; 5] = ["body_subtreemass", "dof_length", "geom_aabb", "geom_rbound", "bvh_aabb"];
+const DERIVED: [&str; 5] = [
+    "body_subtreemass",
+    "dof_length",
+    "geom_aabb",
+    "geom_rbound",
+    "bvh_aabb",
+];
 
 /// The first quantity with a value that is not finite in the text of a model, and the object under whose heading it stands.
 fn first_in(text: &str) -> Option<(String, String)> {
@@ -65,7 +101,9 @@ fn first_in(text: &str) -> Option<(String, String)> {
             name = Some(named.trim());
         } else if heading != "STATISTIC" && odd() {
             let kind = heading.split(' ').next().unwrap_or_default().to_lowercase();
-            let object = name.map_or(heading.to_owned(), |name| format!("{kind} `{}`", shortened(name)));
+            let object = name.map_or(heading.to_owned(), |name| {
+                format!("{kind} `{}`", shortened(name))
+            });
             if indented && !first.ends_with('0') && !DERIVED.contains(&first) {
                 return Some((first.to_owned(), object));
             }
@@ -85,10 +123,21 @@ mod tests {
     fn the_first_value_that_is_not_finite_is_found_with_its_heading_and_name() {
         let text = "MuJoCo version 3\n\nOPTION\n  gravity  0 0 -9.8\n\nqpos0  0 1\n\nBODY 0:\n  name  nan\n  body_pos  0 0 0\n";
         assert_eq!(first_in(text), None);
-        let found =
-            |more: &str| first_in(&format!("{text}{more}")).map(|(quantity, object)| format!("{quantity}|{object}"));
-        assert_eq!(found("  body_mass  nan\n").as_deref(), Some("body_mass|body `nan`"));
-        assert_eq!(found("DOF 3:\n  dof_damping  1 -inf\n").as_deref(), Some("dof_damping|DOF 3"));
-        assert_eq!(found("qpos_spring  0 -nan 1\n").as_deref(), Some("qpos_spring|"));
+        let found = |more: &str| {
+            first_in(&format!("{text}{more}"))
+                .map(|(quantity, object)| format!("{quantity}|{object}"))
+        };
+        assert_eq!(
+            found("  body_mass  nan\n").as_deref(),
+            Some("body_mass|body `nan`")
+        );
+        assert_eq!(
+            found("DOF 3:\n  dof_damping  1 -inf\n").as_deref(),
+            Some("dof_damping|DOF 3")
+        );
+        assert_eq!(
+            found("qpos_spring  0 -nan 1\n").as_deref(),
+            Some("qpos_spring|")
+        );
     }
 }

@@ -13,8 +13,14 @@ use super::compilation::{Compilation, VISUAL, only_seen};
 use super::constants::*;
 
 /// The colours of the faces, as in the built-in scene: +x, -x, +y, -y, +z, -z.
-const FACES: [[f32; 3]; 6] =
-    [[0.8, 0.1, 0.12], [0.95, 0.45, 0.05], [0.1, 0.6, 0.25], [0.1, 0.3, 0.8], [0.93, 0.93, 0.93], [0.95, 0.82, 0.1]];
+const FACES: [[f32; 3]; 6] = [
+    [0.8, 0.1, 0.12],
+    [0.95, 0.45, 0.05],
+    [0.1, 0.6, 0.25],
+    [0.1, 0.3, 0.8],
+    [0.93, 0.93, 0.93],
+    [0.95, 0.82, 0.1],
+];
 
 /// The thickness of a face's plate beyond the box, as a fraction of the box's half size.
 const PLATE: f64 = 0.02;
@@ -23,11 +29,17 @@ const PLATE: f64 = 0.02;
 ///
 /// # Errors
 /// Fails if MuJoCo refuses the scene.
-pub fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Result<Option<MjModel>> {
+pub fn furnished(
+    file: &Path,
+    model: &MjModel,
+    compilation: &Compilation,
+) -> Result<Option<MjModel>> {
     let is_dark = model.nlight() == 0;
     let has_no_sky = !model.tex_type().contains(&mjTEXTURE_SKYBOX);
     let shown = |body: usize| {
-        let name = model.id_to_name(mjOBJ_BODY, body).filter(|name| !name.is_empty())?;
+        let name = model
+            .id_to_name(mjOBJ_BODY, body)
+            .filter(|name| !name.is_empty())?;
         let is_goal = model.body_mocapid()[body] >= 0;
         // A goal can be seen through.
         let opacity = if is_goal { 0.7 } else { 1.0 };
@@ -40,16 +52,25 @@ pub fn furnished(file: &Path, model: &MjModel, compilation: &Compilation) -> Res
     let mut spec = compilation.spec(Some(file))?;
     if is_dark {
         let light = spec.world_body_mut().add_light();
-        light.with_pos([0.0, 0.0, 2.0]).with_dir([0.2, 0.4, -1.0]).with_type(mjLIGHT_DIRECTIONAL);
+        light
+            .with_pos([0.0, 0.0, 2.0])
+            .with_dir([0.2, 0.4, -1.0])
+            .with_type(mjLIGHT_DIRECTIONAL);
     }
     if has_no_sky {
         let sky = spec.add_texture();
-        sky.with_name("sky of shadow-repose").with_type(mjTEXTURE_SKYBOX);
-        sky.with_builtin(mjBUILTIN_GRADIENT).with_width(64).with_height(384);
-        sky.with_rgb1([0.74, 0.78, 0.83]).with_rgb2([0.42, 0.49, 0.58]);
+        sky.with_name("sky of shadow-repose")
+            .with_type(mjTEXTURE_SKYBOX);
+        sky.with_builtin(mjBUILTIN_GRADIENT)
+            .with_width(64)
+            .with_height(384);
+        sky.with_rgb1([0.74, 0.78, 0.83])
+            .with_rgb2([0.42, 0.49, 0.58]);
     }
     for (name, half, opacity) in boxes {
-        let body = spec.body_mut(name).context("a body of the compiled scene")?;
+        let body = spec
+            .body_mut(name)
+            .context("a body of the compiled scene")?;
         colour_faces(body, half, opacity);
     }
     spec.compile().map(Some).map_err(|error| anyhow!("{error}"))
@@ -62,11 +83,20 @@ fn colour_faces(body: &mut MjsBody, half: [f64; 3], opacity: f32) {
         let mut size = half.map(|half| 0.88 * half);
         size[axis] = PLATE * half[axis];
         let mut position = [0.0; 3];
-        position[axis] = if face % 2 == 0 { half[axis] } else { -half[axis] };
-        let plate = only_seen(body).with_type(mjGEOM_BOX).with_size(size).with_pos(position);
+        position[axis] = if face % 2 == 0 {
+            half[axis]
+        } else {
+            -half[axis]
+        };
+        let plate = only_seen(body)
+            .with_type(mjGEOM_BOX)
+            .with_size(size)
+            .with_pos(position);
         // Regardless of the defaults of its class.
         plate.with_quat([1.0, 0.0, 0.0, 0.0]);
-        plate.with_rgba([red, green, blue, opacity]).with_group(VISUAL);
+        plate
+            .with_rgba([red, green, blue, opacity])
+            .with_group(VISUAL);
     }
 }
 

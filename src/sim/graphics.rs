@@ -13,7 +13,9 @@ pub fn attempt<T, E: Error + 'static>(f: impl FnOnce() -> Result<T, E>) -> Resul
     std::panic::set_hook(Box::new(|_| {}));
     let result = caught(f);
     std::panic::set_hook(hook);
-    result.map_err(anyhow::Error::msg)?.map_err(|error| described(&error))
+    result
+        .map_err(anyhow::Error::msg)?
+        .map_err(|error| described(&error))
 }
 
 /// Formats an error and its causes on one line, without consecutive duplicates.
@@ -40,15 +42,25 @@ mod tests {
 
     #[test]
     fn a_panic_is_an_error_that_says_what_it_said() {
-        let panicking: fn() -> Result<(), std::fmt::Error> = || panic!("Library {} could not be loaded.", "libx.so");
-        assert_eq!(attempt(panicking).unwrap_err().to_string(), "Library libx.so could not be loaded.");
+        let panicking: fn() -> Result<(), std::fmt::Error> =
+            || panic!("Library {} could not be loaded.", "libx.so");
+        assert_eq!(
+            attempt(panicking).unwrap_err().to_string(),
+            "Library libx.so could not be loaded."
+        );
         assert_eq!(attempt(|| Ok::<_, std::fmt::Error>(3)).unwrap(), 3);
     }
 
     #[test]
     fn places_in_the_source_of_libraries_are_left_out() {
         let text = "event loop failed: os error at /somewhere/winit/src/linux/mod.rs:788: Failed to open connection";
-        assert_eq!(without_place(text), "event loop failed: Failed to open connection");
-        assert_eq!(without_place("glutin operation failed"), "glutin operation failed");
+        assert_eq!(
+            without_place(text),
+            "event loop failed: Failed to open connection"
+        );
+        assert_eq!(
+            without_place("glutin operation failed"),
+            "glutin operation failed"
+        );
     }
 }

@@ -106,16 +106,33 @@ impl Dress {
         let mut spec = compilation.spec(None)?;
         let mut files = MjVfs::new();
         for (name, content) in &self.files {
-            files.add_from_buffer(name, content).map_err(|error| anyhow!("{name}: {error}"))?;
-            spec.add_mesh().with_name(name).with_file(name).with_scale([MILLIMETRE; 3]);
+            files
+                .add_from_buffer(name, content)
+                .map_err(|error| anyhow!("{name}: {error}"))?;
+            spec.add_mesh()
+                .with_name(name)
+                .with_file(name)
+                .with_scale([MILLIMETRE; 3]);
         }
-        for Piece { body, file, material, height } in &self.pieces {
+        for Piece {
+            body,
+            file,
+            material,
+            height,
+        } in &self.pieces
+        {
             let found = spec.body_mut(body);
-            let body = found.with_context(|| format!("there is no body {body} for the mesh {file}"))?;
-            let geom = only_seen(body).with_type(mjGEOM_MESH).with_meshname(file).with_material(material);
+            let body =
+                found.with_context(|| format!("there is no body {body} for the mesh {file}"))?;
+            let geom = only_seen(body)
+                .with_type(mjGEOM_MESH)
+                .with_meshname(file)
+                .with_material(material);
             geom.with_pos([0.0, 0.0, *height]).with_group(VISUAL);
         }
-        let mut model = spec.compile_with_vfs(&files).map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
+        let mut model = spec
+            .compile_with_vfs(&files)
+            .map_err(|error| anyhow!("the meshes of the hand: {error}"))?;
         for geom in 0..model.ngeom() as usize {
             if is_of(&model, geom, &self.bodies) && model.geom_group()[geom] != VISUAL {
                 model.geom_group_mut()[geom] = HIDDEN;
@@ -128,5 +145,7 @@ impl Dress {
 /// Whether a shape is of one of the bodies whose names begin with `bodies`.
 pub fn is_of(model: &MjModel, geom: usize, bodies: &str) -> bool {
     let body = model.geom_bodyid()[geom] as usize;
-    model.id_to_name(mjOBJ_BODY, body).is_some_and(|name| name.starts_with(bodies))
+    model
+        .id_to_name(mjOBJ_BODY, body)
+        .is_some_and(|name| name.starts_with(bodies))
 }

@@ -78,12 +78,15 @@ impl Panel {
         if !ui.egui_wants_keyboard_input() {
             self.take_keys(ui);
         }
-        egui::Panel::right("shadow-repose").resizable(true).default_size(300.0).show(ui, |ui| {
-            egui::ScrollArea::vertical().show(ui, |ui| {
-                self.show_controls(ui);
-                self.show_readout(ui);
+        egui::Panel::right("shadow-repose")
+            .resizable(true)
+            .default_size(300.0)
+            .show(ui, |ui| {
+                egui::ScrollArea::vertical().show(ui, |ui| {
+                    self.show_controls(ui);
+                    self.show_readout(ui);
+                });
             });
-        });
     }
 
     fn take_keys(&mut self, ui: &Ui) {
@@ -95,8 +98,10 @@ impl Panel {
             controls.steps += input.num_presses(Key::ArrowRight) as u32;
             controls.reset |= input.key_pressed(Key::R);
             controls.new_goal |= input.key_pressed(Key::G);
-            let doublings = input.num_presses(Key::ArrowUp) as i32 - input.num_presses(Key::ArrowDown) as i32;
-            controls.speed = (controls.speed * 2f64.powi(doublings)).clamp(*SPEEDS.start(), *SPEEDS.end());
+            let doublings =
+                input.num_presses(Key::ArrowUp) as i32 - input.num_presses(Key::ArrowDown) as i32;
+            controls.speed =
+                (controls.speed * 2f64.powi(doublings)).clamp(*SPEEDS.start(), *SPEEDS.end());
             controls.choice = (controls.choice + input.num_presses(Key::P)) % self.choices.len();
         });
         // A single step would not be visible while the scene runs.
@@ -107,7 +112,11 @@ impl Panel {
         let controls = &mut self.controls;
         ui.add_space(4.0);
         ui.horizontal(|ui| {
-            let pause = if controls.paused { "Resume (Space)" } else { "Pause (Space)" };
+            let pause = if controls.paused {
+                "Resume (Space)"
+            } else {
+                "Pause (Space)"
+            };
             controls.paused ^= ui.button(pause).clicked();
             if ui.button("Step (Right)").clicked() {
                 controls.steps += 1;
@@ -119,7 +128,11 @@ impl Panel {
             controls.reset |= ui.button("Reset (R)").clicked();
         });
         ui.horizontal(|ui| {
-            ui.add(Slider::new(&mut controls.speed, SPEEDS).logarithmic(true).suffix(" ×"));
+            ui.add(
+                Slider::new(&mut controls.speed, SPEEDS)
+                    .logarithmic(true)
+                    .suffix(" ×"),
+            );
             ui.label("speed (Up, Down)");
         });
         ui.horizontal(|ui| {
@@ -158,13 +171,23 @@ impl Panel {
             ui.separator();
             ui.label(curve.name);
             let seconds = |mark: egui_plot::GridMark, _: &_| format!("{} s", mark.value);
-            let plot = Plot::new(curve.name).height(100.0).show_x(false).include_y(0.0).x_axis_formatter(seconds);
-            plot.allow_drag(false).allow_zoom(false).allow_scroll(false).show(ui, |plot| {
-                plot.line(Line::new(curve.name, PlotPoints::from_iter(curve.points.iter().copied())));
-                if let Some(level) = curve.level {
-                    plot.hline(HLine::new("level", level));
-                }
-            });
+            let plot = Plot::new(curve.name)
+                .height(100.0)
+                .show_x(false)
+                .include_y(0.0)
+                .x_axis_formatter(seconds);
+            plot.allow_drag(false)
+                .allow_zoom(false)
+                .allow_scroll(false)
+                .show(ui, |plot| {
+                    plot.line(Line::new(
+                        curve.name,
+                        PlotPoints::from_iter(curve.points.iter().copied()),
+                    ));
+                    if let Some(level) = curve.level {
+                        plot.hline(HLine::new("level", level));
+                    }
+                });
         }
     }
 }
@@ -175,18 +198,41 @@ fn draw_gauge(ui: &mut Ui, gauge: &Gauge) {
     const NEGATIVE: Color32 = Color32::from_rgb(205, 110, 40);
     let (rect, _) = ui.allocate_exact_size(vec2(ui.available_width(), 16.0), Sense::hover());
     let fraction = gauge.fraction.clamp(-1.0, 1.0);
-    let zero = if gauge.signed { rect.center().x } else { rect.left() };
-    let end = zero + fraction * if gauge.signed { rect.width() / 2.0 } else { rect.width() };
+    let zero = if gauge.signed {
+        rect.center().x
+    } else {
+        rect.left()
+    };
+    let end = zero
+        + fraction
+            * if gauge.signed {
+                rect.width() / 2.0
+            } else {
+                rect.width()
+            };
     let painter = ui.painter();
     painter.rect_filled(rect, 2.0, ui.visuals().extreme_bg_color);
-    let bar = Rect::from_min_max(pos2(zero.min(end), rect.top()), pos2(zero.max(end), rect.bottom()));
+    let bar = Rect::from_min_max(
+        pos2(zero.min(end), rect.top()),
+        pos2(zero.max(end), rect.bottom()),
+    );
     painter.rect_filled(bar, 0.0, if fraction < 0.0 { NEGATIVE } else { POSITIVE });
     if gauge.signed {
-        painter.vline(zero, rect.y_range(), ui.visuals().widgets.noninteractive.fg_stroke);
+        painter.vline(
+            zero,
+            rect.y_range(),
+            ui.visuals().widgets.noninteractive.fg_stroke,
+        );
     }
     let colour = ui.visuals().strong_text_color();
     let at = rect.right_center() - vec2(4.0, 0.0);
-    painter.text(at, Align2::RIGHT_CENTER, &gauge.text, FontId::monospace(12.0), colour);
+    painter.text(
+        at,
+        Align2::RIGHT_CENTER,
+        &gauge.text,
+        FontId::monospace(12.0),
+        colour,
+    );
 }
 
 /// Closes MuJoCo's own panel at the left when the window opens. Its second reset and its physics options do not belong to the
@@ -204,13 +250,26 @@ impl egui::Plugin for CloseLeftPanel {
 
     fn input_hook(&mut self, context: &egui::Context, input: &mut egui::RawInput) {
         // The panel is laid out in the first frames.
-        let Some(panel) = PanelState::load(context, egui::Id::new("interface_panel")) else { return };
+        let Some(panel) = PanelState::load(context, egui::Id::new("interface_panel")) else {
+            return;
+        };
         let edge = pos2(panel.outer_rect.right(), panel.outer_rect.center().y);
         let side = pos2(panel.outer_rect.left() - 50.0, edge.y);
         let button = egui::PointerButton::Primary;
-        let press = |pos, pressed| Event::PointerButton { pos, button, pressed, modifiers: egui::Modifiers::NONE };
+        let press = |pos, pressed| Event::PointerButton {
+            pos,
+            button,
+            pressed,
+            modifiers: egui::Modifiers::NONE,
+        };
         let moved = Event::PointerMoved;
-        let drag = [moved(edge), press(edge, true), moved(side), press(side, false), Event::PointerGone];
+        let drag = [
+            moved(edge),
+            press(edge, true),
+            moved(side),
+            press(side, false),
+            Event::PointerGone,
+        ];
         if let Some(event) = drag.into_iter().nth(self.frame) {
             self.frame += 1;
             // No other event may come between.

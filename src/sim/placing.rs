@@ -14,7 +14,8 @@ pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
     // Every body has a higher number than its parent.
     for body in top + 1..frames.len() {
         let parent = frames[model.body_parentid()[body] as usize];
-        frames[body] = parent.map(|parent| inside(parent, model.body_pos()[body], model.body_quat()[body]));
+        frames[body] =
+            parent.map(|parent| inside(parent, model.body_pos()[body], model.body_quat()[body]));
     }
     frames
 }
@@ -23,7 +24,10 @@ pub fn frames_within(model: &MjModel, top: usize) -> Vec<Option<Placed>> {
 pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, Placed)> {
     let placed = |geom: usize| {
         let frame = frames[model.geom_bodyid()[geom] as usize]?;
-        Some((geom, inside(frame, model.geom_pos()[geom], model.geom_quat()[geom])))
+        Some((
+            geom,
+            inside(frame, model.geom_pos()[geom], model.geom_quat()[geom]),
+        ))
     };
     (0..model.ngeom() as usize).filter_map(placed).collect()
 }
@@ -31,7 +35,10 @@ pub fn geoms_within(model: &MjModel, frames: &[Option<Placed>]) -> Vec<(usize, P
 /// A pose that is given in a frame as a pose in the surroundings of that frame.
 pub fn inside((origin, axes): Placed, position: [f64; 3], orientation: Quat) -> Placed {
     let [x, y, z] = quat::rotate(axes, position);
-    ([origin[0] + x, origin[1] + y, origin[2] + z], quat::mul(axes, orientation))
+    (
+        [origin[0] + x, origin[1] + y, origin[2] + z],
+        quat::mul(axes, orientation),
+    )
 }
 
 /// Whether a geom can be in a contact.
@@ -39,5 +46,8 @@ pub fn touches(model: &MjModel, geom: usize) -> bool {
     let pairs = [model.pair_geom1(), model.pair_geom2()];
     model.geom_contype()[geom] != 0
         || model.geom_conaffinity()[geom] != 0
-        || pairs.into_iter().flatten().any(|&of_pair| of_pair == geom as i32)
+        || pairs
+            .into_iter()
+            .flatten()
+            .any(|&of_pair| of_pair == geom as i32)
 }

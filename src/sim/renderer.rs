@@ -26,9 +26,16 @@ impl Renderer {
     /// # Errors
     /// Fails if there is no EGL. The message names the packages that provide it.
     pub fn new(scene: &Scene) -> Result<Self> {
-        let build = || MjRenderer::builder().camera(MjvCamera::new_free(&scene.model)).build(&scene.model);
+        let build = || {
+            MjRenderer::builder()
+                .camera(MjvCamera::new_free(&scene.model))
+                .build(&scene.model)
+        };
         let renderer = attempt(build).map_err(|reason| anyhow!("cannot draw: {reason}{HELP}"))?;
-        Ok(Self { renderer, data: MjData::new(scene.model.clone()) })
+        Ok(Self {
+            renderer,
+            data: MjData::new(scene.model.clone()),
+        })
     }
 
     /// The width and height of pictures in pixels.
@@ -45,11 +52,19 @@ impl Renderer {
     /// # Panics
     /// Panics if the simulation is of another scene.
     pub fn draw(&mut self, simulation: &Simulation) -> Result<&[u8]> {
-        simulation.data.copy_visual_to(&mut self.data).expect("a simulation of the same scene");
+        simulation
+            .data
+            .copy_visual_to(&mut self.data)
+            .expect("a simulation of the same scene");
         // A mocap body that was moved after the step (the next goal) is not at its new pose yet.
         self.data.kinematics();
-        self.renderer.sync_data(&mut self.data).map_err(|error| described(&error))?;
+        self.renderer
+            .sync_data(&mut self.data)
+            .map_err(|error| described(&error))?;
         self.renderer.render().map_err(|error| described(&error))?;
-        Ok(self.renderer.rgb_flat().expect("colour rendering is enabled"))
+        Ok(self
+            .renderer
+            .rgb_flat()
+            .expect("colour rendering is enabled"))
     }
 }

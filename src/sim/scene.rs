@@ -15,8 +15,11 @@ use super::furnish::furnished;
 use crate::os::shortened;
 
 /// What a scene may not disable: nothing could be held without it.
-const NEEDED: [(&str, MjtDisableBit); 3] =
-    [("constraint", mjDSBL_CONSTRAINT), ("contact", mjDSBL_CONTACT), ("actuation", mjDSBL_ACTUATION)];
+const NEEDED: [(&str, MjtDisableBit); 3] = [
+    ("constraint", mjDSBL_CONSTRAINT),
+    ("contact", mjDSBL_CONTACT),
+    ("actuation", mjDSBL_ACTUATION),
+];
 
 /// A compiled MuJoCo model that any number of simulations can share.
 #[derive(Clone)]
@@ -101,10 +104,18 @@ impl Scene {
     ///
     /// # Errors
     /// Fails like [`Scene::load`], or if meshes cannot be read.
-    pub fn load_for_display(file: Option<&Path>, compilation: &Compilation, look: &Look) -> Result<Self> {
+    pub fn load_for_display(
+        file: Option<&Path>,
+        compilation: &Compilation,
+        look: &Look,
+    ) -> Result<Self> {
         let scene = Self::load(file, compilation)?;
         let changed = match file {
-            None => look.dress.as_ref().map(|dress| dress.compile(compilation)).transpose()?,
+            None => look
+                .dress
+                .as_ref()
+                .map(|dress| dress.compile(compilation))
+                .transpose()?,
             // A scene to which nothing can be added is shown as it is.
             Some(file) => furnished(file, &scene.model, compilation).unwrap_or_default(),
         };
@@ -133,13 +144,25 @@ impl Scene {
             Cone::Elliptic => model.opt_mut().cone = mjCONE_ELLIPTIC as i32,
         }
         let halves = model.opt().integrator != mjINT_RK4 as i32;
-        ensure!(halves, "the RK4 integrator cannot be stepped in halves; use implicitfast");
+        ensure!(
+            halves,
+            "the RK4 integrator cannot be stepped in halves; use implicitfast"
+        );
         for (flag, bit) in NEEDED {
-            ensure!(model.opt().disableflags & bit as i32 == 0, "{flag} must not be disabled in its <flag>");
+            ensure!(
+                model.opt().disableflags & bit as i32 == 0,
+                "{flag} must not be disabled in its <flag>"
+            );
         }
         let awake = model.opt().enableflags & mjENBL_SLEEP as i32 == 0;
-        ensure!(awake, "sleep is not part of the state that MuJoCo can save; leave sleep switched off");
-        Ok(Self { model: Arc::new(model), own_timestep })
+        ensure!(
+            awake,
+            "sleep is not part of the state that MuJoCo can save; leave sleep switched off"
+        );
+        Ok(Self {
+            model: Arc::new(model),
+            own_timestep,
+        })
     }
 
     /// The size of the compiled scene in bytes.
@@ -160,8 +183,14 @@ impl Scene {
         let id = self.find(mjOBJ_JOINT, "joint", name)?;
         let name = shortened(name);
         let kind = self.model.jnt_type()[id];
-        ensure!(kind == mjJNT_HINGE, "joint `{name}` must be a hinge, but is {kind:?}");
-        ensure!(self.model.jnt_limited()[id], "joint `{name}` must have a range");
+        ensure!(
+            kind == mjJNT_HINGE,
+            "joint `{name}` must be a hinge, but is {kind:?}"
+        );
+        ensure!(
+            self.model.jnt_limited()[id],
+            "joint `{name}` must have a range"
+        );
         Ok(Hinge {
             qpos: self.model.jnt_qposadr()[id] as usize,
             dof: self.model.jnt_dofadr()[id] as usize,
@@ -176,10 +205,20 @@ impl Scene {
     pub fn free_body(&self, name: &str) -> Result<FreeJoint> {
         let body = self.body(name)?;
         let joint = self.free_joint(body.0);
-        let joint = joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
-        let [qpos, dof] = [self.model.jnt_qposadr()[joint], self.model.jnt_dofadr()[joint]].map(|at| at as usize);
+        let joint =
+            joint.with_context(|| format!("body `{}` must have a free joint", shortened(name)))?;
+        let [qpos, dof] = [
+            self.model.jnt_qposadr()[joint],
+            self.model.jnt_dofadr()[joint],
+        ]
+        .map(|at| at as usize);
         let inertia = self.model.dof_m0()[dof + 3..dof + 6].iter().sum::<f64>() / 3.0;
-        Ok(FreeJoint { body, qpos, dof, inertia })
+        Ok(FreeJoint {
+            body,
+            qpos,
+            dof,
+            inertia,
+        })
     }
 
     /// The number of the first joint of a body if it is a free joint.
@@ -190,7 +229,12 @@ impl Scene {
 
     /// The names of its keyframes.
     pub fn keyframes(&self) -> Vec<String> {
-        let name = |id| self.model.id_to_name(mjOBJ_KEY, id).unwrap_or_default().to_owned();
+        let name = |id| {
+            self.model
+                .id_to_name(mjOBJ_KEY, id)
+                .unwrap_or_default()
+                .to_owned()
+        };
         (0..self.model.nkey() as usize).map(name).collect()
     }
 
@@ -221,14 +265,20 @@ impl Scene {
         if !name.is_empty() {
             return self.find(mjOBJ_KEY, "keyframe", name).map(Some);
         }
-        let known = ["start", "home"].into_iter().find_map(|name| self.model.name_to_id(mjOBJ_KEY, name));
+        let known = ["start", "home"]
+            .into_iter()
+            .find_map(|name| self.model.name_to_id(mjOBJ_KEY, name));
         Ok(known.or((self.model.nkey() == 1).then_some(0)))
     }
 
     /// The generalised positions of a keyframe, by its number, or the default ones.
     pub fn pose_of(&self, keyframe: Option<usize>) -> Vec<f64> {
         let size = self.model.nq() as usize;
-        keyframe.map_or(self.model.qpos0(), |key| &self.model.key_qpos()[key * size..][..size]).to_vec()
+        keyframe
+            .map_or(self.model.qpos0(), |key| {
+                &self.model.key_qpos()[key * size..][..size]
+            })
+            .to_vec()
     }
 
     /// The first body of the kinematic tree to which a frame belongs.
@@ -247,7 +297,9 @@ impl Scene {
     pub fn mocap(&self, name: &str) -> Result<Mocap> {
         let Body(body) = self.body(name)?;
         let id = usize::try_from(self.model.body_mocapid()[body]).ok();
-        Ok(Mocap(id.with_context(|| format!("body `{}` must have mocap=\"true\"", shortened(name)))?))
+        Ok(Mocap(id.with_context(|| {
+            format!("body `{}` must have mocap=\"true\"", shortened(name))
+        })?))
     }
 
     /// Finds the actuator `name`, which must be a position servo with one limited control that moves a joint or a tendon.
@@ -261,24 +313,40 @@ impl Scene {
         let is_disabled = (0..31).contains(&group) && model.opt().disableactuator >> group & 1 == 1;
         let moves = matches!(model.actuator_trntype()[id], mjTRN_JOINT | mjTRN_TENDON);
         let is_angle = model.actuator_gear()[id][0] == 1.0;
-        let is_direct = model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
+        let is_direct =
+            model.actuator_dyntype()[id] == mjDYN_NONE && model.actuator_delay()[id] == 0.0;
         let ctrl = model.actuator_ctrladr()[id] as usize;
         let is_limited = model.actuator_ctrlnum()[id] == 1 && model.actuator_ctrllimited()[ctrl];
         for (holds, what) in [
-            (self.is_position_servo(id), "be a position servo (<position>): its control is an angle"),
-            (!is_disabled, &format!("not be disabled by its group {group}")),
+            (
+                self.is_position_servo(id),
+                "be a position servo (<position>): its control is an angle",
+            ),
+            (
+                !is_disabled,
+                &format!("not be disabled by its group {group}"),
+            ),
             (moves, "drive a joint or a tendon"),
             (is_angle, "have a gear of 1: its control is an angle"),
-            (is_direct, "act at once: without activation dynamics (timeconst) and delay"),
+            (
+                is_direct,
+                "act at once: without activation dynamics (timeconst) and delay",
+            ),
             (is_limited, "have one control with a ctrlrange"),
         ] {
             ensure!(holds, "actuator `{}` must {what}", shortened(name));
         }
-        Ok(Actuator { id, ctrl, range: model.actuator_ctrlrange()[ctrl] })
+        Ok(Actuator {
+            id,
+            ctrl,
+            range: model.actuator_ctrlrange()[ctrl],
+        })
     }
 
     fn find(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
-        self.model.name_to_id(kind, name).with_context(|| format!("has no {what} `{}`", shortened(name)))
+        self.model
+            .name_to_id(kind, name)
+            .with_context(|| format!("has no {what} `{}`", shortened(name)))
     }
 
     /// Whether the force is kp · (control - length), with or without damping.

@@ -20,7 +20,9 @@ pub struct Simulation {
 impl Simulation {
     /// Creates a simulation of `scene` in its default state.
     pub fn new(scene: &Scene) -> Self {
-        Self { data: MjData::new(scene.model.clone()) }
+        Self {
+            data: MjData::new(scene.model.clone()),
+        }
     }
 
     /// Continues in another scene. The state must be reset after it.
@@ -66,7 +68,12 @@ impl Simulation {
     /// Whether the state diverged. MuJoCo resets it silently within the step. Only its warning counters show it.
     fn diverged(&self) -> bool {
         let warnings = self.data.warning();
-        let kinds = [mjWARN_BADQPOS, mjWARN_BADQVEL, mjWARN_BADQACC, mjWARN_BADCTRL];
+        let kinds = [
+            mjWARN_BADQPOS,
+            mjWARN_BADQVEL,
+            mjWARN_BADQACC,
+            mjWARN_BADCTRL,
+        ];
         kinds.iter().any(|&kind| warnings[kind as usize].number > 0)
     }
 
@@ -112,7 +119,11 @@ impl Simulation {
     /// Fails if the state is of another scene or has diverged.
     pub fn restore(&mut self, numbers: &[f64]) -> Result<()> {
         let size = self.data.model().state_size(EVERYTHING);
-        ensure!(numbers.len() == size, "the state has {} values, but this scene needs {size}", numbers.len());
+        ensure!(
+            numbers.len() == size,
+            "the state has {} values, but this scene needs {size}",
+            numbers.len()
+        );
         self.data.reset();
         self.data.set_state(numbers, EVERYTHING)?;
         self.refresh();
@@ -128,12 +139,18 @@ impl Simulation {
     /// The pose of a frame.
     pub fn pose(&self, frame: Frame) -> Pose {
         match frame {
-            Frame::Body(Body(id)) => Pose { position: self.data.xpos()[id], orientation: self.data.xquat()[id] },
+            Frame::Body(Body(id)) => Pose {
+                position: self.data.xpos()[id],
+                orientation: self.data.xquat()[id],
+            },
             Frame::Site(id) => {
                 let model = self.data.model();
                 let body = self.data.xquat()[model.site_bodyid()[id] as usize];
                 let orientation = quat::mul(body, model.site_quat()[id]);
-                Pose { position: self.data.site_xpos()[id], orientation }
+                Pose {
+                    position: self.data.site_xpos()[id],
+                    orientation,
+                }
             }
         }
     }
@@ -146,7 +163,10 @@ impl Simulation {
             Frame::Site(id) => (mjOBJ_SITE, id),
         };
         let [wx, wy, wz, x, y, z] = self.data.object_velocity(kind, id, false);
-        Velocity { linear: [x, y, z], angular: [wx, wy, wz] }
+        Velocity {
+            linear: [x, y, z],
+            angular: [wx, wy, wz],
+        }
     }
 
     /// Applies a force (N, world frame) to the centre of mass of a body. It acts in all steps until it is replaced or the state
@@ -161,7 +181,14 @@ impl Simulation {
     }
 
     /// Sets the pose of a mocap body.
-    pub fn place(&mut self, Mocap(id): Mocap, Pose { position, orientation }: Pose) {
+    pub fn place(
+        &mut self,
+        Mocap(id): Mocap,
+        Pose {
+            position,
+            orientation,
+        }: Pose,
+    ) {
         self.data.mocap_pos_mut()[id] = position;
         self.data.mocap_quat_mut()[id] = orientation;
     }

@@ -46,16 +46,30 @@ impl Scene {
         let mut parts = named.clone();
         let mut problems = Problems::new();
         let hand = self.find_hand(&mut parts, &mut problems);
-        let others = (1..self.model.nbody() as usize).filter(|&body| !hand.contains(&self.root_of(body)));
-        let free: Vec<usize> = others.clone().filter(|&body| self.free_joint(body).is_some()).collect();
+        let others =
+            (1..self.model.nbody() as usize).filter(|&body| !hand.contains(&self.root_of(body)));
+        let free: Vec<usize> = others
+            .clone()
+            .filter(|&body| self.free_joint(body).is_some())
+            .collect();
         if parts.object.is_empty() && free.is_empty() {
             problems.push(NO_OBJECT.into());
         }
-        self.name_only(&free, &mut parts.object, ("bodies with a free joint", "hand.object"), &mut problems);
+        self.name_only(
+            &free,
+            &mut parts.object,
+            ("bodies with a free joint", "hand.object"),
+            &mut problems,
+        );
         let held = self.trees_of_constraints();
         let is_goal = |body: &usize| self.model.body_mocapid()[*body] >= 0 && !held.contains(body);
         let goals: Vec<usize> = others.filter(is_goal).collect();
-        self.name_only(&goals, &mut parts.goal, ("mocap bodies", "hand.goal"), &mut problems);
+        self.name_only(
+            &goals,
+            &mut parts.goal,
+            ("mocap bodies", "hand.goal"),
+            &mut problems,
+        );
         ensure!(problems.is_empty(), problems.join("; "));
         Ok(parts)
     }
@@ -63,16 +77,25 @@ impl Scene {
     /// Names the parts of the hand that are not named. The result is the first bodies of the trees that its actuators move.
     fn find_hand(&self, parts: &mut Parts, problems: &mut Problems) -> BTreeSet<usize> {
         if parts.actuators.is_empty() {
-            parts.actuators = self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
+            parts.actuators =
+                self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, problems);
         }
-        let actuators = parts.actuators.iter().filter_map(|name| self.model.name_to_id(mjOBJ_ACTUATOR, name));
-        let moved = actuators.flat_map(|actuator| self.wraps(actuator)).filter_map(|(kind, id, _)| match kind {
-            mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
-            mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
-            _ => None,
-        });
+        let actuators = parts
+            .actuators
+            .iter()
+            .filter_map(|name| self.model.name_to_id(mjOBJ_ACTUATOR, name));
+        let moved = actuators
+            .flat_map(|actuator| self.wraps(actuator))
+            .filter_map(|(kind, id, _)| match kind {
+                mjWRAP_JOINT => Some(self.model.jnt_bodyid()[id]),
+                mjWRAP_SITE => Some(self.model.site_bodyid()[id]),
+                _ => None,
+            });
         // The world is no tree.
-        let trees: BTreeSet<usize> = moved.map(|body| self.root_of(body as usize)).filter(|tree| *tree > 0).collect();
+        let trees: BTreeSet<usize> = moved
+            .map(|body| self.root_of(body as usize))
+            .filter(|tree| *tree > 0)
+            .collect();
         let is_hinge = |&joint: &usize| {
             trees.contains(&self.root_of(self.model.jnt_bodyid()[joint] as usize))
                 && self.model.jnt_type()[joint] == mjJNT_HINGE
@@ -84,7 +107,9 @@ impl Scene {
         }
         if parts.joints.is_empty() || parts.actuators.is_empty() {
             let found = "position servos that move limited hinges are needed";
-            problems.push(format!("has no hand: {found}; hand.joints and hand.actuators name them"));
+            problems.push(format!(
+                "has no hand: {found}; hand.joints and hand.actuators name them"
+            ));
         }
         if parts.fingertips.is_empty() {
             parts.fingertips = self.names(mjOBJ_BODY, self.last_bodies(&hinges), problems);
@@ -96,7 +121,13 @@ impl Scene {
     }
 
     /// Names a part that is not named, if there is only one body that it can be.
-    fn name_only(&self, found: &[usize], part: &mut String, (what, setting): (&str, &str), problems: &mut Problems) {
+    fn name_only(
+        &self,
+        found: &[usize],
+        part: &mut String,
+        (what, setting): (&str, &str),
+        problems: &mut Problems,
+    ) {
         if !part.is_empty() || found.is_empty() {
             return;
         }
@@ -105,8 +136,14 @@ impl Scene {
             return;
         }
         let names = self.names(mjOBJ_BODY, found.iter().copied(), &mut Problems::new());
-        let names: Vec<String> = names.iter().map(|name| format!("`{}`", shortened(name))).collect();
-        problems.push(format!("has several {what}, {}: name one by {setting}", names.join(", ")));
+        let names: Vec<String> = names
+            .iter()
+            .map(|name| format!("`{}`", shortened(name)))
+            .collect();
+        problems.push(format!(
+            "has several {what}, {}: name one by {setting}",
+            names.join(", ")
+        ));
     }
 
     /// The number of the first body of the tree that a body belongs to.
@@ -144,34 +181,58 @@ impl Scene {
             moved[body] |= moved[parent];
             carries[parent] = true;
         }
-        (1..count).filter(|&body| moved[body] && !carries[body]).collect()
+        (1..count)
+            .filter(|&body| moved[body] && !carries[body])
+            .collect()
     }
 
     /// The joints that an actuator drives, with the coefficients of their sum, which is its length. A tendon along a path
     /// in space drives no sum.
     pub fn driven(&self, actuator: Actuator) -> Vec<(String, f64)> {
-        let name = |joint: usize| self.model.id_to_name(mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
-        let joints = self.wraps(actuator.id).into_iter().filter(|(kind, ..)| *kind == mjWRAP_JOINT);
-        joints.map(|(_, joint, coefficient)| (name(joint), coefficient)).collect()
+        let name = |joint: usize| {
+            self.model
+                .id_to_name(mjOBJ_JOINT, joint)
+                .unwrap_or_default()
+                .to_owned()
+        };
+        let joints = self
+            .wraps(actuator.id)
+            .into_iter()
+            .filter(|(kind, ..)| *kind == mjWRAP_JOINT);
+        joints
+            .map(|(_, joint, coefficient)| (name(joint), coefficient))
+            .collect()
     }
 
     /// What an actuator or its tendon acts on: the kind, the number, and the coefficient if it is a joint.
     fn wraps(&self, actuator: usize) -> Vec<(MjtWrap, usize, f64)> {
         let target = self.model.actuator_trnid()[actuator][0] as usize;
-        let wrap =
-            |at: usize| (self.model.wrap_type()[at], self.model.wrap_objid()[at] as usize, self.model.wrap_prm()[at]);
+        let wrap = |at: usize| {
+            (
+                self.model.wrap_type()[at],
+                self.model.wrap_objid()[at] as usize,
+                self.model.wrap_prm()[at],
+            )
+        };
         match self.model.actuator_trntype()[actuator] {
             mjTRN_JOINT => vec![(mjWRAP_JOINT, target, 1.0)],
             mjTRN_TENDON => {
                 let first = self.model.tendon_adr()[target] as usize;
-                (first..first + self.model.tendon_num()[target] as usize).map(wrap).collect()
+                (first..first + self.model.tendon_num()[target] as usize)
+                    .map(wrap)
+                    .collect()
             }
             _ => Vec::new(),
         }
     }
 
     /// The names of these objects. Each that has none is a problem.
-    fn names(&self, kind: MjtObjBase, ids: impl IntoIterator<Item = usize>, problems: &mut Problems) -> Vec<String> {
+    fn names(
+        &self,
+        kind: MjtObjBase,
+        ids: impl IntoIterator<Item = usize>,
+        problems: &mut Problems,
+    ) -> Vec<String> {
         let what = match kind {
             mjOBJ_ACTUATOR => "actuator",
             mjOBJ_JOINT => "joint",
@@ -189,11 +250,19 @@ impl Scene {
 
     /// The names of all joints that have one.
     pub fn joints(&self) -> Vec<String> {
-        self.names(mjOBJ_JOINT, 0..self.model.njnt() as usize, &mut Problems::new())
+        self.names(
+            mjOBJ_JOINT,
+            0..self.model.njnt() as usize,
+            &mut Problems::new(),
+        )
     }
 
     /// The names of all actuators that have one.
     pub fn actuators(&self) -> Vec<String> {
-        self.names(mjOBJ_ACTUATOR, 0..self.model.nactuator() as usize, &mut Problems::new())
+        self.names(
+            mjOBJ_ACTUATOR,
+            0..self.model.nactuator() as usize,
+            &mut Problems::new(),
+        )
     }
 }

@@ -32,16 +32,30 @@ impl Scene {
     /// With moving parts there is only the identity.
     pub fn symmetry(&self, body: Body) -> Vec<usize> {
         let form = self.form(body);
-        let turns = CUBE_ROTATIONS.iter().map(|turn| quat::normalized(turn.map(f64::from)));
-        turns.enumerate().filter(|&(i, turn)| i == 0 || form.holds(turn)).map(|(i, _)| i).collect()
+        let turns = CUBE_ROTATIONS
+            .iter()
+            .map(|turn| quat::normalized(turn.map(f64::from)));
+        turns
+            .enumerate()
+            .filter(|&(i, turn)| i == 0 || form.holds(turn))
+            .map(|(i, _)| i)
+            .collect()
     }
 
     /// The axes of a body about which any turn maps it onto itself: all three for a sphere, one for a cylinder.
     pub fn round_axes(&self, body: Body) -> String {
         let form = self.form(body);
         let (sin, cos) = 0.5_f64.sin_cos();
-        let turns = [('x', [cos, sin, 0.0, 0.0]), ('y', [cos, 0.0, sin, 0.0]), ('z', [cos, 0.0, 0.0, sin])];
-        turns.into_iter().filter(|&(_, turn)| form.holds(turn)).map(|(axis, _)| axis).collect()
+        let turns = [
+            ('x', [cos, sin, 0.0, 0.0]),
+            ('y', [cos, 0.0, sin, 0.0]),
+            ('z', [cos, 0.0, 0.0, sin]),
+        ];
+        turns
+            .into_iter()
+            .filter(|&(_, turn)| form.holds(turn))
+            .map(|(axis, _)| axis)
+            .collect()
     }
 
     fn form(&self, Body(top): Body) -> Form {
@@ -61,24 +75,37 @@ impl Scene {
             for axis in (0..3).filter(|_| mass > 0.0) {
                 let reach = (3.0 * (half - inertia[axis]).max(0.0) / mass).sqrt();
                 for reach in [reach, -reach] {
-                    masses.push((mass / 6.0, [0, 1, 2].map(|i| centre[i] + reach * axes[i][axis])));
+                    masses.push((
+                        mass / 6.0,
+                        [0, 1, 2].map(|i| centre[i] + reach * axes[i][axis]),
+                    ));
                 }
             }
         }
-        let touching = geoms_within(model, &frames).into_iter().filter(|&(geom, _)| touches(model, geom));
+        let touching = geoms_within(model, &frames)
+            .into_iter()
+            .filter(|&(geom, _)| touches(model, geom));
         let shapes = touching.map(|(geom, place)| Shape {
             kind: (model.geom_type()[geom], model.geom_dataid()[geom]),
             size: model.geom_size()[geom],
             place,
         });
-        Form { shapes: shapes.collect(), masses, moves }
+        Form {
+            shapes: shapes.collect(),
+            masses,
+            moves,
+        }
     }
 }
 
 impl Form {
     /// Whether a rotation maps it onto itself.
     fn holds(&self, turn: Quat) -> bool {
-        let onto = |shape: &Shape| self.shapes.iter().any(|other| shape.turned(turn).fills(other));
+        let onto = |shape: &Shape| {
+            self.shapes
+                .iter()
+                .any(|other| shape.turned(turn).fills(other))
+        };
         !self.moves && self.keeps_masses(turn) && self.shapes.iter().all(onto)
     }
 
@@ -97,7 +124,12 @@ impl Form {
         for &(mass, place) in &self.masses {
             let place = quat::rotate(turn, place);
             for (i, moment) in moments.iter_mut().enumerate() {
-                *moment += mass * if i < 3 { place[i] } else { place[i / 3 - 1] * place[i % 3] };
+                *moment += mass
+                    * if i < 3 {
+                        place[i]
+                    } else {
+                        place[i / 3 - 1] * place[i % 3]
+                    };
             }
         }
         moments
@@ -106,25 +138,35 @@ impl Form {
 
 /// The rotation as a matrix: its columns are the rotated axes.
 fn matrix(turn: Quat) -> [[f64; 3]; 3] {
-    let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| quat::rotate(turn, axis));
+    let columns =
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| quat::rotate(turn, axis));
     [0, 1, 2].map(|row| columns.map(|column| column[row]))
 }
 
 /// Whether values are equal but for rounding.
 fn alike(a: &[f64], b: &[f64], scale: f64) -> bool {
-    a.iter().zip(b).all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
+    a.iter()
+        .zip(b)
+        .all(|(a, b)| (a - b).abs() <= TOLERANCE * scale)
 }
 
 impl Shape {
     fn turned(&self, turn: Quat) -> Self {
         let (position, orientation) = self.place;
-        Self { place: inside(([0.0; 3], turn), position, orientation), ..*self }
+        Self {
+            place: inside(([0.0; 3], turn), position, orientation),
+            ..*self
+        }
     }
 
     /// Whether this shape is in the place of another and fills the same space.
     fn fills(&self, other: &Self) -> bool {
         let (position, orientation) = self.place;
-        let scale = self.size.iter().chain(&position).fold(0.0, |most: f64, x| most.max(x.abs()));
+        let scale = self
+            .size
+            .iter()
+            .chain(&position)
+            .fold(0.0, |most: f64, x| most.max(x.abs()));
         if self.kind != other.kind || !alike(&position, &other.place.0, scale) {
             return false;
         }
@@ -135,7 +177,9 @@ impl Shape {
             mjGEOM_CAPSULE | mjGEOM_CYLINDER if between[2][2].abs() >= 1.0 - TOLERANCE => self.size,
             mjGEOM_BOX | mjGEOM_ELLIPSOID => {
                 let axis = |row: [f64; 3]| (0..3).find(|&j| row[j].abs() >= 1.0 - TOLERANCE);
-                let [Some(x), Some(y), Some(z)] = between.map(axis) else { return false };
+                let [Some(x), Some(y), Some(z)] = between.map(axis) else {
+                    return false;
+                };
                 [x, y, z].map(|axis| self.size[axis])
             }
             _ if (0..3).all(|i| between[i][i] >= 1.0 - TOLERANCE) => self.size,
@@ -153,7 +197,9 @@ mod tests {
     use super::*;
 
     fn scene_with(object: &str) -> (Scene, Body) {
-        let text = format!("<mujoco><worldbody><body name='cube'><freejoint/>{object}</body></worldbody></mujoco>");
+        let text = format!(
+            "<mujoco><worldbody><body name='cube'><freejoint/>{object}</body></worldbody></mujoco>"
+        );
         let mut file = tempfile::NamedTempFile::with_suffix(".xml").unwrap();
         file.write_all(text.as_bytes()).unwrap();
         let scene = Scene::load(Some(file.path()), &Compilation::plain(0.01, Cone::Scene)).unwrap();
@@ -176,13 +222,38 @@ mod tests {
                 2,
                 "<geom type='box' size='.03 .015 .015' pos='.015 0 0'/><geom type='box' size='.015 .03 .015' pos='0 .015 0'/>",
             ),
-            (1, "<geom type='box' size='.03 .015 .015'/><geom type='box' size='.015 .02 .01' pos='-.015 .015 0'/>"),
-            (24, &format!("{cube}<geom type='box' size='.01 .02 .03' contype='0' conaffinity='0' mass='0'/>")),
-            (4, &format!("{cube}<geom type='sphere' size='.01' pos='0 0 .02' contype='0' conaffinity='0'/>")),
-            (24, &format!("{cube}<body><geom type='sphere' size='.01'/></body>")),
-            (4, &format!("{cube}<body pos='0 .03 0'><geom type='sphere' size='.01'/></body>")),
-            (1, &format!("{cube}<body><joint/><geom type='sphere' size='.01'/></body>")),
-            (8, "<inertial pos='0 0 0' mass='.1' diaginertia='1e-4 1e-4 1.1e-4'/><geom type='sphere' size='.03'/>"),
+            (
+                1,
+                "<geom type='box' size='.03 .015 .015'/><geom type='box' size='.015 .02 .01' pos='-.015 .015 0'/>",
+            ),
+            (
+                24,
+                &format!(
+                    "{cube}<geom type='box' size='.01 .02 .03' contype='0' conaffinity='0' mass='0'/>"
+                ),
+            ),
+            (
+                4,
+                &format!(
+                    "{cube}<geom type='sphere' size='.01' pos='0 0 .02' contype='0' conaffinity='0'/>"
+                ),
+            ),
+            (
+                24,
+                &format!("{cube}<body><geom type='sphere' size='.01'/></body>"),
+            ),
+            (
+                4,
+                &format!("{cube}<body pos='0 .03 0'><geom type='sphere' size='.01'/></body>"),
+            ),
+            (
+                1,
+                &format!("{cube}<body><joint/><geom type='sphere' size='.01'/></body>"),
+            ),
+            (
+                8,
+                "<inertial pos='0 0 0' mass='.1' diaginertia='1e-4 1e-4 1.1e-4'/><geom type='sphere' size='.03'/>",
+            ),
         ] {
             let (scene, body) = scene_with(object);
             assert_eq!(scene.symmetry(body).len(), rotations, "{object}");
@@ -196,7 +267,10 @@ mod tests {
             ("xyz", "<geom type='sphere' size='.03'/>"),
             ("z", "<geom type='cylinder' size='.025 .025'/>"),
             ("y", "<geom type='capsule' size='.02 .025' euler='90 0 0'/>"),
-            ("", "<geom type='cylinder' size='.025 .025'/><geom type='box' size='.01 .01 .01' pos='.02 0 0'/>"),
+            (
+                "",
+                "<geom type='cylinder' size='.025 .025'/><geom type='box' size='.01 .01 .01' pos='.02 0 0'/>",
+            ),
         ] {
             let (scene, body) = scene_with(object);
             assert_eq!(scene.round_axes(body), axes, "{object}");
@@ -206,6 +280,9 @@ mod tests {
     #[test]
     fn the_cube_of_the_built_in_scene_has_all_24() {
         let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
-        assert_eq!(scene.symmetry(scene.body("cube").unwrap()), (0..24).collect::<Vec<_>>());
+        assert_eq!(
+            scene.symmetry(scene.body("cube").unwrap()),
+            (0..24).collect::<Vec<_>>()
+        );
     }
 }

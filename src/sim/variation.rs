@@ -3,7 +3,10 @@
 //! This is the only place where the physics of a scene is varied, for a whole task and for single episodes. Every variation is
 //! applied to the scene's own values, so that variations do not add up.
 
-#![expect(unsafe_code, reason = "a value that the wrapper does not let change; the comment says why it is sound")]
+#![expect(
+    unsafe_code,
+    reason = "a value that the wrapper does not let change; the comment says why it is sound"
+)]
 
 use std::sync::Arc;
 
@@ -36,7 +39,9 @@ impl Change {
     /// Changes what MuJoCo does not derive other values from.
     fn apply(&self, model: &mut MjModel) {
         let scale = |values: &mut [f64], factor: f64| values.iter_mut().for_each(|x| *x *= factor);
-        let add = |values: &mut [f64; 3], by: [f64; 3]| values.iter_mut().zip(by).for_each(|(x, by)| *x += by);
+        let add = |values: &mut [f64; 3], by: [f64; 3]| {
+            values.iter_mut().zip(by).for_each(|(x, by)| *x += by)
+        };
         match *self {
             Self::Friction(factor) => {
                 scale(model.geom_friction_mut().as_flattened_mut(), factor);
@@ -81,7 +86,10 @@ impl Scene {
             workspace.set_const();
             model = workspace.model().clone();
         }
-        Self { model: Arc::new(model), ..*self }
+        Self {
+            model: Arc::new(model),
+            ..*self
+        }
     }
 
     /// Whether it differs from another scene only in its numbers, so that a simulation can change from one to the other.
@@ -99,16 +107,26 @@ mod tests {
     #[test]
     fn the_boxes_of_a_shifted_body_are_those_that_mujoco_compiles() {
         // The boxes in which contacts are searched are kept in the frame of the inertia. `mj_setConst` updates them.
-        let compilation = Compilation { object: "cube".into(), shifts: true, ..Compilation::plain(0.01, Cone::Scene) };
+        let compilation = Compilation {
+            object: "cube".into(),
+            shifts: true,
+            ..Compilation::plain(0.01, Cone::Scene)
+        };
         let scene = Scene::load(None, &compilation).unwrap();
         let shift = Change::CentreOfMass(scene.body("cube").unwrap(), [0.01, -0.004, 0.002]);
         let shifted = scene.varied(&[shift]).model;
         let joint = "<freejoint name=\"cube\"/>";
         let inertia = "<inertial pos=\".01 -.004 .002\" mass=\".028\" diaginertia=\"1.16e-5 1.16e-5 1.16e-5\"/>";
-        let compiled = MjModel::from_xml_string(&BUILTIN.replace(joint, &format!("{joint}{inertia}"))).unwrap();
+        let compiled =
+            MjModel::from_xml_string(&BUILTIN.replace(joint, &format!("{joint}{inertia}")))
+                .unwrap();
         let apart = |a: &[[f64; 6]], b: &[[f64; 6]]| {
             assert_eq!(a.len(), b.len());
-            a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+            a.as_flattened()
+                .iter()
+                .zip(b.as_flattened())
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f64::max)
         };
         assert!(apart(shifted.bvh_aabb(), compiled.bvh_aabb()) < 1e-12);
         assert!(apart(scene.model.bvh_aabb(), compiled.bvh_aabb()) > 1e-3);

@@ -28,10 +28,26 @@ impl Viewer {
     /// # Errors
     /// Fails if there is no display or a library is missing. The message names the packages that provide it.
     pub fn open(scene: &Scene, choices: Vec<&'static str>, first: usize) -> Result<Self> {
-        let build = || MjViewer::builder().window_name("shadow-repose".to_owned()).build_passive(&scene.model);
-        let mut viewer = attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
-        let controls = Controls { paused: false, speed: 1.0, choice: first, steps: 0, reset: false, new_goal: false };
-        let panel = Rc::new(RefCell::new(Panel { choices, readout: Readout::default(), controls }));
+        let build = || {
+            MjViewer::builder()
+                .window_name("shadow-repose".to_owned())
+                .build_passive(&scene.model)
+        };
+        let mut viewer =
+            attempt(build).map_err(|reason| anyhow!("cannot open a window: {reason}{HELP}"))?;
+        let controls = Controls {
+            paused: false,
+            speed: 1.0,
+            choice: first,
+            steps: 0,
+            reset: false,
+            new_goal: false,
+        };
+        let panel = Rc::new(RefCell::new(Panel {
+            choices,
+            readout: Readout::default(),
+            controls,
+        }));
         let shown = panel.clone();
         viewer.add_ui_callback(move |ui, _| shown.borrow_mut().show(ui));
         viewer.with_ui_egui_ctx(|context| context.add_plugin(CloseLeftPanel::default()));
@@ -64,7 +80,12 @@ impl Viewer {
         let controls = &mut self.panel.borrow_mut().controls;
         controls.reset |= was_reset;
         let asked = *controls;
-        *controls = Controls { steps: 0, reset: false, new_goal: false, ..asked };
+        *controls = Controls {
+            steps: 0,
+            reset: false,
+            new_goal: false,
+            ..asked
+        };
         Ok(asked)
     }
 }

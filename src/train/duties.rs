@@ -78,7 +78,14 @@ impl Lead {
         report.settings = config.to_text();
         report.hparams = config.dotted();
         report.best = session.best.map(|[goals, _]| goals);
-        Self { report, saver, quiet, diverged: 0, warned: false, far: 0 }
+        Self {
+            report,
+            saver,
+            quiet,
+            diverged: 0,
+            warned: false,
+            far: 0,
+        }
     }
 
     /// Writes into the folder of a new run for the first time.
@@ -86,7 +93,9 @@ impl Lead {
     /// # Errors
     /// Fails if the folder cannot be written to. It is then cleared.
     pub fn open_folder(&mut self) -> Result<()> {
-        self.saver.open_folder(&mut self.report).inspect_err(|_| self.give_back())
+        self.saver
+            .open_folder(&mut self.report)
+            .inspect_err(|_| self.give_back())
     }
 
     /// Clears the folder of a run that could not begin.
@@ -96,7 +105,12 @@ impl Lead {
 
     /// Warns of physics that diverge, once: the total follows at the end. Warns of updates that are too large.
     fn warn(&mut self, session: &Session, outcome: &Outcome) {
-        let Outcome { iteration, steps, evaluation, .. } = outcome;
+        let Outcome {
+            iteration,
+            steps,
+            evaluation,
+            ..
+        } = outcome;
         self.diverged += steps.diverged;
         let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
@@ -105,7 +119,11 @@ impl Lead {
         }
         let desired_kl = session.config.ppo.desired_kl.at(session.agent.env_steps);
         let is_far = desired_kl > 0.0 && iteration.update.losses.kl > FAR * desired_kl;
-        self.far = if is_far { self.far.saturating_add(1) } else { 0 };
+        self.far = if is_far {
+            self.far.saturating_add(1)
+        } else {
+            0
+        };
         if self.far == FAR_FOR {
             self.report.progress.warn(&format!(
                 "policy/kl has been more than {FAR} times ppo.desired_kl = {desired_kl} for {FAR_FOR} iterations: updates are too \
@@ -143,8 +161,16 @@ impl Lead {
     fn finish(&mut self, session: &Session) {
         let held = &self.saver.held;
         held.folder.mark_finished(true);
-        let why = if session.is_flat() { "evaluations no longer rise" } else { "finished" };
-        say!("{why}: {}; {}", held.steps_made(), held.folder.path.display());
+        let why = if session.is_flat() {
+            "evaluations no longer rise"
+        } else {
+            "finished"
+        };
+        say!(
+            "{why}: {}; {}",
+            held.steps_made(),
+            held.folder.path.display()
+        );
         if let Some(rise) = &session.rise {
             os::say_line(&before_and_after(rise, session.config.run.eval_episodes));
         }
@@ -162,7 +188,11 @@ impl Lead {
             );
         }
         held.folder.mark_finished(stop.by_file);
-        let reason = if stop.by_file { "stopped by the file `stop`" } else { "stopped" };
+        let reason = if stop.by_file {
+            "stopped by the file `stop`"
+        } else {
+            "stopped"
+        };
         say!("{reason} after {}; resume with", held.steps_made());
         say!("  {}", held.how_to_resume(&held.folder));
         self.saver.release();
@@ -181,12 +211,18 @@ impl Duties for Lead {
     }
 
     fn evaluated(&mut self, env_steps: u64, score: &Score) {
-        let found =
-            HEADLINE.map(|column| format!("{} {}", measure(column).label(), measure(column).text(score[column])));
+        let found = HEADLINE.map(|column| {
+            format!(
+                "{} {}",
+                measure(column).label(),
+                measure(column).text(score[column])
+            )
+        });
         let episodes = score.episodes;
-        self.report
-            .progress
-            .say(&format!("{env_steps} steps: evaluation of {episodes} episodes: {}", found.join("; ")));
+        self.report.progress.say(&format!(
+            "{env_steps} steps: evaluation of {episodes} episodes: {}",
+            found.join("; ")
+        ));
     }
 
     fn keep(&mut self, state: Checkpoint) {
@@ -200,7 +236,11 @@ impl Duties for Lead {
             dumped.unwrap_or_else(|error| self.report.progress.warn(&format!("{error:#}")));
         }
         self.warn(session, outcome);
-        let ended = Ended::new(&outcome.ended, session.config.env.ctrl_dt, session.config.randomization.happens());
+        let ended = Ended::new(
+            &outcome.ended,
+            session.config.env.ctrl_dt,
+            session.config.randomization.happens(),
+        );
         let shown = ended.shown();
         let status = Status {
             env_steps: session.agent.env_steps,
@@ -209,7 +249,12 @@ impl Duties for Lead {
             drop_rate: shown["drop_rate"],
             evaluation: outcome.evaluation["goals"],
         };
-        self.report.iteration(session.agent.iteration, &row(outcome, &ended), &outcome.histograms, &status);
+        self.report.iteration(
+            session.agent.iteration,
+            &row(outcome, &ended),
+            &outcome.histograms,
+            &status,
+        );
         Ok(())
     }
 
@@ -220,10 +265,23 @@ impl Duties for Lead {
 
 /// The first evaluation and the best one as a table.
 fn before_and_after(rise: &Rise, episodes: usize) -> String {
-    let mut table = format!("  {:<20} {:>8} {:>8}", format!("{episodes} episodes"), "before", "best");
-    for (column, (before, best)) in HEADLINE.into_iter().zip(rise.before.into_iter().zip(rise.best)) {
+    let mut table = format!(
+        "  {:<20} {:>8} {:>8}",
+        format!("{episodes} episodes"),
+        "before",
+        "best"
+    );
+    for (column, (before, best)) in HEADLINE
+        .into_iter()
+        .zip(rise.before.into_iter().zip(rise.best))
+    {
         let measure = measure(column);
-        table += &format!("\n  {:<20} {:>8} {:>8}", measure.label(), measure.text(before), measure.text(best));
+        table += &format!(
+            "\n  {:<20} {:>8} {:>8}",
+            measure.label(),
+            measure.text(before),
+            measure.text(best)
+        );
     }
     table
 }
@@ -232,7 +290,13 @@ fn before_and_after(rise: &Rise, episodes: usize) -> String {
 fn say_what_next(run: &Path, env: &EnvConfig) {
     let program = os::called_as();
     let word = os::quoted_path(run);
-    let all = run.parent().filter(|all| !all.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let all = run
+        .parent()
+        .filter(|all| !all.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     let play = format!("{program} play --ckpt {word}{}", scene_option(env));
-    say!("  {play}\n  {program} plot {word}\n  tensorboard --logdir {}", os::quoted_path(all));
+    say!(
+        "  {play}\n  {program} plot {word}\n  tensorboard --logdir {}",
+        os::quoted_path(all)
+    );
 }

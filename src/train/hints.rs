@@ -31,7 +31,9 @@ pub fn hints(config: &Config, args: &TrainArgs, default: &Config, scene: usize) 
     let mut hints = Vec::from_iter(of_ramps(config));
     let samples = config.samples_per_minibatch();
     if samples < SMALL_MINIBATCH {
-        hints.push(format!("minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"));
+        hints.push(format!(
+            "minibatches of {samples} samples: gradients are noisy below {SMALL_MINIBATCH}"
+        ));
     }
     let begins = args.init.is_none() && args.fork.is_none() && args.resume.is_none();
     if config.ppo.critic_first > 0 && begins {
@@ -74,12 +76,14 @@ fn without_effect(config: &Config, default: &Config) -> Vec<String> {
     let mut notes = Vec::new();
     for (key, [_, value]) in usual.compared_with(config) {
         let is_about = |keys: &str| keys.split(' ').any(|begin| key.starts_with(begin));
-        let cause = WITHOUT_EFFECT
-            .iter()
-            .find(|(keys, other, most)| is_about(keys) && *other != key && reached(config, other) <= *most);
+        let cause = WITHOUT_EFFECT.iter().find(|(keys, other, most)| {
+            is_about(keys) && *other != key && reached(config, other) <= *most
+        });
         if let Some((_, other, _)) = cause {
             let [value, cause] = [&value, &config.dotted()[*other]].map(short);
-            notes.push(format!("{key} = {value} has little or no effect with {other} = {cause}"));
+            notes.push(format!(
+                "{key} = {value} has little or no effect with {other} = {cause}"
+            ));
         }
     }
     notes
@@ -92,7 +96,9 @@ const MAY_GROW: [&str; 2] = ["training.drop_reward", "randomization.share"];
 fn of_ramps(config: &Config) -> Option<String> {
     let total = config.run.total_steps;
     let mut cut = config.ramps();
-    cut.retain(|(key, ramp)| ramp.end() > total && (ramp.after >= total || !MAY_GROW.contains(&&**key)));
+    cut.retain(|(key, ramp)| {
+        ramp.end() > total && (ramp.after >= total || !MAY_GROW.contains(&&**key))
+    });
     let longest = cut.iter().map(|(_, ramp)| ramp.end()).max()?;
     let names: Vec<String> = cut.into_iter().map(|(key, _)| key).collect();
     Some(format!(
@@ -114,34 +120,64 @@ mod tests {
 
     #[test]
     fn what_is_rarely_meant_gets_a_line_each() {
-        let [line] = &hints_for(&["run.total_steps=18000000"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["run.total_steps=18000000"])[..] else {
+            panic!("one line")
+        };
         let ramps = "training.tolerance, training.hold, randomization.share, ppo.horizon";
-        assert!(line.contains(&format!("{ramps}, which last up to 80000000 steps")), "{line}");
+        assert!(
+            line.contains(&format!("{ramps}, which last up to 80000000 steps")),
+            "{line}"
+        );
         assert!(!line.contains("assist"), "its ramp ends in time: {line}");
         assert!(hints_for(&["run.total_steps=9000000"])[0].contains("training.assist"));
-        let [line] = &hints_for(&["ppo.minibatches=32"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["ppo.minibatches=32"])[..] else {
+            panic!("one line")
+        };
         assert!(line.starts_with("minibatches of 512 samples"), "{line}");
-        let [line] = &hints_for(&["env.dist_reward_scale=-20"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["env.dist_reward_scale=-20"])[..] else {
+            panic!("one line")
+        };
         assert!(
             line.starts_with("env.dist_reward_scale = -20 has little or no effect with training.task_reward = 0.03"),
             "{line}"
         );
         assert!(hints_for(&["env.dist_reward_scale=-20", "training.task_reward=1"]).is_empty());
-        let [line] = &hints_for(&["env.num_envs=8192"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["env.num_envs=8192"])[..] else {
+            panic!("one line")
+        };
         assert!(
             line.contains("8192 environments gets its own model of this scene, from 40000000 steps on: 8.0 GiB"),
             "{line}"
         );
         assert!(hints_for(&["env.num_envs=8192", "randomization.share=0"]).is_empty());
-        let [line] = &hints_for(&["env.num_envs=8192", "randomization.share.from=0.2"])[..] else { panic!("one line") };
+        let [line] = &hints_for(&["env.num_envs=8192", "randomization.share.from=0.2"])[..] else {
+            panic!("one line")
+        };
         assert!(line.contains("from 0 steps on"), "{line}");
         let short = hints_for(&["env.num_envs=8192", "run.total_steps=30_000_000"]);
         assert!(!short.concat().contains("own model"), "it ends before");
-        let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else { panic!("one line") };
-        assert!(line.contains("shorter than the ramps of randomization.share, which"), "{line}");
-        let ranges = hints_for(&["randomization.friction=[0.3,2]", "run.total_steps=30_000_000"]);
-        assert!(ranges.concat().contains("randomization.friction = [0.3,2] has little or no effect"), "{ranges:?}");
-        assert!(hints_for(&["env.fall_penalty=-100"]).concat().contains("env.fall_penalty = -100 has little"));
+        let [line] = &hints_for(&["randomization.share={after=200_000_000}"])[..] else {
+            panic!("one line")
+        };
+        assert!(
+            line.contains("shorter than the ramps of randomization.share, which"),
+            "{line}"
+        );
+        let ranges = hints_for(&[
+            "randomization.friction=[0.3,2]",
+            "run.total_steps=30_000_000",
+        ]);
+        assert!(
+            ranges
+                .concat()
+                .contains("randomization.friction = [0.3,2] has little or no effect"),
+            "{ranges:?}"
+        );
+        assert!(
+            hints_for(&["env.fall_penalty=-100"])
+                .concat()
+                .contains("env.fall_penalty = -100 has little")
+        );
     }
 
     #[test]
@@ -151,14 +187,32 @@ mod tests {
                 ["ppo.desired_kl=0", "ppo.learning_rate_range=[1e-6,1e-2]"],
                 "ppo.learning_rate_range = [0.000001,0.01] has",
             ),
-            (["ppo.away_std=0", "ppo.away_range=[0.1,0.5]"], "ppo.away_range = [0.1,0.5] has"),
-            (["randomization.push=0", "randomization.push_steps=3"], "randomization.push_steps = 3 has"),
-            (["env.rot_reward_scale=0", "env.rot_eps=0.2"], "env.rot_eps = 0.2 has"),
-            (["randomization.share=0", "randomization.each=0.9"], "randomization.each = 0.9 has"),
-            (["ppo.critic_first=20", "run.seed=3"], "ppo.critic_first = 20: it is for a policy"),
+            (
+                ["ppo.away_std=0", "ppo.away_range=[0.1,0.5]"],
+                "ppo.away_range = [0.1,0.5] has",
+            ),
+            (
+                ["randomization.push=0", "randomization.push_steps=3"],
+                "randomization.push_steps = 3 has",
+            ),
+            (
+                ["env.rot_reward_scale=0", "env.rot_eps=0.2"],
+                "env.rot_eps = 0.2 has",
+            ),
+            (
+                ["randomization.share=0", "randomization.each=0.9"],
+                "randomization.each = 0.9 has",
+            ),
+            (
+                ["ppo.critic_first=20", "run.seed=3"],
+                "ppo.critic_first = 20: it is for a policy",
+            ),
         ] {
             let hints = hints_for(&sets);
-            assert!(hints.iter().any(|hint| hint.starts_with(begin)), "{begin}: {hints:?}");
+            assert!(
+                hints.iter().any(|hint| hint.starts_with(begin)),
+                "{begin}: {hints:?}"
+            );
         }
     }
 
@@ -168,7 +222,10 @@ mod tests {
         for (_, text) in SHIPPED {
             let source = Source::new("x.toml", text);
             let config = Settings::new().file(source).resolve().unwrap();
-            let args = TrainArgs { init: Some("builtin".into()), ..TrainArgs::default() };
+            let args = TrainArgs {
+                init: Some("builtin".into()),
+                ..TrainArgs::default()
+            };
             assert_eq!(hints(&config, &args, &default, 1 << 19), [""; 0]);
         }
     }

@@ -21,7 +21,10 @@ pub struct Stop {
 impl Stop {
     /// The stop that these requests ask for.
     pub fn by_signal(requests: &Requests) -> Self {
-        Self { by_file: false, signal: requests.signal() }
+        Self {
+            by_file: false,
+            signal: requests.signal(),
+        }
     }
 }
 
@@ -56,11 +59,24 @@ impl Session {
         let exchange = &self.agent.exchange;
         // With a single rank, the next iteration stops at once.
         let asked = !exchange.is_alone() && requests.stop.load(Ordering::Relaxed);
-        let weights = if exchange.is_alone() { 0 } else { self.agent.ppo.checksum() };
+        let weights = if exchange.is_alone() {
+            0
+        } else {
+            self.agent.ppo.checksum()
+        };
         let signal = if asked { requests.signal() } else { 0 };
-        let vote = Vote { stop: by_file || asked, save: requests.take_save(), improved, signal, weights };
+        let vote = Vote {
+            stop: by_file || asked,
+            save: requests.take_save(),
+            improved,
+            signal,
+            weights,
+        };
         let votes = exchange.all_gather(vote);
-        if let Some(rank) = votes.iter().position(|vote| vote.weights != votes[0].weights) {
+        if let Some(rank) = votes
+            .iter()
+            .position(|vote| vote.weights != votes[0].weights)
+        {
             bail!(
                 "the weights of rank {rank} differ from those of rank 0: one of the machines does not compute as it should"
             );
@@ -69,10 +85,18 @@ impl Session {
         let signal = votes.iter().map(|vote| vote.signal).max().unwrap_or(0);
         let finished = self.finished();
         let stop = (!finished && any(|vote| vote.stop)).then_some(Stop { by_file, signal });
-        let save = any(|vote| vote.save) || self.agent.iteration.is_multiple_of(self.config.run.checkpoint_every);
+        let save = any(|vote| vote.save)
+            || self
+                .agent
+                .iteration
+                .is_multiple_of(self.config.run.checkpoint_every);
         let is_last = finished || stop.is_some();
         let hand_over = exchange.is_alone() || is_last || save || any(|vote| vote.improved);
-        Ok(Decision { save: save && !is_last, hand_over, stop })
+        Ok(Decision {
+            save: save && !is_last,
+            hand_over,
+            stop,
+        })
     }
 
     /// The steps that led to each divergence, as files with these names and texts.
@@ -82,8 +106,15 @@ impl Session {
         }
         let iteration = self.agent.iteration;
         let mut own: Vec<(String, String)> = Vec::new();
-        for Member { env: hand, number: env, .. } in self.agent.pool.members_mut() {
-            let Some(diverged) = hand.diverged.take() else { continue };
+        for Member {
+            env: hand,
+            number: env,
+            ..
+        } in self.agent.pool.members_mut()
+        {
+            let Some(diverged) = hand.diverged.take() else {
+                continue;
+            };
             let text = diverged.as_json(&self.config.env, iteration, *env);
             own.push((format!("iteration-{iteration:08}-env-{env}.json"), text));
         }

@@ -18,13 +18,22 @@ pub struct Ended {
 impl Ended {
     /// Computes the scores of `episodes` with control steps of `ctrl_dt` seconds, in a training run with or without randomised ones.
     pub fn new(episodes: &[EpisodeStats], ctrl_dt: f64, randomizes: bool) -> Self {
-        let (drawn, nominal): (Vec<_>, Vec<_>) = episodes.iter().copied().partition(|episode| episode.randomized);
-        Self { nominal: Score::of(&nominal, ctrl_dt), randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)) }
+        let (drawn, nominal): (Vec<_>, Vec<_>) = episodes
+            .iter()
+            .copied()
+            .partition(|episode| episode.randomized);
+        Self {
+            nominal: Score::of(&nominal, ctrl_dt),
+            randomized: randomizes.then(|| Score::of(&drawn, ctrl_dt)),
+        }
     }
 
     /// The score to show: the score of the task as it is, if such episodes ended.
     pub fn shown(&self) -> &Score {
-        self.randomized.as_ref().filter(|_| self.nominal.episodes == 0).unwrap_or(&self.nominal)
+        self.randomized
+            .as_ref()
+            .filter(|_| self.nominal.episodes == 0)
+            .unwrap_or(&self.nominal)
     }
 }
 
@@ -32,14 +41,26 @@ impl Ended {
 /// it, all its steps, the lesson and the evaluation (a score of no episodes if there was none). Then come the update and the
 /// timings, with the traffic of the exchange.
 pub fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
-    let Outcome { iteration, steps, evaluation, traffic, .. } = outcome;
+    let Outcome {
+        iteration,
+        steps,
+        evaluation,
+        traffic,
+        ..
+    } = outcome;
     let mut row = Vec::new();
     let mut put = |group: &str, values: &mut dyn Iterator<Item = (&'static str, f64)>| {
         row.extend(values.map(|(name, value)| (format!("{group}{name}"), value)));
     };
-    put("episode/", &mut ended.nominal.named(OF_TRAINING).into_iter());
+    put(
+        "episode/",
+        &mut ended.nominal.named(OF_TRAINING).into_iter(),
+    );
     if let Some(randomized) = &ended.randomized {
-        put("randomized/", &mut randomized.named(OF_TRAINING).into_iter());
+        put(
+            "randomized/",
+            &mut randomized.named(OF_TRAINING).into_iter(),
+        );
     }
     put("reward/", &mut steps.task_named());
     put("training/", &mut steps.training_named());
@@ -48,14 +69,23 @@ pub fn row(outcome: &Outcome, ended: &Ended) -> Vec<(String, f64)> {
     put("", &mut iteration.update.named().into_iter());
     put("time/", &mut iteration.time_named().into_iter());
     put("time/", &mut traffic.iter().copied());
-    put("sim/", &mut [("diverged", steps.diverged as f64)].into_iter());
+    put(
+        "sim/",
+        &mut [("diverged", steps.diverged as f64)].into_iter(),
+    );
     row
 }
 
 /// The names of the values of any iteration, in a training run with or without randomised episodes.
 pub fn tags(randomizes: bool) -> Vec<String> {
     let traffic = Exchange::alone(1).take_traffic();
-    let empty = row(&Outcome { traffic, ..Outcome::default() }, &Ended::new(&[], 0.0, randomizes));
+    let empty = row(
+        &Outcome {
+            traffic,
+            ..Outcome::default()
+        },
+        &Ended::new(&[], 0.0, randomizes),
+    );
     empty.into_iter().map(|(name, _)| name).collect()
 }
 
@@ -65,14 +95,26 @@ const ADVANTAGES: &str = "histogram/advantages";
 
 /// The values with these names and all other things that are logged, with their descriptions.
 pub fn described(names: &[String]) -> Descriptions {
-    let all = names.iter().map(String::as_str).chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
-    all.map(|name| (name.to_owned(), tag(name).map(|known| known.description).unwrap_or_default())).collect()
+    let all = names
+        .iter()
+        .map(String::as_str)
+        .chain([ACTIONS, ADVANTAGES, run::SETTINGS]);
+    all.map(|name| {
+        (
+            name.to_owned(),
+            tag(name).map(|known| known.description).unwrap_or_default(),
+        )
+    })
+    .collect()
 }
 
 /// The histograms of the rollout that was just learnt from.
 pub fn histograms(rollout: &Rollout) -> Vec<(&'static str, Histogram)> {
     let all = |of: fn(&RolloutBlock) -> &[f32]| histogram(rollout.blocks.iter().flat_map(of));
-    vec![(ACTIONS, all(|block| &block.actions)), (ADVANTAGES, all(|block| &block.advantages))]
+    vec![
+        (ACTIONS, all(|block| &block.actions)),
+        (ADVANTAGES, all(|block| &block.advantages)),
+    ]
 }
 
 #[cfg(test)]
@@ -94,16 +136,30 @@ mod tests {
 
     #[test]
     fn histograms_are_those_of_the_quantities_whose_names_they_have() {
-        let sets = ["env.num_envs=8", "ppo.horizon=4", "ppo.hidden=[8]", "ppo.minibatches=2"];
-        let config = Settings::new().sets(&sets.map(|set| set.parse().unwrap())).resolve().unwrap();
-        let mut agent = Agent::for_task(&Task::new(&config).unwrap(), &config, Exchange::alone(1)).unwrap();
+        let sets = [
+            "env.num_envs=8",
+            "ppo.horizon=4",
+            "ppo.hidden=[8]",
+            "ppo.minibatches=2",
+        ];
+        let config = Settings::new()
+            .sets(&sets.map(|set| set.parse().unwrap()))
+            .resolve()
+            .unwrap();
+        let mut agent =
+            Agent::for_task(&Task::new(&config).unwrap(), &config, Exchange::alone(1)).unwrap();
         agent.iterate(&AtomicBool::new(false)).unwrap().unwrap();
         let found = histograms(&agent.rollout);
-        let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else { panic!("{found:?}") };
+        let [(ACTIONS, actions), (ADVANTAGES, advantages)] = &found[..] else {
+            panic!("{found:?}")
+        };
         let count = |histogram: &Histogram| histogram.bucket.iter().sum::<f64>();
         assert_eq!([count(actions), count(advantages)], [32.0 * 20.0, 32.0]);
         assert!(actions.min < -0.5, "{found:?}");
-        assert!(advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2, "{advantages:?}");
+        assert!(
+            advantages.sum.abs() < 1e-3 && (advantages.sum_squares - 32.0).abs() < 1e-2,
+            "{advantages:?}"
+        );
     }
 
     /// The row of the test below between the scores of episodes and of the evaluation, and after them: every column with a value of
@@ -122,18 +178,41 @@ mod tests {
     fn each_value_of_a_row_stands_beside_its_own_name() {
         let lesson = Lesson::task(&Config::default().env);
         let update = UpdateStats {
-            losses: Losses { surrogate: -1.0, value_error: 2.0, excess: 3.0, kl: 5.0, clipped: 8.0, ratio_error: 0.0 },
-            first: Losses { kl: 6.0, ratio_error: 7.0, ..Losses::default() },
+            losses: Losses {
+                surrogate: -1.0,
+                value_error: 2.0,
+                excess: 3.0,
+                kl: 5.0,
+                clipped: 8.0,
+                ratio_error: 0.0,
+            },
+            first: Losses {
+                kl: 6.0,
+                ratio_error: 7.0,
+                ..Losses::default()
+            },
             entropy: 4.0,
             grad_norm: 9.0,
             std: 10.0,
             explained_variance: 11.0,
             learning_rate: 12.0,
         };
-        let iteration = Iteration { lesson, update, steps: 60, collect_s: 13.0, update_s: 17.0 };
+        let iteration = Iteration {
+            lesson,
+            update,
+            steps: 60,
+            collect_s: 13.0,
+            update_s: 17.0,
+        };
         let reward = [20.0, 21.0, 22.0, 23.0, 24.0];
         let training = [25.0, 31.0, 26.0, 27.0];
-        let steps = StepSums { steps: 1, task: reward, training, turned: 0.32, diverged: 28 };
+        let steps = StepSums {
+            steps: 1,
+            task: reward,
+            training,
+            turned: 0.32,
+            diverged: 28,
+        };
         let episode = |reward, length, goals| EpisodeStats {
             length,
             goals,
@@ -143,20 +222,49 @@ mod tests {
             dropped: length < 100,
             ..Default::default()
         };
-        let other = EpisodeStats { randomized: true, ..episode(TaskReward::default(), 200, 8) };
+        let other = EpisodeStats {
+            randomized: true,
+            ..episode(TaskReward::default(), 200, 8)
+        };
         let ended = |randomizes| Ended::new(&[episode(reward, 80, 2), other], 0.01, randomizes);
-        let whole = EpisodeStats { turned: 16.8, ..episode(TaskReward::default(), 1000, 5) };
-        let evaluation = Score::of(&[whole, episode(TaskReward::default(), 200, 1), episode(reward, 50, 0)], 0.01);
+        let whole = EpisodeStats {
+            turned: 16.8,
+            ..episode(TaskReward::default(), 1000, 5)
+        };
+        let evaluation = Score::of(
+            &[
+                whole,
+                episode(TaskReward::default(), 200, 1),
+                episode(reward, 50, 0),
+            ],
+            0.01,
+        );
         let traffic = [("exchange_s", 29.0), ("exchange_bytes", 30.0)];
-        let outcome = Outcome { iteration, steps, evaluation, traffic, ..Outcome::default() };
+        let outcome = Outcome {
+            iteration,
+            steps,
+            evaluation,
+            traffic,
+            ..Outcome::default()
+        };
         let row = |ended: &Ended| {
             let row = row(&outcome, ended);
-            row.iter().map(|(name, value)| format!("{name} {value}")).collect::<Vec<_>>().join(", ")
+            row.iter()
+                .map(|(name, value)| format!("{name} {value}"))
+                .collect::<Vec<_>>()
+                .join(", ")
         };
-        let names =
-            |row: &str| row.split(", ").map(|cell| cell.split_once(' ').unwrap().0.to_owned()).collect::<Vec<_>>();
+        let names = |row: &str| {
+            row.split(", ")
+                .map(|cell| cell.split_once(' ').unwrap().0.to_owned())
+                .collect::<Vec<_>>()
+        };
         let of = |group: &str, columns: &[&str], score: &Score| {
-            columns.iter().map(|column| format!("{group}/{column} {}", score[*column])).collect::<Vec<_>>().join(", ")
+            columns
+                .iter()
+                .map(|column| format!("{group}/{column} {}", score[*column]))
+                .collect::<Vec<_>>()
+                .join(", ")
         };
         let nominal = ended(false);
         let episode_columns = of("episode", &OF_TRAINING, &nominal.nominal);
@@ -167,12 +275,19 @@ mod tests {
         // Randomised episodes are apart, in columns that only such a training run has.
         let both = ended(true);
         let apart = of("randomized", &OF_TRAINING, &both.randomized.unwrap());
-        assert!(apart.starts_with("randomized/return 0, randomized/length 200, randomized/goals 8"), "{apart}");
+        assert!(
+            apart.starts_with("randomized/return 0, randomized/length 200, randomized/goals 8"),
+            "{apart}"
+        );
         let expected = [&episode_columns, &apart, BETWEEN, &evaluated, AFTER].join(", ");
         assert_eq!(row(&both), expected);
         assert_eq!(tags(true), names(&expected));
-        let shown =
-            [vec![other], vec![other, episode(reward, 80, 2)]].map(|all| Ended::new(&all, 0.01, true).shown()["goals"]);
-        assert_eq!(shown, [8.0, 2.0], "the task as it is, where such episodes ended");
+        let shown = [vec![other], vec![other, episode(reward, 80, 2)]]
+            .map(|all| Ended::new(&all, 0.01, true).shown()["goals"]);
+        assert_eq!(
+            shown,
+            [8.0, 2.0],
+            "the task as it is, where such episodes ended"
+        );
     }
 }

@@ -25,8 +25,11 @@ const OF_BUILTIN: f64 = 3.6;
 /// A sentence about the mobility of a task's hand, in the first stage of the `default` task.
 pub fn mobility(task: &Arc<Task>, default: &EnvConfig) -> String {
     let task = &task.at_the_stage_of(default);
-    let played = (0..EPISODES).into_par_iter().map(|episode| play(task, episode));
-    let (turned, steps, drops) = played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
+    let played = (0..EPISODES)
+        .into_par_iter()
+        .map(|episode| play(task, episode));
+    let (turned, steps, drops) =
+        played.reduce(|| (0.0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
     let rate = 100.0 * turned / f64::from(steps.max(1));
     let object = &task.hand.parts.object;
     format!(

@@ -65,13 +65,23 @@ fn lead(args: &TrainArgs, requests: &Requests, exchange: &Exchange) -> Result<Ex
     }
     requests.wait_for_end();
     say!("run folder: {place}");
-    session.task.warnings.iter().for_each(|warning| say!("warning: {warning}"));
+    session
+        .task
+        .warnings
+        .iter()
+        .for_each(|warning| say!("warning: {warning}"));
     if !args.quiet {
         let default = Config::default();
         let hints = hints(&session.config, args, &default, session.task.scene.size());
         let own_scene = session.config.env.model_file().is_some() && args.resume.is_none();
         let mobility = own_scene.then(|| mobility(&session.task, &default.env));
-        session.task.notes().iter().chain(&mobility).chain(&hints).for_each(|hint| say!("note: {hint}"));
+        session
+            .task
+            .notes()
+            .iter()
+            .chain(&mobility)
+            .chain(&hints)
+            .for_each(|hint| say!("note: {hint}"));
     }
     let mut lead = Lead::new(&session, saver, args.quiet);
     if args.resume.is_none() {
@@ -93,12 +103,18 @@ fn follow(requests: &Requests, exchange: &Exchange) -> Result<ExitCode> {
 }
 
 /// Iterates until all steps are made, or until a stop is requested, which is returned. All ranks run it together.
-fn run(session: &mut Session, duties: &mut dyn Duties, requests: &Requests) -> Result<Option<Stop>> {
+fn run(
+    session: &mut Session,
+    duties: &mut dyn Duties,
+    requests: &Requests,
+) -> Result<Option<Stop>> {
     if !session.begin(requests, duties)? {
         return Ok(Some(Stop::by_signal(requests)));
     }
     while !session.finished() {
-        let Some(outcome) = session.iterate(requests, duties)? else { return Ok(Some(Stop::by_signal(requests))) };
+        let Some(outcome) = session.iterate(requests, duties)? else {
+            return Ok(Some(Stop::by_signal(requests)));
+        };
         if outcome.decision.hand_over {
             duties.keep(session.checkpoint());
         }
@@ -125,23 +141,40 @@ impl Session {
         let iterate = || {
             // What was exchanged since the last iteration is not counted.
             self.agent.exchange.take_traffic();
-            let Some(iteration) = self.agent.iterate(&now.stop)? else { return Ok(None) };
+            let Some(iteration) = self.agent.iterate(&now.stop)? else {
+                return Ok(None);
+            };
             let traffic = self.agent.exchange.take_traffic();
             let due = evaluates(self.agent.iteration, self.config.run.eval_every);
-            let Some(evaluation) = self.evaluate(due, &now, duties)? else { return Ok(None) };
+            let Some(evaluation) = self.evaluate(due, &now, duties)? else {
+                return Ok(None);
+            };
             let histograms = self.histograms();
             let improved = self.take_down(&evaluation);
             let (ended, steps) = self.take_results();
             let dumps = self.dumps();
             let decision = self.decide(requests, duties.is_stopped_by_file(), improved)?;
-            Ok(Some(Outcome { iteration, ended, steps, evaluation, traffic, histograms, dumps, decision }))
+            Ok(Some(Outcome {
+                iteration,
+                ended,
+                steps,
+                evaluation,
+                traffic,
+                histograms,
+                dumps,
+                decision,
+            }))
         };
         caught(iterate).with_context(|| format!("iteration {number}"))
     }
 
     /// What may end an iteration early: with other ranks nothing, because they wait for what is computed here.
     fn requests_now(&self, requests: &Requests) -> Requests {
-        if self.agent.exchange.is_alone() { requests.clone() } else { Requests::none() }
+        if self.agent.exchange.is_alone() {
+            requests.clone()
+        } else {
+            Requests::none()
+        }
     }
 
     /// The episodes that ended on any rank since the last call, and the sums over all steps.
@@ -164,8 +197,13 @@ impl Session {
 
     /// The histograms that are due after this iteration. Only the first rank has some.
     fn histograms(&self) -> Vec<(&'static str, Histogram)> {
-        let due = self.agent.exchange.is_first() && self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY);
-        if due { histograms(&self.agent.rollout) } else { Vec::new() }
+        let due =
+            self.agent.exchange.is_first() && self.agent.iteration.is_multiple_of(HISTOGRAMS_EVERY);
+        if due {
+            histograms(&self.agent.rollout)
+        } else {
+            Vec::new()
+        }
     }
 
     /// Evaluates before the first iteration, if the run ends when evaluations no longer rise. Says whether it can go on: no stop
@@ -176,14 +214,20 @@ impl Session {
     fn begin(&mut self, requests: &Requests, duties: &mut dyn Duties) -> Result<bool> {
         if self.config.run.patience > 0 && self.rise.is_none() {
             let now = self.requests_now(requests);
-            let Some(before) = caught(|| self.evaluate(true, &now, duties))? else { return Ok(false) };
+            let Some(before) = caught(|| self.evaluate(true, &now, duties))? else {
+                return Ok(false);
+            };
             let known = figures(&before);
             ensure!(
                 known.iter().all(|x| x.is_finite()),
                 "run.patience: the physics of every evaluation episode diverges at once"
             );
             self.take_down(&before);
-            self.rise = Some(Rise { before: known, best: known, since: 0 });
+            self.rise = Some(Rise {
+                before: known,
+                best: known,
+                since: 0,
+            });
             duties.keep(self.checkpoint());
         }
         Ok(true)
@@ -196,28 +240,49 @@ impl Session {
         self.best = if improved { Some(found) } else { self.best };
         // While the critic learns alone, an evaluation cannot rise.
         if evaluation.episodes > 0 && !self.agent.ppo.is_critic_alone(self.agent.iteration) {
-            self.rise.iter_mut().for_each(|rise| rise.add(figures(evaluation)));
+            self.rise
+                .iter_mut()
+                .for_each(|rise| rise.add(figures(evaluation)));
         }
         improved
     }
 
     /// Plays the evaluation episodes, if they are `due`, and shows their score. Returns `None` if a stop was requested meanwhile.
-    fn evaluate(&self, due: bool, requests: &Requests, duties: &mut dyn Duties) -> Result<Option<Score>> {
+    fn evaluate(
+        &self,
+        due: bool,
+        requests: &Requests,
+        duties: &mut dyn Duties,
+    ) -> Result<Option<Score>> {
         let ctrl_dt = self.task.config.ctrl_dt;
         if !due {
             return Ok(Some(Score::of(&[], ctrl_dt)));
         }
-        let task = self.task.at_the_stage_of(&self.config.env.at(self.agent.env_steps));
+        let task = self
+            .task
+            .at_the_stage_of(&self.config.env.at(self.agent.env_steps));
         let run = &self.config.run;
-        let episodes = Episodes { seed: run.seed, purpose: "evaluation", first: 0, count: run.eval_episodes };
+        let episodes = Episodes {
+            seed: run.seed,
+            purpose: "evaluation",
+            first: 0,
+            count: run.eval_episodes,
+        };
         let actor = Actor::Mean(self.agent.ppo.policy.freeze());
-        let trial = Trial { task: &task, actor: &actor, episodes, stop: &requests.stop };
+        let trial = Trial {
+            task: &task,
+            actor: &actor,
+            episodes,
+            stop: &requests.stop,
+        };
         let played = trial.play_together(&self.agent.exchange, &mut |_| {
             duties.attend(requests);
             Ok(())
         })?;
         let score = played.map(|played| Score::of(&played, ctrl_dt));
-        score.iter().for_each(|score| duties.evaluated(self.agent.env_steps, score));
+        score
+            .iter()
+            .for_each(|score| duties.evaluated(self.agent.env_steps, score));
         Ok(score)
     }
 }
@@ -254,18 +319,32 @@ mod tests {
     use crate::train::start::Plan;
 
     fn from_scratch(sets: &[Override]) -> Session {
-        let mut plan = Plan::new(Settings::new().sets(sets).resolve().unwrap(), &TrainArgs::default()).unwrap();
+        let mut plan = Plan::new(
+            Settings::new().sets(sets).resolve().unwrap(),
+            &TrainArgs::default(),
+        )
+        .unwrap();
         let loaded = plan.load_task().unwrap();
         Session::new(plan, loaded, Exchange::alone(1)).unwrap()
     }
 
     fn saver_of(session: &Session, place: (RunFolder, Locked)) -> Saver {
-        Saver::new(place, &TrainArgs::default(), &session.config, session.checkpoint(), false)
+        Saver::new(
+            place,
+            &TrainArgs::default(),
+            &session.config,
+            session.checkpoint(),
+            false,
+        )
     }
 
     #[test]
     fn evaluations_come_at_the_multiples_and_once_early_where_they_are_rare() {
-        let after = |every| (1..=310).filter(|&iteration| evaluates(iteration, every)).collect::<Vec<u64>>();
+        let after = |every| {
+            (1..=310)
+                .filter(|&iteration| evaluates(iteration, every))
+                .collect::<Vec<u64>>()
+        };
         assert_eq!(after(150), [50, 150, 300]);
         assert_eq!(after(50), [50, 100, 150, 200, 250, 300]);
         assert_eq!(after(100), [50, 100, 200, 300]);
@@ -275,15 +354,26 @@ mod tests {
     #[test]
     fn a_panic_on_a_worker_thread_is_an_error_and_the_iteration_before_is_saved() {
         let place = tempfile::tempdir().unwrap();
-        let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]", "run.eval_every=1000"];
+        let sets = [
+            "env.num_envs=9",
+            "ppo.horizon=4",
+            "ppo.hidden=[8]",
+            "run.eval_every=1000",
+        ];
         let sets: Vec<Override> = sets.map(|set| set.parse().unwrap()).into();
         let mut session = from_scratch(&sets);
-        let saver = saver_of(&session, RunFolder::create(Some(place.path()), None).unwrap());
+        let saver = saver_of(
+            &session,
+            RunFolder::create(Some(place.path()), None).unwrap(),
+        );
         let latest = saver.held.folder.checkpoints.latest();
         let mut lead = Lead::new(&session, saver, true);
         lead.open_folder().unwrap();
         let never = Requests::none();
-        assert!(session.iterate(&never, &mut lead).unwrap().is_some(), "nothing stops it");
+        assert!(
+            session.iterate(&never, &mut lead).unwrap().is_some(),
+            "nothing stops it"
+        );
         lead.keep(session.checkpoint());
         // A rollout with room for fewer environments than there are.
         session.agent.rollout = session.agent.ppo.rollout(&[7, 1]);
@@ -298,7 +388,8 @@ mod tests {
     fn a_run_that_cannot_begin_leaves_nothing_but_what_is_anothers() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("run");
-        let sets = ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]"].map(|set| set.parse().unwrap());
+        let sets =
+            ["env.num_envs=9", "ppo.horizon=4", "ppo.hidden=[8]"].map(|set| set.parse().unwrap());
         let session = from_scratch(&sets);
         let begin = || {
             let saver = saver_of(&session, RunFolder::create(Some(&path), None).unwrap());
@@ -309,7 +400,11 @@ mod tests {
         begin().give_back();
         assert!(!path.exists());
         let lost = begin();
-        std::process::Command::new("rm").arg("-r").arg(&path).status().unwrap();
+        std::process::Command::new("rm")
+            .arg("-r")
+            .arg(&path)
+            .status()
+            .unwrap();
         let other = begin();
         lost.give_back();
         assert!(path.join("checkpoints/latest.safetensors").exists());

@@ -57,15 +57,38 @@ impl Saver {
         initial: Checkpoint,
         from_newest: bool,
     ) -> Self {
-        let options =
-            format!("{}{}", scene_option(&config.env), if args.dump_diverged { " --dump-diverged" } else { "" });
+        let options = format!(
+            "{}{}",
+            scene_option(&config.env),
+            if args.dump_diverged {
+                " --dump-diverged"
+            } else {
+                ""
+            }
+        );
         // The newest, and one more in case that is damaged.
-        let keep = args.keep.unwrap_or_else(|| folder.checkpoints.count().max(2));
+        let keep = args
+            .keep
+            .unwrap_or_else(|| folder.checkpoints.count().max(2));
         let initial = Arc::new(initial);
         let last = initial.clone();
         let settings = config.to_text();
-        let held = Held { folder, keep, settings, options, last, wrote: false, best: None, best_is_saved: true };
-        let saver = Self { held, lock: Some(lock), initial, from_newest };
+        let held = Held {
+            folder,
+            keep,
+            settings,
+            options,
+            last,
+            wrote: false,
+            best: None,
+            best_is_saved: true,
+        };
+        let saver = Self {
+            held,
+            lock: Some(lock),
+            initial,
+            from_newest,
+        };
         saver.save_before_fatal_errors();
         saver
     }
@@ -100,13 +123,25 @@ impl Saver {
         let best = self.held.folder.checkpoints.best();
         if load::read(&best).is_err_and(|error| load::is_damage(&error)) {
             let aside = self.held.folder.checkpoints.put_best_aside()?;
-            report.progress.warn(&format!("{} is damaged; renamed to {}", best.display(), aside.display()));
+            report.progress.warn(&format!(
+                "{} is damaged; renamed to {}",
+                best.display(),
+                aside.display()
+            ));
         }
         if !self.from_newest || self.held.folder.checkpoints.newest_first().is_empty() {
             write(&self.held.folder, None, &self.initial, self.held.keep)?;
         }
-        let Progress { iteration, env_steps, fork, .. } = &self.initial.progress;
-        report.open_logs(fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration, *env_steps);
+        let Progress {
+            iteration,
+            env_steps,
+            fork,
+            ..
+        } = &self.initial.progress;
+        report.open_logs(
+            fork.as_ref().map_or(0, |fork| fork.iteration)..*iteration,
+            *env_steps,
+        );
         self.describe()?;
         self.held.folder.mark_finished(false);
         self.held.wrote = true;
@@ -132,7 +167,9 @@ impl Saver {
             self.held.last.progress.fork.as_ref().map_or(String::new(), |Fork { from, iteration, env_steps }| {
                 format!("# Forked from {from:?} after {iteration} iterations, {env_steps} env steps.\n\n")
             });
-        self.held.folder.describe(&format!("{fork}{}", self.held.settings), &version())
+        self.held
+            .folder
+            .describe(&format!("{fork}{}", self.held.settings), &version())
     }
 
     /// Writes the logs, the best policy and the checkpoint, each before anything that refers to it.
@@ -155,7 +192,9 @@ impl Saver {
     /// Saves, and prints a warning if that is not possible now.
     pub fn save_or_warn(&mut self, report: &mut Report) {
         if let Err(error) = self.save(report) {
-            report.progress.warn(&format!("{error:#}; saving will be tried again at the next checkpoint"));
+            report.progress.warn(&format!(
+                "{error:#}; saving will be tried again at the next checkpoint"
+            ));
         }
     }
 
@@ -182,7 +221,10 @@ impl Saver {
                 return say!("the run folder was not changed");
             }
             let replaced = || anyhow!("{} has been replaced", held.folder.path.display());
-            let ours = holds.is_some_and(|holds| holds()).then_some(()).ok_or_else(replaced);
+            let ours = holds
+                .is_some_and(|holds| holds())
+                .then_some(())
+                .ok_or_else(replaced);
             match ours.and_then(|()| held.write(&held.folder, held.keep)) {
                 Ok(()) => {
                     let iteration = held.last.progress.iteration;
@@ -198,13 +240,21 @@ impl Saver {
 impl Held {
     /// The progress of the training run as text.
     pub fn steps_made(&self) -> String {
-        format!("{} iterations, {} env steps", self.last.progress.iteration, self.last.progress.env_steps)
+        format!(
+            "{} iterations, {} env steps",
+            self.last.progress.iteration, self.last.progress.env_steps
+        )
     }
 
     /// Writes the best policy, unless that is done, and the checkpoint into a run folder, in which the newest `keep` are kept.
     fn write(&self, folder: &RunFolder, keep: usize) -> Result<()> {
         let unsaved = !self.best_is_saved || !folder.checkpoints.best().exists();
-        write(folder, self.best.as_deref().filter(|_| unsaved), &self.last, keep)
+        write(
+            folder,
+            self.best.as_deref().filter(|_| unsaved),
+            &self.last,
+            keep,
+        )
     }
 
     /// Saves the state elsewhere after it could not be saved in its folder for this `reason`. Returns an error for both.
@@ -232,7 +282,12 @@ impl Held {
 
     /// The command that resumes the run in this folder with the same options.
     pub fn how_to_resume(&self, run: &RunFolder) -> String {
-        format!("{} train --resume {}{}", os::called_as(), os::quoted_path(&run.path), self.options)
+        format!(
+            "{} train --resume {}{}",
+            os::called_as(),
+            os::quoted_path(&run.path),
+            self.options
+        )
     }
 }
 
@@ -240,12 +295,23 @@ impl Held {
 /// of the best checkpoint in the folder. If that is lost, the score of the policy that was made from it counts, else the score
 /// in the resumed checkpoint.
 pub fn best_so_far(folder: &RunFolder, resumed: Option<[f64; 2]>) -> Option<[f64; 2]> {
-    let score = |path: &Path| load::read(path).ok().and_then(|checkpoint| checkpoint.progress.best);
-    score(&folder.checkpoints.best()).or_else(|| score(&folder.policy())).or(resumed)
+    let score = |path: &Path| {
+        load::read(path)
+            .ok()
+            .and_then(|checkpoint| checkpoint.progress.best)
+    };
+    score(&folder.checkpoints.best())
+        .or_else(|| score(&folder.policy()))
+        .or(resumed)
 }
 
 /// Writes the best checkpoint, if there is one to write, and the checkpoint `last` into a run folder.
-fn write(folder: &RunFolder, best: Option<&Checkpoint>, last: &Checkpoint, keep: usize) -> Result<()> {
+fn write(
+    folder: &RunFolder,
+    best: Option<&Checkpoint>,
+    last: &Checkpoint,
+    keep: usize,
+) -> Result<()> {
     let checkpoints = &folder.checkpoints;
     match best {
         Some(best) => {

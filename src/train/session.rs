@@ -51,9 +51,18 @@ impl Session {
         // A new folder is created last, so that a training run that cannot be set up leaves none behind.
         let (place, from_newest) = match existing {
             Some(existing) => existing,
-            None => (RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?, false),
+            None => (
+                RunFolder::create(args.run_dir.as_deref(), args.name.as_deref())?,
+                false,
+            ),
         };
-        let saver = Saver::new(place, args, &session.config, session.checkpoint(), from_newest);
+        let saver = Saver::new(
+            place,
+            args,
+            &session.config,
+            session.checkpoint(),
+            from_newest,
+        );
         Ok((session, saver))
     }
 
@@ -80,8 +89,12 @@ impl Session {
         os::start_threads(threads)?;
         let session = Self::new(plan, loaded, exchange)?;
         let exchange = &session.agent.exchange;
-        let warning = exchange.expect_alike(&session.scene)?.filter(|_| exchange.is_first() && threads == 0);
-        warning.iter().for_each(|warning| say!("warning: {warning}"));
+        let warning = exchange
+            .expect_alike(&session.scene)?
+            .filter(|_| exchange.is_first() && threads == 0);
+        warning
+            .iter()
+            .for_each(|warning| say!("warning: {warning}"));
         Ok(session)
     }
 
@@ -90,18 +103,38 @@ impl Session {
     /// # Errors
     /// Fails if the precision cannot be used, or if it cannot start from what is planned.
     pub fn new(plan: Plan, (task, hand): (Arc<Task>, Record), exchange: Exchange) -> Result<Self> {
-        let Plan { mut config, from, best, context, dumps } = plan;
+        let Plan {
+            mut config,
+            from,
+            best,
+            context,
+            dumps,
+        } = plan;
         let set_up = || {
             // As it is saved.
             config.run.shards = config.shards();
             let agent = Agent::for_task(&task, &config, exchange)?;
-            let mut session =
-                Self { scene: task.scene.fingerprint(), hand, config, task, agent, best, rise: None, dumps };
-            from.map_or(Ok(()), |(takes, checkpoint)| session.start(takes, checkpoint))?;
+            let mut session = Self {
+                scene: task.scene.fingerprint(),
+                hand,
+                config,
+                task,
+                agent,
+                best,
+                rise: None,
+                dumps,
+            };
+            from.map_or(Ok(()), |(takes, checkpoint)| {
+                session.start(takes, checkpoint)
+            })?;
             Ok(session)
         };
         let session = set_up();
-        if let Some(context) = context { session.context(context) } else { session }
+        if let Some(context) = context {
+            session.context(context)
+        } else {
+            session
+        }
     }
 
     /// Starts from the policy or the state in a checkpoint.
@@ -114,13 +147,17 @@ impl Session {
         }
         agent.restore(&mut checkpoint)?;
         if let Takes::Fork = takes {
-            let parent = Settings::new().file(Source::new("the checkpoint", &*checkpoint.config)).resolve()?;
+            let parent = Settings::new()
+                .file(Source::new("the checkpoint", &*checkpoint.config))
+                .resolve()?;
             agent.ppo.reconcile_learning_rate(&parent.ppo);
             return checkpoint.finish();
         }
         self.rise = checkpoint.progress.rise;
         if checkpoint.scene != self.scene && agent.exchange.is_first() {
-            say!("warning: the scene differs from the checkpoint's scene: the resumed run is a different training");
+            say!(
+                "warning: the scene differs from the checkpoint's scene: the resumed run is a different training"
+            );
         }
         checkpoint.finish()
     }
@@ -144,6 +181,7 @@ impl Session {
 
     /// Whether the run ends because evaluations no longer rise.
     pub fn is_flat(&self) -> bool {
-        self.rise.is_some_and(|rise| rise.since >= self.config.run.patience)
+        self.rise
+            .is_some_and(|rise| rise.since >= self.config.run.patience)
     }
 }

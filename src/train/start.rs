@@ -47,7 +47,13 @@ pub enum Takes {
 pub type Existing = ((RunFolder, Locked), bool);
 
 /// The parts of a plan as they are sent: the settings as text, the checkpoint as a file.
-type PlanParts = (String, Option<(Takes, Vec<u8>)>, Option<[f64; 2]>, Option<String>, bool);
+type PlanParts = (
+    String,
+    Option<(Takes, Vec<u8>)>,
+    Option<[f64; 2]>,
+    Option<String>,
+    bool,
+);
 
 impl Plan {
     /// Plans what the command line asks for, in the folder of a run if it exists.
@@ -56,7 +62,9 @@ impl Plan {
     /// Fails as [`Plan::new_run`], [`Plan::resume`] and [`Plan::fork`] do.
     pub fn of(args: &TrainArgs) -> Result<(Self, Option<Existing>)> {
         match (&args.resume, &args.fork) {
-            (Some(place), _) => Self::resume(place.as_deref(), args).map(|(plan, existing)| (plan, Some(existing))),
+            (Some(place), _) => {
+                Self::resume(place.as_deref(), args).map(|(plan, existing)| (plan, Some(existing)))
+            }
             (None, Some(place)) => Self::fork(place, args).map(|plan| (plan, None)),
             (None, None) => Self::new_run(args).map(|plan| (plan, None)),
         }
@@ -69,10 +77,18 @@ impl Plan {
     /// Fails if the scene does not exist.
     pub fn new(mut config: Config, args: &TrainArgs) -> Result<Self> {
         if let Some(model) = config.env.model_file() {
-            let model = model.canonicalize().with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
+            let model = model
+                .canonicalize()
+                .with_context(|| format!("{MODEL}: cannot find {}", model.display()))?;
             config.env.model = model.display().to_string();
         }
-        Ok(Self { config, from: None, best: None, context: None, dumps: args.dump_diverged })
+        Ok(Self {
+            config,
+            from: None,
+            best: None,
+            context: None,
+            dumps: args.dump_diverged,
+        })
     }
 
     /// Plans a new training with the requested settings.
@@ -81,7 +97,9 @@ impl Plan {
     /// Fails if the settings or the initial policy cannot be used.
     fn new_run(args: &TrainArgs) -> Result<Self> {
         let settings = settings(args)?;
-        let Some(place) = &args.init else { return Self::new(settings.resolve()?, args) };
+        let Some(place) = &args.init else {
+            return Self::new(settings.resolve()?, args);
+        };
         let origin = PolicySource::find(place)?;
         let (checkpoint, played) = origin.load_for_any_scene()?;
         let settings = settings.stored(load::source(&checkpoint, place), Reader::NewRun);
@@ -89,7 +107,11 @@ impl Plan {
         expect_net(&checkpoint, &played.ppo, &plan.config.ppo)
             .with_context(|| format!("cannot start from the policy {origin}"))?;
         let context = Some(format!("cannot start from the policy {}", place.display()));
-        Ok(Self { from: Some((Takes::Policy, checkpoint)), context, ..plan })
+        Ok(Self {
+            from: Some((Takes::Policy, checkpoint)),
+            context,
+            ..plan
+        })
     }
 
     /// Plans to resume a training run from the newest undamaged checkpoint of a run, or from the given one. Locks its folder.
@@ -98,7 +120,9 @@ impl Plan {
     /// Fails if a setting is given that cannot be changed, or if the run cannot be resumed.
     fn resume(place: Option<&Path>, args: &TrainArgs) -> Result<(Self, Existing)> {
         let place = place.map(Path::to_owned).or_else(run::newest_run);
-        let place = place.context("--resume: there is no run in runs/shadow-hand-repose; name the folder of a run")?;
+        let place = place.context(
+            "--resume: there is no run in runs/shadow-hand-repose; name the folder of a run",
+        )?;
         let folder = RunFolder::containing(&place)?;
         let checkpoints = &folder.checkpoints;
         ensure!(
@@ -113,7 +137,12 @@ impl Plan {
         let context = format!("cannot resume from {}", path.display());
         let config = load::settings(&checkpoint, &path, Reader::Run, &overrides(args));
         let config = config.with_context(|| context.clone())?;
-        expect_same(&Settings::new().file(load::source(&checkpoint, &path)).resolve()?, &config)?;
+        expect_same(
+            &Settings::new()
+                .file(load::source(&checkpoint, &path))
+                .resolve()?,
+            &config,
+        )?;
         expect_states(&checkpoint, &config).with_context(|| context.clone())?;
         expect_config(&folder, &config)?;
         // The best evaluation comes from the folder. It may have been saved after the checkpoint that is resumed, and a worse
@@ -121,7 +150,12 @@ impl Plan {
         let best = best_so_far(&folder, checkpoint.progress.best);
         let from_newest = os::same_file(&path, &newest[0]);
         let from = Some((Takes::State, checkpoint));
-        let plan = Self { from, best, context: Some(context), ..Self::new(config, args)? };
+        let plan = Self {
+            from,
+            best,
+            context: Some(context),
+            ..Self::new(config, args)?
+        };
         Ok((plan, ((folder, lock), from_newest)))
     }
 
@@ -133,13 +167,19 @@ impl Plan {
     fn fork(place: &Path, args: &TrainArgs) -> Result<Self> {
         if matches!(PolicySource::find(place), Ok(PolicySource::BuiltIn(_))) {
             let name = place.display();
-            bail!("--fork {name}: a built-in policy has no training state; use --init {name} to start from it");
+            bail!(
+                "--fork {name}: a built-in policy has no training state; use --init {name} to start from it"
+            );
         }
         let context = || format!("cannot fork {}", place.display());
-        let (path, checkpoint) = load::newest_sound(|| checkpoints_at(place)).with_context(context)?;
+        let (path, checkpoint) =
+            load::newest_sound(|| checkpoints_at(place)).with_context(context)?;
         let context = format!("cannot fork {}", path.display());
         let plan = Self::forked(&path, checkpoint, args).with_context(|| context.clone())?;
-        Ok(Self { context: Some(context), ..plan })
+        Ok(Self {
+            context: Some(context),
+            ..plan
+        })
     }
 
     fn forked(path: &Path, mut checkpoint: Checkpoint, args: &TrainArgs) -> Result<Self> {
@@ -149,7 +189,11 @@ impl Plan {
         let plan = Self::new(config, args)?;
         let config = &plan.config;
         expect_scene(&parent, config, &checkpoint)?;
-        let from = path.canonicalize().unwrap_or_else(|_| path.to_owned()).display().to_string();
+        let from = path
+            .canonicalize()
+            .unwrap_or_else(|_| path.to_owned())
+            .display()
+            .to_string();
         let progress = &mut checkpoint.progress;
         ensure!(
             progress.env_steps < config.run.total_steps,
@@ -157,10 +201,17 @@ impl Plan {
             config.run.total_steps,
             progress.env_steps
         );
-        progress.fork = Some(Fork { from, iteration: progress.iteration, env_steps: progress.env_steps });
+        progress.fork = Some(Fork {
+            from,
+            iteration: progress.iteration,
+            env_steps: progress.env_steps,
+        });
         // Scores under different settings are not comparable, so the best one is not kept.
         progress.best = None;
-        Ok(Self { from: Some((Takes::Fork, checkpoint)), ..plan })
+        Ok(Self {
+            from: Some((Takes::Fork, checkpoint)),
+            ..plan
+        })
     }
 
     /// Loads the task for the policy of the plan, and takes over what its scene gives. Returns it with the policy's record.
@@ -180,7 +231,11 @@ impl Plan {
             Ok((task.for_policy(&record)?, record))
         };
         let loaded: Result<_> = load();
-        let loaded = if let Some(context) = &self.context { loaded.context(context.clone()) } else { loaded }?;
+        let loaded = if let Some(context) = &self.context {
+            loaded.context(context.clone())
+        } else {
+            loaded
+        }?;
         self.config.env = loaded.0.config.clone();
         Ok(loaded)
     }
@@ -191,10 +246,18 @@ impl Plan {
     /// Fails if a value in the checkpoint is not finite.
     pub fn send(&self, exchange: &Exchange) -> Result<()> {
         if !exchange.is_alone() {
-            let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| checkpoint.to_bytes().map(|bytes| (*takes, bytes));
+            let bytes = |(takes, checkpoint): &(Takes, Checkpoint)| {
+                checkpoint.to_bytes().map(|bytes| (*takes, bytes))
+            };
             let config = self.config.to_text();
             let from = self.from.as_ref().map(bytes).transpose()?;
-            exchange.broadcast::<PlanParts>(Some((config, from, self.best, self.context.clone(), self.dumps)));
+            exchange.broadcast::<PlanParts>(Some((
+                config,
+                from,
+                self.best,
+                self.context.clone(),
+                self.dumps,
+            )));
         }
         Ok(())
     }
@@ -205,9 +268,18 @@ impl Plan {
     /// Fails if the sender runs another version of the program.
     pub fn receive(exchange: &Exchange) -> Result<Self> {
         let (config, from, best, context, dumps) = exchange.broadcast::<PlanParts>(None);
-        let config = Settings::new().file(Source::new("the settings that were sent", config)).resolve()?;
-        let from = from.map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
-        Ok(Self { config, from: from.transpose()?, best, context, dumps })
+        let config = Settings::new()
+            .file(Source::new("the settings that were sent", config))
+            .resolve()?;
+        let from = from
+            .map(|(takes, bytes)| Checkpoint::parse(&bytes).map(|checkpoint| (takes, checkpoint)));
+        Ok(Self {
+            config,
+            from: from.transpose()?,
+            best,
+            context,
+            dumps,
+        })
     }
 }
 
@@ -221,7 +293,9 @@ fn checkpoints_at(place: &Path) -> Result<Vec<PathBuf>> {
 
 /// What the user sets.
 fn settings(args: &TrainArgs) -> Result<Settings> {
-    Ok(Settings::new().user_file(args.settings.config.as_deref())?.sets(&overrides(args)))
+    Ok(Settings::new()
+        .user_file(args.settings.config.as_deref())?
+        .sets(&overrides(args)))
 }
 
 /// The single settings, including settings that have their own options.
@@ -231,8 +305,13 @@ fn overrides(args: &TrainArgs) -> Vec<Override> {
         ("run.threads", args.threads.map(|n| n as u64)),
         ("run.total_steps", args.total_steps),
     ];
-    let given = options.into_iter().filter_map(|(key, value)| Some((key, value?)));
-    let given = given.map(|(key, value)| Override { key: key.into(), value: value.to_string() });
+    let given = options
+        .into_iter()
+        .filter_map(|(key, value)| Some((key, value?)));
+    let given = given.map(|(key, value)| Override {
+        key: key.into(),
+        value: value.to_string(),
+    });
     args.settings.set.iter().cloned().chain(given).collect()
 }
 
@@ -249,19 +328,33 @@ fn expect_same(stored: &Config, config: &Config) -> Result<()> {
 
 /// Checks that the settings in the folder match the checkpoint, because edits to them would be ignored.
 fn expect_config(folder: &RunFolder, config: &Config) -> Result<()> {
-    let Some((path, text)) = folder.config()? else { return Ok(()) };
-    let advice = format!("restore {} or delete it; to change settings, start a new run with --fork", path.display());
+    let Some((path, text)) = folder.config()? else {
+        return Ok(());
+    };
+    let advice = format!(
+        "restore {} or delete it; to change settings, start a new run with --fork",
+        path.display()
+    );
     let source = Source::new(path.clone(), text);
-    let found = Settings::new().file(source).resolve().with_context(|| advice.clone())?;
+    let found = Settings::new()
+        .file(source)
+        .resolve()
+        .with_context(|| advice.clone())?;
     let differing = config.differences(&found);
-    ensure!(differing.is_empty(), "{} differs from the checkpoint: {}\n{advice}", path.display(), differing.join("; "));
+    ensure!(
+        differing.is_empty(),
+        "{} differs from the checkpoint: {}\n{advice}",
+        path.display(),
+        differing.join("; ")
+    );
     Ok(())
 }
 
 /// Checks that a policy with the `stored` settings can begin a training run with these.
 fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig) -> Result<()> {
     load::expect_policy(checkpoint, settings)?;
-    let [found, expected] = [stored, settings].map(|settings| (settings.activation, settings.symmetry));
+    let [found, expected] =
+        [stored, settings].map(|settings| (settings.activation, settings.symmetry));
     ensure!(
         found == expected,
         "its activation and symmetry are {found:?}, but those of this training run are {expected:?}"
@@ -271,10 +364,18 @@ fn expect_net(checkpoint: &Checkpoint, stored: &PpoConfig, settings: &PpoConfig)
 
 /// Checks that a fork keeps the settings that determine the size of the state or the kind of policy.
 fn expect_kept(parent: &Config, config: &Config) -> Result<()> {
-    let kept = ["env.num_envs", "ppo.hidden", "ppo.symmetry", "ppo.activation"];
+    let kept = [
+        "env.num_envs",
+        "ppo.hidden",
+        "ppo.symmetry",
+        "ppo.activation",
+    ];
     for (key, [before, now]) in parent.compared_with(config) {
         let [before, now] = [before, now].map(|value| short(&value));
-        ensure!(!kept.contains(&&*key), "{key} = {now}: a fork keeps {before}, the value of its checkpoint");
+        ensure!(
+            !kept.contains(&&*key),
+            "{key} = {now}: a fork keeps {before}, the value of its checkpoint"
+        );
     }
     Ok(())
 }

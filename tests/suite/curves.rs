@@ -13,8 +13,16 @@ fn expect_xml(path: &Path) {
     let allowed = |c: char| !(c.is_control() && c != '\n' || matches!(c, '\u{fffe}' | '\u{ffff}'));
     assert!(text.chars().all(allowed), "{text}");
     let parse = "import sys, xml.etree.ElementTree as tree\ntree.parse(sys.argv[1])";
-    if let Ok(parsed) = Command::new("python3").args(["-c", parse]).arg(path).output() {
-        assert!(parsed.status.success(), "{}", String::from_utf8_lossy(&parsed.stderr));
+    if let Ok(parsed) = Command::new("python3")
+        .args(["-c", parse])
+        .arg(path)
+        .output()
+    {
+        assert!(
+            parsed.status.success(),
+            "{}",
+            String::from_utf8_lossy(&parsed.stderr)
+        );
     }
 }
 
@@ -22,13 +30,33 @@ fn expect_xml(path: &Path) {
 fn a_picture_is_xml_whatever_the_name_of_the_run() {
     let place = tempfile::tempdir().unwrap();
     let (folder, run) = (place.path(), "a\u{1}\u{9f}\u{ffff}<&>\"]]>");
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", run])));
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", run]),
+    ));
     succeeded(program(folder, &["plot", run, "--out", "curves.svg"]));
-    let play = ["play", "--ckpt", run, "--robustness", "--episodes", "1", "--out", "bars.svg"];
-    succeeded(program(folder, &[&play[..], &["--set", "env.max_episode_seconds=0.05"]].concat()));
+    let play = [
+        "play",
+        "--ckpt",
+        run,
+        "--robustness",
+        "--episodes",
+        "1",
+        "--out",
+        "bars.svg",
+    ];
+    succeeded(program(
+        folder,
+        &[&play[..], &["--set", "env.max_episode_seconds=0.05"]].concat(),
+    ));
     for picture in ["curves.svg", "bars.svg"] {
         expect_xml(&folder.join(picture));
-        assert!(fs::read_to_string(folder.join(picture)).unwrap().contains("a\u{fffd}"), "it shows the name");
+        assert!(
+            fs::read_to_string(folder.join(picture))
+                .unwrap()
+                .contains("a\u{fffd}"),
+            "it shows the name"
+        );
     }
 }
 
@@ -42,9 +70,15 @@ fn by_default_a_tenth_of_the_shortest_run_is_smoothed_and_fifty_iterations_at_mo
     }
     // The numbers of points of the curves. Shorter lines belong to axes and legend.
     let points = |tables: &[&str]| {
-        succeeded(program(place.path(), &[&["plot", "--metric", "loss/value"], tables].concat()));
+        succeeded(program(
+            place.path(),
+            &[&["plot", "--metric", "loss/value"], tables].concat(),
+        ));
         let svg = fs::read_to_string(place.path().join("learning.svg")).unwrap();
-        let lines = svg.lines().filter(|line| line.starts_with("<polyline")).map(|line| line.matches(',').count());
+        let lines = svg
+            .lines()
+            .filter(|line| line.starts_with("<polyline"))
+            .map(|line| line.matches(',').count());
         let mut counts: Vec<usize> = lines.filter(|&points| points > 2).collect();
         counts.sort_unstable();
         counts
@@ -57,12 +91,28 @@ fn by_default_a_tenth_of_the_shortest_run_is_smoothed_and_fifty_iterations_at_mo
 #[test]
 fn a_table_of_another_learner_needs_only_its_steps_and_the_metric() {
     let place = tempfile::tempdir().unwrap();
-    fs::write(place.path().join("ours.csv"), "env_steps,time/collect_s,time/update_s,eval/goals\n1,1,1,0\n2,1,1,1\n")
-        .unwrap();
-    fs::write(place.path().join("theirs.csv"), "env_steps,eval/goals\n1,0\n2,3\n").unwrap();
+    fs::write(
+        place.path().join("ours.csv"),
+        "env_steps,time/collect_s,time/update_s,eval/goals\n1,1,1,0\n2,1,1,1\n",
+    )
+    .unwrap();
+    fs::write(
+        place.path().join("theirs.csv"),
+        "env_steps,eval/goals\n1,0\n2,3\n",
+    )
+    .unwrap();
     let plot = ["plot", "ours.csv", "theirs.csv", "--metric", "eval/goals"];
     let said = stderr(&succeeded(program(place.path(), &plot)));
-    assert!(said.contains(": 2 runs") && !said.contains("warning"), "{said}");
-    let said = stderr(&succeeded(program(place.path(), &[&plot[..], &["--along", "hours"]].concat())));
-    assert!(said.contains("theirs.csv has no column time/collect_s") && said.contains(": 1 run"), "{said}");
+    assert!(
+        said.contains(": 2 runs") && !said.contains("warning"),
+        "{said}"
+    );
+    let said = stderr(&succeeded(program(
+        place.path(),
+        &[&plot[..], &["--along", "hours"]].concat(),
+    )));
+    assert!(
+        said.contains("theirs.csv has no column time/collect_s") && said.contains(": 1 run"),
+        "{said}"
+    );
 }

@@ -11,7 +11,9 @@ use crate::support::{SCENE, program, stderr, succeeded, train};
 fn python() -> Option<OsString> {
     let python = std::env::var_os("SHADOW_REPOSE_PYTHON");
     if python.is_none() {
-        eprintln!("not tested: SHADOW_REPOSE_PYTHON does not name a Python with mujoco, onnx and onnxruntime");
+        eprintln!(
+            "not tested: SHADOW_REPOSE_PYTHON does not name a Python with mujoco, onnx and onnxruntime"
+        );
     }
     python
 }
@@ -25,7 +27,11 @@ pub(crate) fn check_in_python(folder: &Path, args: &[&str]) {
 }
 
 fn runs(python: &OsString, folder: &Path, args: &[&str]) {
-    let output = Command::new(python).args(args).current_dir(folder).output().unwrap();
+    let output = Command::new(python)
+        .args(args)
+        .current_dir(folder)
+        .output()
+        .unwrap();
     let said = String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(&output);
     assert!(output.status.success(), "{args:?}: {said}");
 }
@@ -35,18 +41,58 @@ fn an_exported_policy_sees_and_does_in_python_what_it_does_here() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let other =
-        ["--total-steps", "256", "--run-dir", "run", "--set", "ppo.symmetry=none", "--set", "ppo.activation=tanh"];
+    let other = [
+        "--total-steps",
+        "256",
+        "--run-dir",
+        "run",
+        "--set",
+        "ppo.symmetry=none",
+        "--set",
+        "ppo.activation=tanh",
+    ];
     succeeded(program(folder, &train(&other)));
     let deploy = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/deploy/deploy.py");
     for policy in ["builtin", "run"] {
         succeeded(program(folder, &["export", "--ckpt", policy]));
-        succeeded(program(folder, &["play", "--ckpt", policy, "--json", "--episodes", "2", "--out", "trace.jsonl"]));
-        let check = "import onnx, sys; onnx.checker.check_model(onnx.load(sys.argv[1]), full_check=True)";
+        succeeded(program(
+            folder,
+            &[
+                "play",
+                "--ckpt",
+                policy,
+                "--json",
+                "--episodes",
+                "2",
+                "--out",
+                "trace.jsonl",
+            ],
+        ));
+        let check =
+            "import onnx, sys; onnx.checker.check_model(onnx.load(sys.argv[1]), full_check=True)";
         runs(&python, folder, &["-c", check, "policy.onnx"]);
-        runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--check", "trace.jsonl"]);
+        runs(
+            &python,
+            folder,
+            &[
+                deploy.to_str().unwrap(),
+                "policy.onnx",
+                "--check",
+                "trace.jsonl",
+            ],
+        );
     }
-    runs(&python, folder, &[deploy.to_str().unwrap(), "policy.onnx", "--episodes", "2", "--json"]);
+    runs(
+        &python,
+        folder,
+        &[
+            deploy.to_str().unwrap(),
+            "policy.onnx",
+            "--episodes",
+            "2",
+            "--json",
+        ],
+    );
 }
 
 /// Steps the hand of deploy.py from each state of a trace, and prints how far it then is from the next state. This is the median,
@@ -86,16 +132,43 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
         "env.action_delay=1",
     ];
     let sets: Vec<&str> = varied.iter().flat_map(|set| ["--set", set]).collect();
-    succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
-    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--out", "trace.jsonl"];
+    succeeded(program(
+        folder.path(),
+        &[&["export", "--ckpt", "builtin"], &sets[..]].concat(),
+    ));
+    let play = [
+        "play",
+        "--ckpt",
+        "builtin",
+        "--json",
+        "--episodes",
+        "1",
+        "--out",
+        "trace.jsonl",
+    ];
     succeeded(program(folder.path(), &[&play[..], &sets].concat()));
     runs(&python, folder.path(), &["-c", REPLAY, examples]);
     let check = ["policy.onnx", "--check", "trace.jsonl"];
-    runs(&python, folder.path(), &[&[&format!("{examples}/deploy.py")[..]], &check[..]].concat());
+    runs(
+        &python,
+        folder.path(),
+        &[&[&format!("{examples}/deploy.py")[..]], &check[..]].concat(),
+    );
     // Without one of the settings it is another hand, so the comparison would notice.
-    succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..sets.len() - 4]].concat()));
-    let output = Command::new(&python).args(["-c", REPLAY, examples]).current_dir(folder.path()).output().unwrap();
-    assert!(!output.status.success() && stderr(&output).contains(" off"), "{}", stderr(&output));
+    succeeded(program(
+        folder.path(),
+        &[&["export", "--ckpt", "builtin"], &sets[..sets.len() - 4]].concat(),
+    ));
+    let output = Command::new(&python)
+        .args(["-c", REPLAY, examples])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert!(
+        !output.status.success() && stderr(&output).contains(" off"),
+        "{}",
+        stderr(&output)
+    );
     // What it cannot simulate or compare is refused in words.
     let noisy = ["--set", "env.noise.joint_pos=0.01"];
     succeeded(program(folder.path(), &[&play[..], &noisy].concat()));
@@ -104,7 +177,11 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
         .current_dir(folder.path())
         .output()
         .unwrap();
-    assert!(!output.status.success() && stderr(&output).contains("noise or bias"), "{}", stderr(&output));
+    assert!(
+        !output.status.success() && stderr(&output).contains("noise or bias"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[test]
@@ -122,9 +199,26 @@ fn an_own_object_is_resized_in_python_as_it_is_here() {
         "<inertial pos=\"0 0 0\" mass=\".03\" fullinertia=\"2e-5 1e-5 2e-5 1e-6 0 0\"/><geom type=\"sphere\" size=\".03\"",
     ] {
         std::fs::write(folder.path().join("own.xml"), SCENE.replace(cube, object)).unwrap();
-        let sets = ["--set", "env.model=own.xml", "--set", "env.cube_size_scale=1.2"];
-        succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin"], &sets[..]].concat()));
-        let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--out", "trace.jsonl"];
+        let sets = [
+            "--set",
+            "env.model=own.xml",
+            "--set",
+            "env.cube_size_scale=1.2",
+        ];
+        succeeded(program(
+            folder.path(),
+            &[&["export", "--ckpt", "builtin"], &sets[..]].concat(),
+        ));
+        let play = [
+            "play",
+            "--ckpt",
+            "builtin",
+            "--json",
+            "--episodes",
+            "1",
+            "--out",
+            "trace.jsonl",
+        ];
         succeeded(program(folder.path(), &[&play[..], &sets].concat()));
         runs(&python, folder.path(), &["-c", &replay, examples]);
     }
@@ -154,17 +248,51 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.5"];
-    succeeded(program(folder, &[&play[..], &["--out", "trace.jsonl"]].concat()));
-    succeeded(program(folder, &["export", "--ckpt", "builtin", "--set", "env.max_episode_seconds=0.5"]));
+    let play = [
+        "play",
+        "--ckpt",
+        "builtin",
+        "--json",
+        "--episodes",
+        "1",
+        "--set",
+        "env.max_episode_seconds=0.5",
+    ];
+    succeeded(program(
+        folder,
+        &[&play[..], &["--out", "trace.jsonl"]].concat(),
+    ));
+    succeeded(program(
+        folder,
+        &[
+            "export",
+            "--ckpt",
+            "builtin",
+            "--set",
+            "env.max_episode_seconds=0.5",
+        ],
+    ));
     runs(&python, folder, &["-c", SPOIL]);
     let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
-    runs(&python, folder, &[deploy, "policy.onnx", "--check", "trace.jsonl"]);
+    runs(
+        &python,
+        folder,
+        &[deploy, "policy.onnx", "--check", "trace.jsonl"],
+    );
     let refused = [
-        (["nan.onnx", "--check", "trace.jsonl"], "actions are not finite"),
+        (
+            ["nan.onnx", "--check", "trace.jsonl"],
+            "actions are not finite",
+        ),
         (["nan.onnx", "--episodes", "1"], "actions are not finite"),
-        (["policy.onnx", "--check", "obs"], "obs has a value that is not finite"),
-        (["policy.onnx", "--check", "action"], "action has a value that is not finite"),
+        (
+            ["policy.onnx", "--check", "obs"],
+            "obs has a value that is not finite",
+        ),
+        (
+            ["policy.onnx", "--check", "action"],
+            "action has a value that is not finite",
+        ),
         (["policy.onnx", "--check", "other"], "env.action_delay = 2"),
         (["policy.onnx", "--check", "cut"], "not a complete trace"),
         (["policy.onnx", "--check", "empty"], "not a complete trace"),
@@ -172,9 +300,17 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
         (["trace.jsonl", "--episodes", "1"], "not an ONNX file"),
     ];
     for (args, reason) in refused {
-        let output = Command::new(&python).arg(deploy).args(args).current_dir(folder).output().unwrap();
+        let output = Command::new(&python)
+            .arg(deploy)
+            .args(args)
+            .current_dir(folder)
+            .output()
+            .unwrap();
         let said = stderr(&output);
-        assert!(!output.status.success() && said.contains(reason) && !said.contains("Traceback"), "{args:?}: {said}");
+        assert!(
+            !output.status.success() && said.contains(reason) && !said.contains("Traceback"),
+            "{args:?}: {said}"
+        );
     }
 }
 
@@ -217,30 +353,49 @@ fn the_example_in_python_refuses_garbled_policies_and_traces_in_a_sentence() {
     runs(&python, folder, &["-c", GARBLE]);
     let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
     let said = |args: &[&str]| {
-        let output = Command::new(&python).arg(deploy).args(args).current_dir(folder).output().unwrap();
-        (output.status.success(), String::from_utf8(output.stdout.clone()).unwrap(), stderr(&output))
+        let output = Command::new(&python)
+            .arg(deploy)
+            .args(args)
+            .current_dir(folder)
+            .output()
+            .unwrap();
+        (
+            output.status.success(),
+            String::from_utf8(output.stdout.clone()).unwrap(),
+            stderr(&output),
+        )
     };
-    for policy in ["nan", "inf", "far", "bare", "toml", "empty", "words", "key", "short"] {
+    for policy in [
+        "nan", "inf", "far", "bare", "toml", "empty", "words", "key", "short",
+    ] {
         let file = format!("{policy}.onnx");
         for args in [&["--check", "trace.jsonl"][..], &["--episodes", "1"]] {
             let (success, _, error) = said(&[&[&file[..]], args].concat());
-            let told = error.starts_with(&format!("error: {file}")) && error.trim().lines().count() == 1;
+            let told =
+                error.starts_with(&format!("error: {file}")) && error.trim().lines().count() == 1;
             assert!(!success && told, "{policy} {args:?}: {error}");
         }
     }
     for trace in ["headless", "lacking", "words", "null", "short", "list"] {
         let (success, _, error) = said(&["policy.onnx", "--check", trace]);
-        let told = error.starts_with(&format!("error: {trace} ")) && error.trim().lines().count() == 1;
+        let told =
+            error.starts_with(&format!("error: {trace} ")) && error.trim().lines().count() == 1;
         assert!(!success && told, "{trace}: {error}");
     }
     for args in [["--seed", "-1"], ["--scene", "nowhere.xml"]] {
         let (success, _, error) = said(&[&["policy.onnx"], &args[..]].concat());
-        assert!(!success && error.contains("error: ") && !error.contains("Traceback"), "{args:?}: {error}");
+        assert!(
+            !success && error.contains("error: ") && !error.contains("Traceback"),
+            "{args:?}: {error}"
+        );
     }
     // One episode has no interval.
     let (success, json, error) = said(&["policy.onnx", "--episodes", "1", "--json"]);
     let score: serde_json::Value = serde_json::from_str(&json).unwrap();
-    assert!(success && score["goals_ci95"] == serde_json::json!([null, null]), "{json}{error}");
+    assert!(
+        success && score["goals_ci95"] == serde_json::json!([null, null]),
+        "{json}{error}"
+    );
     assert!(!said(&["policy.onnx", "--episodes", "1"]).1.contains("nan"));
 }
 
@@ -248,12 +403,19 @@ fn the_example_in_python_refuses_garbled_policies_and_traces_in_a_sentence() {
 fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_know() {
     let folder = tempfile::tempdir().unwrap();
     let export = |out: &str, more: &[&str]| {
-        succeeded(program(folder.path(), &[&["export", "--ckpt", "builtin", "--out", out], more].concat()));
+        succeeded(program(
+            folder.path(),
+            &[&["export", "--ckpt", "builtin", "--out", out], more].concat(),
+        ));
         fs::read(folder.path().join(out)).unwrap()
     };
     let first = export("first.onnx", &[]);
     assert_eq!(first, export("second.onnx", &[]));
-    let holds = |bytes: &[u8], text: &str| bytes.windows(text.len()).any(|window| window == text.as_bytes());
+    let holds = |bytes: &[u8], text: &str| {
+        bytes
+            .windows(text.len())
+            .any(|window| window == text.as_bytes())
+    };
     for text in [
         "rh_A_THJ5,rh_A_THJ4,",
         "joint_pos,joint_vel,cube_pos",
@@ -263,7 +425,9 @@ fn a_policy_is_exported_as_the_same_bytes_each_time_with_what_a_program_must_kno
         assert!(holds(&first, text), "{text}");
     }
     let other = export("third.onnx", &["--set", "env.max_episode_seconds=3"]);
-    assert!(holds(&other, "max_episode_seconds = 3.0") && !holds(&other, "max_episode_seconds = 10.0"));
+    assert!(
+        holds(&other, "max_episode_seconds = 3.0") && !holds(&other, "max_episode_seconds = 10.0")
+    );
 }
 
 #[test]
@@ -273,14 +437,28 @@ fn what_cannot_be_exported_is_named_and_nothing_is_written() {
     for (args, named) in [
         (&["--ckpt", "noise"][..], "cannot use noise"),
         (&["--ckpt", "nowhere"], "nowhere"),
-        (&["--ckpt", "builtin", "--set", "ppo.gamma=0.5"], "`export` does not use ppo.gamma"),
-        (&["--ckpt", "builtin", "--set", "env.model=none.xml"], "none.xml"),
+        (
+            &["--ckpt", "builtin", "--set", "ppo.gamma=0.5"],
+            "`export` does not use ppo.gamma",
+        ),
+        (
+            &["--ckpt", "builtin", "--set", "env.model=none.xml"],
+            "none.xml",
+        ),
         (&["--ckpt", "builtin", "--out", "none/policy.onnx"], "mkdir"),
     ] {
         let output = program(folder.path(), &[&["export"], args].concat());
         assert_eq!(output.status.code(), Some(1), "{args:?}");
         let said = stderr(&output);
-        assert!(said.contains(named) && said.lines().filter(|line| line.starts_with("error")).count() == 1, "{said}");
+        assert!(
+            said.contains(named)
+                && said
+                    .lines()
+                    .filter(|line| line.starts_with("error"))
+                    .count()
+                    == 1,
+            "{said}"
+        );
     }
     assert_eq!(crate::support::names(folder.path()), ["noise"]);
 }

@@ -19,9 +19,19 @@ fn write_script(path: &Path, text: &str) {
 /// Draws a picture, for which the meshes are fetched, and returns what the program says. What the folder and the variables contain
 /// is hostile.
 fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) -> String {
-    let args = ["view", "--out", "hand.png", "--size", "64x64", "--quality", "fast"];
+    let args = [
+        "view",
+        "--out",
+        "hand.png",
+        "--size",
+        "64x64",
+        "--quality",
+        "fast",
+    ];
     let mut command = command(folder, &args);
-    command.env("XDG_CACHE_HOME", cache).envs(variables.iter().copied());
+    command
+        .env("XDG_CACHE_HOME", cache)
+        .envs(variables.iter().copied());
     stderr(&command.output().unwrap())
 }
 
@@ -29,17 +39,38 @@ fn draw(folder: &Path, cache: &Path, variables: &[(&str, &str)]) -> String {
 fn no_file_in_the_users_folder_or_on_the_users_path_of_modules_is_executed() {
     let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let folder = place.path();
-    for module in ["pip", "zipfile", "typing", "random", "sitecustomize", "usercustomize"] {
-        fs::write(folder.join(format!("{module}.py")), "open('/proc/self/cwd/PWNED', 'w')\nraise SystemExit(0)\n")
-            .unwrap();
+    for module in [
+        "pip",
+        "zipfile",
+        "typing",
+        "random",
+        "sitecustomize",
+        "usercustomize",
+    ] {
+        fs::write(
+            folder.join(format!("{module}.py")),
+            "open('/proc/self/cwd/PWNED', 'w')\nraise SystemExit(0)\n",
+        )
+        .unwrap();
     }
     let before = names(folder);
     let here = folder.to_str().unwrap();
     // Nothing is fetched from an index where nobody listens.
     let nowhere = ("PIP_INDEX_URL", "http://127.0.0.1:9/simple");
     let startup = folder.join("pip.py");
-    draw(folder, cache.path(), &[nowhere, ("PYTHONPATH", here), ("PYTHONSTARTUP", startup.to_str().unwrap())]);
-    let made: Vec<String> = names(folder).into_iter().filter(|name| !before.contains(name)).collect();
+    draw(
+        folder,
+        cache.path(),
+        &[
+            nowhere,
+            ("PYTHONPATH", here),
+            ("PYTHONSTARTUP", startup.to_str().unwrap()),
+        ],
+    );
+    let made: Vec<String> = names(folder)
+        .into_iter()
+        .filter(|name| !before.contains(name))
+        .collect();
     assert!(made.iter().all(|name| name == "hand.png"), "{made:?}");
 }
 
@@ -47,7 +78,9 @@ fn no_file_in_the_users_folder_or_on_the_users_path_of_modules_is_executed() {
 fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
     let place = tempfile::tempdir().unwrap();
     let [folder, bin, cache] = ["user", "bin", "cache"].map(|name| place.path().join(name));
-    [&folder, &bin, &cache].iter().for_each(|path| fs::create_dir(path).unwrap());
+    [&folder, &bin, &cache]
+        .iter()
+        .for_each(|path| fs::create_dir(path).unwrap());
     // A python3 that writes down how it was called, and answers as pip does.
     let (python, log) = (bin.join("python3"), place.path().join("log"));
     let script = format!(
@@ -80,21 +113,40 @@ fn python_is_isolated_and_pip_is_told_only_where_packages_come_from() {
     draw(&folder, &cache, &[&kept[..], &dropped].concat());
     let log = fs::read_to_string(&log).unwrap();
     let runs: Vec<&str> = log.split("RUN ").skip(1).collect();
-    let [list, download] = runs[..] else { panic!("{log}") };
+    let [list, download] = runs[..] else {
+        panic!("{log}")
+    };
     for run in [list, download] {
         assert!(run.starts_with("-I -m pip "), "{run}");
-        let place = run.lines().find_map(|line| line.strip_prefix("IN ")).unwrap();
-        assert!(Path::new(place).starts_with(cache.canonicalize().unwrap()), "{run}");
-        assert!(dropped.iter().all(|(name, _)| !run.contains(&format!("{name}="))), "{run}");
+        let place = run
+            .lines()
+            .find_map(|line| line.strip_prefix("IN "))
+            .unwrap();
+        assert!(
+            Path::new(place).starts_with(cache.canonicalize().unwrap()),
+            "{run}"
+        );
+        assert!(
+            dropped
+                .iter()
+                .all(|(name, _)| !run.contains(&format!("{name}="))),
+            "{run}"
+        );
     }
     let conf = folder.join("pip.conf");
-    assert!(list.contains(&format!("PIP_CONFIG_FILE={}\n", conf.display())), "{list}");
+    assert!(
+        list.contains(&format!("PIP_CONFIG_FILE={}\n", conf.display())),
+        "{list}"
+    );
     let told = [
         "CONFIG_FILE=/dev/null",
         "INDEX_URL=http://index",
         "EXTRA_INDEX_URL=http://a http://b",
         "NO_INDEX=1",
-        &format!("FIND_LINKS={} http://links", folder.join("wheels").display()),
+        &format!(
+            "FIND_LINKS={} http://links",
+            folder.join("wheels").display()
+        ),
         &format!("CERT={}", folder.join("ca.pem").display()),
         "PROXY=http://proxy",
     ];
@@ -108,26 +160,52 @@ fn damaged_meshes_are_fetched_again_and_where_that_fails_the_folder_to_delete_is
     let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let meshes = cache.path().join("shadow-repose/shadow-hand-meshes");
     fs::create_dir_all(&meshes).unwrap();
-    mesh_files().into_iter().for_each(|name| fs::write(meshes.join(name), "v nan nan nan").unwrap());
+    mesh_files()
+        .into_iter()
+        .for_each(|name| fs::write(meshes.join(name), "v nan nan nan").unwrap());
     // Without a program named python3 nothing can be fetched.
-    let said = draw(place.path(), cache.path(), &[("PATH", place.path().to_str().unwrap())]);
-    assert!(said.contains("fetching the meshes") && said.contains("python3 could not be started"), "{said}");
-    let advice = format!("the meshes in {} are damaged; deleting this folder may help", meshes.display());
+    let said = draw(
+        place.path(),
+        cache.path(),
+        &[("PATH", place.path().to_str().unwrap())],
+    );
+    assert!(
+        said.contains("fetching the meshes") && said.contains("python3 could not be started"),
+        "{said}"
+    );
+    let advice = format!(
+        "the meshes in {} are damaged; deleting this folder may help",
+        meshes.display()
+    );
     assert!(said.contains(&advice), "{said}");
 }
 
 #[test]
 fn what_python_says_is_cut_and_where_it_says_nothing_its_status_is_told() {
     let (place, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let path = format!("{}:{}", place.path().display(), std::env::var("PATH").unwrap());
+    let path = format!(
+        "{}:{}",
+        place.path().display(),
+        std::env::var("PATH").unwrap()
+    );
     for (script, told) in [
-        ("head -c 1000000 /dev/zero | tr '\\0' x >&2; exit 1", "python3 failed: xxx"),
-        ("for i in 1 2 3; do head -c 100000 /dev/zero | tr '\\0' $i >&2; echo >&2; done; exit 1", " / 333"),
+        (
+            "head -c 1000000 /dev/zero | tr '\\0' x >&2; exit 1",
+            "python3 failed: xxx",
+        ),
+        (
+            "for i in 1 2 3; do head -c 100000 /dev/zero | tr '\\0' $i >&2; echo >&2; done; exit 1",
+            " / 333",
+        ),
         ("exit 3", "python3 failed: exit status: 3"),
     ] {
         write_script(&place.path().join("python3"), script);
         let said = draw(place.path(), cache.path(), &[("PATH", &path)]);
-        assert!(said.len() < 1500 && said.contains(told), "{script}: {} bytes", said.len());
+        assert!(
+            said.len() < 1500 && said.contains(told),
+            "{script}: {} bytes",
+            said.len()
+        );
     }
 }
 
@@ -139,18 +217,43 @@ fn a_signal_ends_python_without_executing_a_file_named_kill() {
     fs::create_dir(folder.join("bin")).unwrap();
     write_script(
         &folder.join("bin/python3"),
-        &format!("echo $$ > '{0}.new'; mv '{0}.new' '{0}'; exec sleep 100", log.display()),
+        &format!(
+            "echo $$ > '{0}.new'; mv '{0}.new' '{0}'; exec sleep 100",
+            log.display()
+        ),
     );
-    let path = format!(".:{}:{}", folder.join("bin").display(), std::env::var("PATH").unwrap());
-    let args = ["view", "--out", "hand.png", "--size", "64x64", "--quality", "fast"];
-    let mut child = command(folder, &args).env("XDG_CACHE_HOME", cache.path()).env("PATH", path).spawn().unwrap();
+    let path = format!(
+        ".:{}:{}",
+        folder.join("bin").display(),
+        std::env::var("PATH").unwrap()
+    );
+    let args = [
+        "view",
+        "--out",
+        "hand.png",
+        "--size",
+        "64x64",
+        "--quality",
+        "fast",
+    ];
+    let mut child = command(folder, &args)
+        .env("XDG_CACHE_HOME", cache.path())
+        .env("PATH", path)
+        .spawn()
+        .unwrap();
     let begun = Instant::now();
     let within = |time: u64| begun.elapsed() < Duration::from_secs(time);
     while !log.exists() && within(60) {
         std::thread::sleep(Duration::from_millis(5));
     }
     let id = fs::read_to_string(&log).unwrap();
-    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    assert!(
+        Command::new("kill")
+            .arg(child.id().to_string())
+            .status()
+            .unwrap()
+            .success()
+    );
     assert!(!child.wait().unwrap().success());
     // Dead, or waiting for whoever adopted it to notice.
     let status = || fs::read_to_string(format!("/proc/{}/status", id.trim())).unwrap_or_default();

@@ -23,18 +23,27 @@ fn refused(edits: &[(&str, &str)], part: &str) {
     let path = folder.path().join("own.xml");
     fs::write(&path, edited(edits)).unwrap();
     let model = format!("env.model={}", path.display());
-    let message = Task::new(&config(&[&model])).err().map(|error| format!("{error:#}"));
-    assert!(message.as_ref().is_some_and(|message| message.contains(part)), "{part}: {message:?}");
+    let message = Task::new(&config(&[&model]))
+        .err()
+        .map(|error| format!("{error:#}"));
+    assert!(
+        message
+            .as_ref()
+            .is_some_and(|message| message.contains(part)),
+        "{part}: {message:?}"
+    );
 }
 
 const SERVO: &str = "<position name=\"rh_A_FFJ3\" class=\"hand\" joint=\"rh_FFJ3\"/>";
 
 #[test]
 fn a_height_that_is_no_number_is_named() {
-    let field =
-        "<asset><hfield name=\"hills\" nrow=\"3\" ncol=\"3\" size=\"1 1 .1 .1\" elevation=\"0 0 0 0 nan 0 0 0 1\"/>";
+    let field = "<asset><hfield name=\"hills\" nrow=\"3\" ncol=\"3\" size=\"1 1 .1 .1\" elevation=\"0 0 0 0 nan 0 0 0 1\"/>";
     let geom = "<worldbody><geom type=\"hfield\" hfield=\"hills\" pos=\"0 0 -1\"/>";
-    refused(&[("<asset>", field), ("<worldbody>", geom)], "hfield_data of hfield `hills` is not a finite number");
+    refused(
+        &[("<asset>", field), ("<worldbody>", geom)],
+        "hfield_data of hfield `hills` is not a finite number",
+    );
 }
 
 #[test]
@@ -47,15 +56,24 @@ fn a_servo_with_a_constant_force_is_none() {
 
 #[test]
 fn servos_and_contacts_that_the_scene_disables_are_named() {
-    let disabled = ("<flag island=\"disable\"/>", "<flag island=\"disable\" actuation=\"disable\"/>");
+    let disabled = (
+        "<flag island=\"disable\"/>",
+        "<flag island=\"disable\" actuation=\"disable\"/>",
+    );
     refused(&[disabled], "actuation must not be disabled");
     for flag in ["contact", "constraint"] {
         let to = format!("<flag island=\"disable\" {flag}=\"disable\"/>");
-        refused(&[("<flag island=\"disable\"/>", &to)], &format!("{flag} must not be disabled"));
+        refused(
+            &[("<flag island=\"disable\"/>", &to)],
+            &format!("{flag} must not be disabled"),
+        );
     }
     let grouped = SERVO.replace("/>", " group=\"4\"/>");
     let option = ("<option ", "<option actuatorgroupdisable=\"4\" ");
-    refused(&[(SERVO, &grouped), option], "`rh_A_FFJ3` must not be disabled by its group 4");
+    refused(
+        &[(SERVO, &grouped), option],
+        "`rh_A_FFJ3` must not be disabled by its group 4",
+    );
 }
 
 #[test]
@@ -75,16 +93,29 @@ fn the_fingerprint_sees_servos_pairs_and_limits_and_that_of_the_builtin_scene_st
         let own = SERVO.replace("/>", &format!(" {servo}/>"));
         assert_ne!(print(&[(SERVO, &own)]), builtin, "{servo}");
     }
-    for limit in ["solreflimit=\".05 1\"", "solimplimit=\".8 .9 .001\"", "margin=\".1\""] {
+    for limit in [
+        "solreflimit=\".05 1\"",
+        "solimplimit=\".8 .9 .001\"",
+        "margin=\".1\"",
+    ] {
         let tendon = format!("<fixed name=\"rh_FFJ0\" limited=\"true\" range=\"0 3\" {limit}>");
         let usual = "<fixed name=\"rh_FFJ0\" limited=\"true\" range=\"0 3\">";
         let from = "<fixed name=\"rh_FFJ0\">";
-        assert_ne!(print(&[(from, &tendon)]), print(&[(from, usual)]), "{limit}");
+        assert_ne!(
+            print(&[(from, &tendon)]),
+            print(&[(from, usual)]),
+            "{limit}"
+        );
     }
     let ball = |size: &str| {
-        format!("<worldbody><geom name=\"ball\" type=\"sphere\" size=\"{size}\" contype=\"0\" conaffinity=\"0\"/>")
+        format!(
+            "<worldbody><geom name=\"ball\" type=\"sphere\" size=\"{size}\" contype=\"0\" conaffinity=\"0\"/>"
+        )
     };
-    let pair = ("</worldbody>", "</worldbody><contact><pair geom1=\"ball\" geom2=\"cube\"/></contact>");
+    let pair = (
+        "</worldbody>",
+        "</worldbody><contact><pair geom1=\"ball\" geom2=\"cube\"/></contact>",
+    );
     let with = |size: &str, paired: bool| {
         let ball = ball(size);
         let edits = [("<worldbody>", &ball[..]), pair];

@@ -30,23 +30,40 @@ struct Mpi {
 
 /// Returns the launcher and program that CI has prepared.
 fn mpi() -> Option<Mpi> {
-    let [launcher, program] = ["SHADOW_REPOSE_MPIRUN", "SHADOW_REPOSE_MPI_PROGRAM"].map(std::env::var_os);
+    let [launcher, program] =
+        ["SHADOW_REPOSE_MPIRUN", "SHADOW_REPOSE_MPI_PROGRAM"].map(std::env::var_os);
     if launcher.is_none() || program.is_none() {
         eprintln!(
             "not tested: SHADOW_REPOSE_MPIRUN and SHADOW_REPOSE_MPI_PROGRAM do not name an mpirun and a program with MPI"
         );
     }
-    Some(Mpi { launcher: launcher?, program: program? })
+    Some(Mpi {
+        launcher: launcher?,
+        program: program?,
+    })
 }
 
 impl Mpi {
     /// Returns the command that runs the program on this number of ranks in `folder`.
     fn command(&self, folder: &Path, ranks: usize, args: &[&str]) -> Command {
         let mut command = Command::new(&self.launcher);
-        command.current_dir(folder).env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY").env_remove("CARGO_PKG_NAME");
+        command
+            .current_dir(folder)
+            .env_remove("DISPLAY")
+            .env_remove("WAYLAND_DISPLAY")
+            .env_remove("CARGO_PKG_NAME");
         // More ranks than cores, and CI runs as root.
-        command.env("OMPI_ALLOW_RUN_AS_ROOT", "1").env("OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "1");
-        command.args(["--map-by", ":OVERSUBSCRIBE", "--bind-to", "none", "-n", &ranks.to_string()]);
+        command
+            .env("OMPI_ALLOW_RUN_AS_ROOT", "1")
+            .env("OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "1");
+        command.args([
+            "--map-by",
+            ":OVERSUBSCRIBE",
+            "--bind-to",
+            "none",
+            "-n",
+            &ranks.to_string(),
+        ]);
         command.arg(&self.program).args(args);
         command
     }
@@ -68,30 +85,59 @@ fn training<'a>(more: &[&'a str]) -> Vec<&'a str> {
 fn several_ranks_come_to_the_bits_of_one_and_resume_on_another_number() {
     let Some(mpi) = mpi() else { return };
     let alone = tempfile::tempdir().unwrap();
-    succeeded(program(alone.path(), &training(&["--total-steps", &steps(20)])));
+    succeeded(program(
+        alone.path(),
+        &training(&["--total-steps", &steps(20)]),
+    ));
     let expected = result(alone.path(), "run");
     for ranks in [2, 4] {
         let folder = tempfile::tempdir().unwrap();
-        let said = stderr(&succeeded(mpi.run(folder.path(), ranks, &training(&["--total-steps", &steps(20)]))));
+        let said = stderr(&succeeded(mpi.run(
+            folder.path(),
+            ranks,
+            &training(&["--total-steps", &steps(20)]),
+        )));
         assert!(result(folder.path(), "run") == expected, "on {ranks} ranks");
         // The others are silent.
-        assert!(said.matches("finished: 20 iterations").count() == 1 && !said.contains("rank "), "{said}");
-        let again = mpi.run(folder.path(), ranks, &["train", "--resume", "run", "--total-steps", &steps(20)]);
-        assert!(stderr(&succeeded(again)).contains("is finished: 20 iterations"), "all of them end");
+        assert!(
+            said.matches("finished: 20 iterations").count() == 1 && !said.contains("rank "),
+            "{said}"
+        );
+        let again = mpi.run(
+            folder.path(),
+            ranks,
+            &["train", "--resume", "run", "--total-steps", &steps(20)],
+        );
+        assert!(
+            stderr(&succeeded(again)).contains("is finished: 20 iterations"),
+            "all of them end"
+        );
     }
     for [first, second] in [[4, 1], [1, 4]] {
         let folder = tempfile::tempdir().unwrap();
-        succeeded(mpi.run(folder.path(), first, &training(&["--total-steps", &steps(10)])));
+        succeeded(mpi.run(
+            folder.path(),
+            first,
+            &training(&["--total-steps", &steps(10)]),
+        ));
         let more = ["train", "--resume", "run", "--total-steps", &steps(20)];
         succeeded(mpi.run(folder.path(), second, &more));
-        assert!(result(folder.path(), "run") == expected, "on {first}, then on {second} ranks");
+        assert!(
+            result(folder.path(), "run") == expected,
+            "on {first}, then on {second} ranks"
+        );
     }
 }
 
 #[test]
 fn evaluations_that_no_longer_rise_end_all_ranks_after_the_same_iteration() {
     let Some(mpi) = mpi() else { return };
-    let waits = ["--total-steps", &steps(200), "--set=run.patience=1", "--set=run.eval_every=2"];
+    let waits = [
+        "--total-steps",
+        &steps(200),
+        "--set=run.patience=1",
+        "--set=run.eval_every=2",
+    ];
     let [alone, together] = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     succeeded(program(alone.path(), &training(&waits)));
     let said = stderr(&succeeded(mpi.run(together.path(), 2, &training(&waits))));
@@ -103,22 +149,43 @@ fn evaluations_that_no_longer_rise_end_all_ranks_after_the_same_iteration() {
 fn if_a_rank_is_killed_all_end_at_once_and_the_run_resumes() {
     let Some(mpi) = mpi() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let (mut launcher, _lines) = begun(mpi.command(folder.path(), 2, &training(&["--total-steps", "100000000"])));
+    let (mut launcher, _lines) =
+        begun(mpi.command(folder.path(), 2, &training(&["--total-steps", "100000000"])));
     while iterations(folder.path()) < 5 {
         std::thread::sleep(Duration::from_millis(50));
     }
-    let ranks = Command::new("pgrep").args(["--parent", &launcher.id().to_string()]).output().unwrap().stdout;
+    let ranks = Command::new("pgrep")
+        .args(["--parent", &launcher.id().to_string()])
+        .output()
+        .unwrap()
+        .stdout;
     let ranks = String::from_utf8(ranks).unwrap();
-    let killed = ranks.lines().last().expect("the launcher has started ranks");
+    let killed = ranks
+        .lines()
+        .last()
+        .expect("the launcher has started ranks");
     let since = Instant::now();
-    assert!(Command::new("kill").args(["-KILL", killed]).status().unwrap().success());
+    assert!(
+        Command::new("kill")
+            .args(["-KILL", killed])
+            .status()
+            .unwrap()
+            .success()
+    );
     assert!(!launcher.wait().unwrap().success());
-    assert!(since.elapsed() < Duration::from_secs(10), "it took {:?}", since.elapsed());
+    assert!(
+        since.elapsed() < Duration::from_secs(10),
+        "it took {:?}",
+        since.elapsed()
+    );
     // One process continues where both were, and comes to the same end.
     let total = steps(iterations(folder.path()) as usize + 10);
     succeeded(resume(folder.path(), &["--total-steps", &total]));
     let undisturbed = tempfile::tempdir().unwrap();
-    succeeded(program(undisturbed.path(), &training(&["--total-steps", &total])));
+    succeeded(program(
+        undisturbed.path(),
+        &training(&["--total-steps", &total]),
+    ));
     assert!(result(folder.path(), "run") == result(undisturbed.path(), "run"));
 }
 
@@ -126,26 +193,49 @@ fn if_a_rank_is_killed_all_end_at_once_and_the_run_resumes() {
 fn an_error_of_one_rank_names_it_and_ends_all() {
     let Some(mpi) = mpi() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let refused = mpi.run(folder.path(), 2, &["train", "--set", "env.model=nowhere.xml"]);
+    let refused = mpi.run(
+        folder.path(),
+        2,
+        &["train", "--set", "env.model=nowhere.xml"],
+    );
     let said = stderr(&refused);
-    assert!(!refused.status.success() && said.matches("cannot find nowhere.xml").count() == 1, "{said}");
+    assert!(
+        !refused.status.success() && said.matches("cannot find nowhere.xml").count() == 1,
+        "{said}"
+    );
     let refused = mpi.run(folder.path(), 4, &training(&["--set", "run.shards=2"]));
     let said = stderr(&refused);
     assert!(
-        !refused.status.success() && said.matches("4 ranks, but the training run has only 2 shards").count() == 1,
+        !refused.status.success()
+            && said
+                .matches("4 ranks, but the training run has only 2 shards")
+                .count()
+                == 1,
         "{said}"
     );
-    assert!(!folder.path().join("run").exists(), "a start that is refused leaves nothing");
+    assert!(
+        !folder.path().join("run").exists(),
+        "a start that is refused leaves nothing"
+    );
     // A rank that runs another program than the first.
     let copy = folder.path().join("other");
     fs::copy(&mpi.program, &copy).unwrap();
-    fs::OpenOptions::new().append(true).open(&copy).unwrap().write_all(b"changed").unwrap();
+    fs::OpenOptions::new()
+        .append(true)
+        .open(&copy)
+        .unwrap()
+        .write_all(b"changed")
+        .unwrap();
     let mut mixed = mpi.command(folder.path(), 1, &training(&[]));
     mixed.args([":", "-n", "1"]).arg(&copy).args(training(&[]));
     let refused = mixed.output().unwrap();
     let said = stderr(&refused);
     assert!(
-        !refused.status.success() && said.matches("rank 1 runs another program than rank 0").count() == 1,
+        !refused.status.success()
+            && said
+                .matches("rank 1 runs another program than rank 0")
+                .count()
+                == 1,
         "{said}"
     );
     assert!(!folder.path().join("run").exists());
@@ -154,7 +244,11 @@ fn an_error_of_one_rank_names_it_and_ends_all() {
 #[test]
 fn a_file_named_stop_ends_a_training_after_it_has_saved() {
     let folder = tempfile::tempdir().unwrap();
-    let endless = training(&["--total-steps", "100000000", "--set=run.checkpoint_every=1000000"]);
+    let endless = training(&[
+        "--total-steps",
+        "100000000",
+        "--set=run.checkpoint_every=1000000",
+    ]);
     let mut commands = vec![command(folder.path(), &endless)];
     commands.extend(mpi().map(|mpi| mpi.command(folder.path(), 2, &["train", "--resume", "run"])));
     for start in commands {
@@ -162,12 +256,23 @@ fn a_file_named_stop_ends_a_training_after_it_has_saved() {
         fs::write(folder.path().join("run/stop"), "").unwrap();
         let said: Vec<String> = lines.map_while(Result::ok).collect();
         assert!(child.wait().unwrap().success(), "{said:?}");
-        assert!(said.iter().any(|line| line.contains("stopped by the file `stop` after")), "{said:?}");
+        assert!(
+            said.iter()
+                .any(|line| line.contains("stopped by the file `stop` after")),
+            "{said:?}"
+        );
         assert!(!folder.path().join("run/stop").exists());
     }
     let saved = iterations(folder.path());
-    let resumed = succeeded(resume(folder.path(), &["--total-steps", &(128 * (saved + 1)).to_string()]));
-    assert!(stderr(&resumed).contains(&format!("finished: {} iterations", saved + 1)), "{}", stderr(&resumed));
+    let resumed = succeeded(resume(
+        folder.path(),
+        &["--total-steps", &(128 * (saved + 1)).to_string()],
+    ));
+    assert!(
+        stderr(&resumed).contains(&format!("finished: {} iterations", saved + 1)),
+        "{}",
+        stderr(&resumed)
+    );
 }
 
 #[test]
@@ -175,7 +280,11 @@ fn ranks_that_cannot_find_one_another_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let in_launcher = |args: &[&str], rank: &str| {
         let mut command = command(folder.path(), args);
-        command.env("PMI_SIZE", "2").env("PMI_RANK", rank).output().unwrap()
+        command
+            .env("PMI_SIZE", "2")
+            .env("PMI_RANK", rank)
+            .output()
+            .unwrap()
     };
     let refused = in_launcher(&training(&[]), "0");
     assert!(
@@ -184,11 +293,22 @@ fn ranks_that_cannot_find_one_another_are_refused() {
         stderr(&refused)
     );
     assert!(!folder.path().join("run").exists());
-    for command in [&["play", "--ckpt", "builtin"][..], &["plot", "."], &["bench"]] {
+    for command in [
+        &["play", "--ckpt", "builtin"][..],
+        &["plot", "."],
+        &["bench"],
+    ] {
         let refused = in_launcher(command, "0");
-        assert!(refused.status.code() == Some(1) && stderr(&refused).contains("only `train` runs on several ranks"));
+        assert!(
+            refused.status.code() == Some(1)
+                && stderr(&refused).contains("only `train` runs on several ranks")
+        );
         let other = in_launcher(command, "1");
-        assert_eq!((other.status.code(), stderr(&other)), (Some(1), String::new()), "one of them says it");
+        assert_eq!(
+            (other.status.code(), stderr(&other)),
+            (Some(1), String::new()),
+            "one of them says it"
+        );
     }
 }
 
@@ -196,13 +316,25 @@ fn ranks_that_cannot_find_one_another_are_refused() {
 fn a_signal_to_save_reaches_all_ranks() {
     let Some(mpi) = mpi() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let rare = ["--total-steps", "100000000", "--set=run.checkpoint_every=1000000"];
+    let rare = [
+        "--total-steps",
+        "100000000",
+        "--set=run.checkpoint_every=1000000",
+    ];
     let (child, lines) = begun(mpi.command(folder.path(), 2, &training(&rare)));
     crate::survival::send("USR1", &child);
     let checkpoints = folder.path().join("run/checkpoints");
     let since = Instant::now();
-    while crate::support::names(&checkpoints).iter().filter(|name| name.starts_with("iteration-")).count() < 2 {
-        assert!(since.elapsed() < Duration::from_secs(60), "nothing was saved");
+    while crate::support::names(&checkpoints)
+        .iter()
+        .filter(|name| name.starts_with("iteration-"))
+        .count()
+        < 2
+    {
+        assert!(
+            since.elapsed() < Duration::from_secs(60),
+            "nothing was saved"
+        );
         std::thread::sleep(Duration::from_millis(50));
     }
     let (code, _) = ended_by("TERM", child, lines);

@@ -15,18 +15,26 @@ const THREE_FINGERS: &str = include_str!("three_fingers.xml");
 
 /// The built-in scene in the mirror, the plane y = 0, with the names of a left hand.
 fn left_scene() -> String {
-    let signs =
-        [("pos=\"", [1.0, -1.0, 1.0, 1.0]), ("quat=\"", [1.0, -1.0, 1.0, -1.0]), ("axis=\"", [-1.0, 1.0, -1.0, 1.0])];
+    let signs = [
+        ("pos=\"", [1.0, -1.0, 1.0, 1.0]),
+        ("quat=\"", [1.0, -1.0, 1.0, -1.0]),
+        ("axis=\"", [-1.0, 1.0, -1.0, 1.0]),
+    ];
     let mut scene = SCENE.replace("rh_", "lh_");
     for (attribute, signs) in signs {
-        let parts = scene.split(attribute).map(str::to_owned).collect::<Vec<_>>();
+        let parts = scene
+            .split(attribute)
+            .map(str::to_owned)
+            .collect::<Vec<_>>();
         let mirrored = parts.iter().enumerate().map(|(i, part)| {
             let (numbers, rest) = part.split_once('"').unwrap();
             if i == 0 {
                 return part.clone();
             }
-            let numbers =
-                numbers.split_whitespace().zip(signs).map(|(x, sign)| (sign * x.parse::<f64>().unwrap()).to_string());
+            let numbers = numbers
+                .split_whitespace()
+                .zip(signs)
+                .map(|(x, sign)| (sign * x.parse::<f64>().unwrap()).to_string());
             format!("{}\"{rest}", numbers.collect::<Vec<_>>().join(" "))
         });
         scene = mirrored.collect::<Vec<_>>().join(attribute);
@@ -58,36 +66,121 @@ fn a_hand_of_another_kind_is_trained_resumed_played_and_exported() {
     let folder = folder.path();
     let tips = "hand.fingertips=[\"α end\",\"β end\",\"γ end\"]";
     let own = ["--set", &model, "--set", tips, "--run-dir", "run"];
-    let said = stderr(&succeeded(program(folder, &train(&[&["--total-steps", "256"], &own[..]].concat()))));
-    assert!(said.contains("random actions turn `block` by") && said.contains("keyframe `cupped`"), "{said}");
+    let said = stderr(&succeeded(program(
+        folder,
+        &train(&[&["--total-steps", "256"], &own[..]].concat()),
+    )));
+    assert!(
+        said.contains("random actions turn `block` by") && said.contains("keyframe `cupped`"),
+        "{said}"
+    );
     let config = fs::read_to_string(folder.join("run/config.toml")).unwrap();
-    for line in ["num_hand_dofs = 9", "num_actuators = 6", "goal_position = [0.0, 0.0, 0.245]", "\"α end\""] {
+    for line in [
+        "num_hand_dofs = 9",
+        "num_actuators = 6",
+        "goal_position = [0.0, 0.0, 0.245]",
+        "\"α end\"",
+    ] {
         assert!(config.contains(line), "{line}: {config}");
     }
-    succeeded(program(folder, &["train", "--resume", "run", "--set", &model, "--total-steps", "384"]));
-    let play = ["play", "--ckpt", "run", "--set", &model, "--json", "--episodes", "2", "--out", "t.jsonl"];
+    succeeded(program(
+        folder,
+        &[
+            "train",
+            "--resume",
+            "run",
+            "--set",
+            &model,
+            "--total-steps",
+            "384",
+        ],
+    ));
+    let play = [
+        "play",
+        "--ckpt",
+        "run",
+        "--set",
+        &model,
+        "--json",
+        "--episodes",
+        "2",
+        "--out",
+        "t.jsonl",
+    ];
     succeeded(program(folder, &play));
     let header = header(&folder.join("t.jsonl"));
     assert_eq!(header["joint_names"].as_array().unwrap().len(), 9);
     assert_eq!(header["actuator_names"][1], "α bends");
     assert_eq!(header["fingertip_names"][2], "γ end");
     let groups = header["observation"].as_array().unwrap();
-    assert_eq!(groups.iter().map(|group| group["length"].as_u64().unwrap()).sum::<u64>(), 18 + 24 + 39 + 6);
-    succeeded(program(folder, &["export", "--ckpt", "run", "--set", &model]));
+    assert_eq!(
+        groups
+            .iter()
+            .map(|group| group["length"].as_u64().unwrap())
+            .sum::<u64>(),
+        18 + 24 + 39 + 6
+    );
+    succeeded(program(
+        folder,
+        &["export", "--ckpt", "run", "--set", &model],
+    ));
     let scene = folder.join("scene.xml");
-    crate::export::check_in_python(folder, &["policy.onnx", "--scene", scene.to_str().unwrap(), "--check", "t.jsonl"]);
+    crate::export::check_in_python(
+        folder,
+        &[
+            "policy.onnx",
+            "--scene",
+            scene.to_str().unwrap(),
+            "--check",
+            "t.jsonl",
+        ],
+    );
 }
 
 #[test]
 fn a_policy_of_another_hand_is_refused_by_the_names_that_differ() {
     let (folder, model) = placed(THREE_FINGERS);
     let folder = folder.path();
-    let said = stderr(&program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", &model]));
-    assert!(said.contains("for another hand") && said.contains("has 9 joints, not 24, 6 actuators, not 20"), "{said}");
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
-    let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", "env.model=builtin"]));
-    assert!(said.contains("for another hand") && said.contains("has 24 joints, not 9"), "{said}");
-    let said = stderr(&program(folder, &["train", "--init", "builtin", "--run-dir", "other", "--set", &model]));
+    let said = stderr(&program(
+        folder,
+        &["play", "--ckpt", "builtin", "--headless", "--set", &model],
+    ));
+    assert!(
+        said.contains("for another hand")
+            && said.contains("has 9 joints, not 24, 6 actuators, not 20"),
+        "{said}"
+    );
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model]),
+    ));
+    let said = stderr(&program(
+        folder,
+        &[
+            "play",
+            "--ckpt",
+            "run",
+            "--headless",
+            "--set",
+            "env.model=builtin",
+        ],
+    ));
+    assert!(
+        said.contains("for another hand") && said.contains("has 24 joints, not 9"),
+        "{said}"
+    );
+    let said = stderr(&program(
+        folder,
+        &[
+            "train",
+            "--init",
+            "builtin",
+            "--run-dir",
+            "other",
+            "--set",
+            &model,
+        ],
+    ));
     assert!(said.contains("for another hand"), "{said}");
 }
 
@@ -95,20 +188,38 @@ fn a_policy_of_another_hand_is_refused_by_the_names_that_differ() {
 fn the_joint_that_another_scene_calls_otherwise_is_named() {
     let (folder, model) = placed(THREE_FINGERS);
     let folder = folder.path();
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model]),
+    ));
     let (_other, model) = placed(&THREE_FINGERS.replace("γ tip", "γ end joint"));
-    let said = stderr(&program(folder, &["play", "--ckpt", "run", "--headless", "--set", &model]));
-    assert!(said.contains("for another hand") && said.contains("has the joint `γ end joint` for `γ tip`\n"), "{said}");
+    let said = stderr(&program(
+        folder,
+        &["play", "--ckpt", "run", "--headless", "--set", &model],
+    ));
+    assert!(
+        said.contains("for another hand")
+            && said.contains("has the joint `γ end joint` for `γ tip`\n"),
+        "{said}"
+    );
 }
 
 #[test]
 fn names_that_no_scene_can_hold_are_refused() {
     let output = program(
         &std::env::temp_dir(),
-        &["play", "--ckpt", "zero", "--headless", "--set", "hand.joints=[\"a\\u0000b\"]"],
+        &[
+            "play",
+            "--ckpt",
+            "zero",
+            "--headless",
+            "--set",
+            "hand.joints=[\"a\\u0000b\"]",
+        ],
     );
     assert!(
-        stderr(&output).contains("hand.joints") && stderr(&output).contains("without control characters"),
+        stderr(&output).contains("hand.joints")
+            && stderr(&output).contains("without control characters"),
         "{}",
         stderr(&output)
     );
@@ -127,25 +238,60 @@ fn the_base_as_a_users_file_names_nothing() {
     ];
     let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
     let with_base = ["train", "--config", base];
-    succeeded(program(folder.path(), &[&with_base[..], &["--set", &model, "--run-dir", "a"], &small].concat()));
-    succeeded(program(folder.path(), &[&with_base[..], &["--init", "builtin", "--run-dir", "b"], &small].concat()));
+    succeeded(program(
+        folder.path(),
+        &[&with_base[..], &["--set", &model, "--run-dir", "a"], &small].concat(),
+    ));
+    succeeded(program(
+        folder.path(),
+        &[
+            &with_base[..],
+            &["--init", "builtin", "--run-dir", "b"],
+            &small,
+        ]
+        .concat(),
+    ));
 }
 
 #[test]
 fn a_hand_with_a_comma_in_a_name_is_trained_but_not_exported() {
     let (folder, model) = placed(&THREE_FINGERS.replace('α', "a,b"));
     let folder = folder.path();
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model])));
-    let said = stderr(&program(folder, &["export", "--ckpt", "run", "--set", &model]));
-    assert!(said.contains("`a,b turn`") && said.contains("comma"), "{said}");
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", "run", "--set", &model]),
+    ));
+    let said = stderr(&program(
+        folder,
+        &["export", "--ckpt", "run", "--set", &model],
+    ));
+    assert!(
+        said.contains("`a,b turn`") && said.contains("comma"),
+        "{said}"
+    );
 }
 
 #[test]
 fn an_action_that_means_another_angle_than_in_training_is_warned_of() {
     let (folder, model) = placed(&SCENE.replace("ctrlrange=\"0 3.1415\"", "ctrlrange=\"0 3\""));
-    let play = ["play", "--ckpt", "builtin", "--json", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
-    let said = stderr(&succeeded(program(folder.path(), &[&play[..], &["--set", &model]].concat())));
-    assert!(said.contains("ranges or the tendons of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"), "{said}");
+    let play = [
+        "play",
+        "--ckpt",
+        "builtin",
+        "--json",
+        "--episodes",
+        "1",
+        "--set",
+        "env.max_episode_seconds=0.1",
+    ];
+    let said = stderr(&succeeded(program(
+        folder.path(),
+        &[&play[..], &["--set", &model]].concat(),
+    )));
+    assert!(
+        said.contains("ranges or the tendons of rh_A_FFJ0 rh_A_MFJ0 rh_A_RFJ0 rh_A_LFJ0 differ"),
+        "{said}"
+    );
 }
 
 #[test]
@@ -155,28 +301,67 @@ fn a_mocap_body_that_guides_something_is_not_the_goal() {
     let site = "<body><site name=\"grip\"/></body></body></worldbody>";
     for (bodies, constraint) in [
         (guide.to_owned(), "<weld body1=\"guide\" body2=\"palm\"/>"),
-        (guide.replace("/></worldbody>", &format!(">{site}")), "<connect site1=\"grip\" site2=\"α end\"/>"),
+        (
+            guide.replace("/></worldbody>", &format!(">{site}")),
+            "<connect site1=\"grip\" site2=\"α end\"/>",
+        ),
     ] {
-        let scene = THREE_FINGERS.replace("</worldbody>", &bodies).replace("</mujoco>", &tied(constraint));
+        let scene = THREE_FINGERS
+            .replace("</worldbody>", &bodies)
+            .replace("</mujoco>", &tied(constraint));
         let (_folder, model) = placed(&scene);
-        assert_eq!(task(&[&model]).hand.parts.goal, "goal of shadow-repose", "{constraint}");
+        assert_eq!(
+            task(&[&model]).hand.parts.goal,
+            "goal of shadow-repose",
+            "{constraint}"
+        );
     }
 }
 
 #[test]
 fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting_that_mends_it() {
-    let block = THREE_FINGERS.split("<body name=\"block\"").nth(1).unwrap().split("</body>").next().unwrap();
+    let block = THREE_FINGERS
+        .split("<body name=\"block\"")
+        .nth(1)
+        .unwrap()
+        .split("</body>")
+        .next()
+        .unwrap();
     let block = format!("<body name=\"block\"{block}</body>");
-    let without = THREE_FINGERS.replace(&block, "").replace("0 .6 .4 0 0 .245 1 0 0 0", "0 .6 .4");
-    let two = THREE_FINGERS.replace(&block, &format!("{block}{}", block.replace("block", "other")));
+    let without = THREE_FINGERS
+        .replace(&block, "")
+        .replace("0 .6 .4 0 0 .245 1 0 0 0", "0 .6 .4");
+    let two = THREE_FINGERS.replace(
+        &block,
+        &format!("{block}{}", block.replace("block", "other")),
+    );
     let two = two.replace("0 0 .245 1 0 0 0", "0 0 .245 1 0 0 0 0 0 .3 1 0 0 0");
     let goals = "<body name=\"g1\" mocap=\"true\"/><body name=\"g2\" mocap=\"true\"/></worldbody>";
     let both = two.replace("</worldbody>", goals);
     for (scene, sets, parts) in [
-        (&without, &[][..], &["<body name=\"cube\" pos=\"X Y Z\"><freejoint/>"][..]),
-        (&two, &[], &["several bodies with a free joint, `block`, `other`: name one by hand.object"]),
-        (&both, &[], &["name one by hand.object", "several mocap bodies, `g1`, `g2`: name one by hand.goal"]),
-        (&THREE_FINGERS.replace("name=\"α distal\" ", ""), &[], &["body 4 of the compiled scene needs a name"]),
+        (
+            &without,
+            &[][..],
+            &["<body name=\"cube\" pos=\"X Y Z\"><freejoint/>"][..],
+        ),
+        (
+            &two,
+            &[],
+            &["several bodies with a free joint, `block`, `other`: name one by hand.object"],
+        ),
+        (
+            &both,
+            &[],
+            &[
+                "name one by hand.object",
+                "several mocap bodies, `g1`, `g2`: name one by hand.goal",
+            ],
+        ),
+        (
+            &THREE_FINGERS.replace("name=\"α distal\" ", ""),
+            &[],
+            &["body 4 of the compiled scene needs a name"],
+        ),
         (
             &THREE_FINGERS.replace("<position name=\"α turns\" ", "<motor name=\"α turns\" "),
             &[],
@@ -187,8 +372,16 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
             &["hand.joints=[\"α turn\",\"δ\"]", "hand.goal=none"],
             &["has no body `none`; has no joint `δ`"],
         ),
-        (&THREE_FINGERS.to_owned(), &["hand.start=flat"], &["has no keyframe `flat`"]),
-        (&THREE_FINGERS.to_owned(), &["hand.joints=[\"α turn\",\"α turn\"]"], &["`α turn` is named twice"]),
+        (
+            &THREE_FINGERS.to_owned(),
+            &["hand.start=flat"],
+            &["has no keyframe `flat`"],
+        ),
+        (
+            &THREE_FINGERS.to_owned(),
+            &["hand.joints=[\"α turn\",\"α turn\"]"],
+            &["`α turn` is named twice"],
+        ),
         (
             &THREE_FINGERS.replace("joint=\"α turn\" ctrl", "joint=\"α turn\" gear=\"2\" ctrl"),
             &["hand.fingertips=[\"x\"]"],
@@ -199,9 +392,16 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
             &[],
             &["joint `α turn` must have a range; joint `β turn` must have a range"],
         ),
-        (&THREE_FINGERS.replace(".245 1 0 0 0", "200 1 0 0 0"), &[], &["`block` starts more than 100 m away"]),
         (
-            &THREE_FINGERS.replace("</worldbody>", "<body name=\"goal of shadow-repose\"/></worldbody>"),
+            &THREE_FINGERS.replace(".245 1 0 0 0", "200 1 0 0 0"),
+            &[],
+            &["`block` starts more than 100 m away"],
+        ),
+        (
+            &THREE_FINGERS.replace(
+                "</worldbody>",
+                "<body name=\"goal of shadow-repose\"/></worldbody>",
+            ),
             &[],
             &["has a body `goal of shadow-repose` that is no mocap body"],
         ),
@@ -210,15 +410,29 @@ fn what_is_missing_or_ambiguous_in_a_scene_comes_in_one_message_with_the_setting
             &["env.num_hand_dofs=24"],
             &["env.num_hand_dofs = 24: the hand of ", "has 9 joints"],
         ),
-        (&"<mujoco/>".to_owned(), &[], &["has no hand", "hand.joints and hand.actuators", "<freejoint/>"]),
+        (
+            &"<mujoco/>".to_owned(),
+            &[],
+            &[
+                "has no hand",
+                "hand.joints and hand.actuators",
+                "<freejoint/>",
+            ],
+        ),
     ] {
         let message = refusal(scene, sets);
-        assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} in {message}");
+        assert!(
+            parts.iter().all(|part| message.contains(part)),
+            "{parts:?} in {message}"
+        );
     }
     let (_folder, model) = placed(&both);
     let config = crate::support::config(&[&model, "hand.object=other", "hand.goal=g2"]);
     let task = Task::new(&config).unwrap();
-    assert_eq!((&*task.hand.parts.object, &*task.hand.parts.goal), ("other", "g2"));
+    assert_eq!(
+        (&*task.hand.parts.object, &*task.hand.parts.goal),
+        ("other", "g2")
+    );
 }
 
 #[test]
@@ -231,50 +445,152 @@ fn a_scene_that_shows_no_goal_gets_one_that_touches_nothing() {
     let goal = task.scene.frame(&task.hand.parts.goal).unwrap();
     let pose = env.sim.pose(goal);
     assert!((pose.position[2] - 0.445).abs() < 1e-9, "{pose:?}");
-    assert_eq!(pose.orientation.map(|x| x as f32), env.goal.map(|x| x as f32));
+    assert_eq!(
+        pose.orientation.map(|x| x as f32),
+        env.goal.map(|x| x as f32)
+    );
 }
 
 #[test]
 fn the_mirror_image_of_the_hand_sees_and_does_in_the_mirror_what_the_hand_does() {
     let (folder, model) = placed(&left_scene());
     let folder = folder.path();
-    let play = ["play", "--ckpt", "builtin", "--episodes", "4", "--set", &model];
+    let play = [
+        "play",
+        "--ckpt",
+        "builtin",
+        "--episodes",
+        "4",
+        "--set",
+        &model,
+    ];
     let goals = |args: &[&str]| -> f64 {
-        let score: Value = serde_json::from_slice(&succeeded(program(folder, args)).stdout).unwrap();
+        let score: Value =
+            serde_json::from_slice(&succeeded(program(folder, args)).stdout).unwrap();
         score["goals_per_episode"].as_f64().unwrap()
     };
-    assert!(goals(&[&play[..], &["--json"]].concat()) > 6.0, "the right hand reaches more than nine");
-    let output = succeeded(program(folder, &[&play[..], &["--out", "t.jsonl"]].concat()));
-    assert_eq!(stderr(&output).matches("plays mirrored").count(), 1, "{}", stderr(&output));
-    let exported = succeeded(program(folder, &["export", "--ckpt", "builtin", "--set", &model]));
-    assert!(stderr(&exported).contains("plays mirrored"), "{}", stderr(&exported));
+    assert!(
+        goals(&[&play[..], &["--json"]].concat()) > 6.0,
+        "the right hand reaches more than nine"
+    );
+    let output = succeeded(program(
+        folder,
+        &[&play[..], &["--out", "t.jsonl"]].concat(),
+    ));
+    assert_eq!(
+        stderr(&output).matches("plays mirrored").count(),
+        1,
+        "{}",
+        stderr(&output)
+    );
+    let exported = succeeded(program(
+        folder,
+        &["export", "--ckpt", "builtin", "--set", &model],
+    ));
+    assert!(
+        stderr(&exported).contains("plays mirrored"),
+        "{}",
+        stderr(&exported)
+    );
     let scene = folder.join("scene.xml");
-    crate::export::check_in_python(folder, &["policy.onnx", "--scene", scene.to_str().unwrap(), "--check", "t.jsonl"]);
-    let run = ["--init", "builtin", "--total-steps", "128", "--run-dir", "run", "--set", &model];
-    let small = ["env.num_envs=16", "ppo.horizon=8", "run.eval_episodes=2", "randomization.share=0"];
+    crate::export::check_in_python(
+        folder,
+        &[
+            "policy.onnx",
+            "--scene",
+            scene.to_str().unwrap(),
+            "--check",
+            "t.jsonl",
+        ],
+    );
+    let run = [
+        "--init",
+        "builtin",
+        "--total-steps",
+        "128",
+        "--run-dir",
+        "run",
+        "--set",
+        &model,
+    ];
+    let small = [
+        "env.num_envs=16",
+        "ppo.horizon=8",
+        "run.eval_episodes=2",
+        "randomization.share=0",
+    ];
     let small: Vec<&str> = small.iter().flat_map(|set| ["--set", *set]).collect();
-    let said = stderr(&succeeded(program(folder, &[&["train"], &run[..], &small].concat())));
+    let said = stderr(&succeeded(program(
+        folder,
+        &[&["train"], &run[..], &small].concat(),
+    )));
     assert!(said.contains("plays mirrored"), "{said}");
-    let trained = ["play", "--ckpt", "run", "--json", "--episodes", "4", "--set"];
-    assert!(goals(&[&trained[..], &[&model]].concat()) > 4.0, "it plays the left hand in the mirror");
-    assert!(goals(&[&trained[..], &["env.model=builtin"]].concat()) > 4.0, "its own hand is still the right one");
+    let trained = [
+        "play",
+        "--ckpt",
+        "run",
+        "--json",
+        "--episodes",
+        "4",
+        "--set",
+    ];
+    assert!(
+        goals(&[&trained[..], &[&model]].concat()) > 4.0,
+        "it plays the left hand in the mirror"
+    );
+    assert!(
+        goals(&[&trained[..], &["env.model=builtin"]].concat()) > 4.0,
+        "its own hand is still the right one"
+    );
     // Names of a left hand in a scene that is none.
     fs::write(folder.join("named.xml"), SCENE.replace("rh_", "lh_")).unwrap();
-    let wrong = program(folder, &["play", "--ckpt", "builtin", "--headless", "--set", "env.model=named.xml"]);
-    assert!(stderr(&wrong).contains("not the mirror image"), "{}", stderr(&wrong));
+    let wrong = program(
+        folder,
+        &[
+            "play",
+            "--ckpt",
+            "builtin",
+            "--headless",
+            "--set",
+            "env.model=named.xml",
+        ],
+    );
+    assert!(
+        stderr(&wrong).contains("not the mirror image"),
+        "{}",
+        stderr(&wrong)
+    );
 }
 
 #[test]
 fn where_names_do_not_tell_the_side_of_a_hand_its_fingertips_do() {
     let (folder, right) = placed(&SCENE.replace("rh_", ""));
     let folder = folder.path();
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run", "--set", &right])));
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", "run", "--set", &right]),
+    ));
     fs::write(folder.join("left.xml"), left_scene().replace("lh_", "")).unwrap();
     // Neither where the policy's hand has its fingertips, nor in the mirror.
-    let moved = SCENE.replace("rh_", "").replacen("pos=\"0 0 .034\"", "pos=\"0 0 .044\"", 1);
+    let moved = SCENE
+        .replace("rh_", "")
+        .replacen("pos=\"0 0 .034\"", "pos=\"0 0 .044\"", 1);
     fs::write(folder.join("moved.xml"), moved).unwrap();
-    for (model, mirrored) in [(&*right, false), ("env.model=left.xml", true), ("env.model=moved.xml", false)] {
-        let play = ["play", "--ckpt", "run", "--headless", "--episodes", "1", "--set", model];
+    for (model, mirrored) in [
+        (&*right, false),
+        ("env.model=left.xml", true),
+        ("env.model=moved.xml", false),
+    ] {
+        let play = [
+            "play",
+            "--ckpt",
+            "run",
+            "--headless",
+            "--episodes",
+            "1",
+            "--set",
+            model,
+        ];
         let said = stderr(&succeeded(program(folder, &play)));
         assert_eq!(said.contains("plays mirrored"), mirrored, "{model}: {said}");
     }

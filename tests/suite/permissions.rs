@@ -36,7 +36,10 @@ fn refused_to_a_user(folder: &Path, args: &[&str], reason: &str) {
         output => {
             let output = output.unwrap();
             let said = String::from_utf8_lossy(&output.stderr);
-            assert!(output.status.code() == Some(1) && said.contains(reason), "{args:?}: {said}");
+            assert!(
+                output.status.code() == Some(1) && said.contains(reason),
+                "{args:?}: {said}"
+            );
         }
     }
 }
@@ -45,7 +48,10 @@ fn refused_to_a_user(folder: &Path, args: &[&str], reason: &str) {
 fn checkpoints_that_may_not_be_read_are_not_taken_for_none() {
     let place = public();
     let folder = place.path();
-    succeeded(program(folder, &train(&["--total-steps", "128", "--run-dir", "run"])));
+    succeeded(program(
+        folder,
+        &train(&["--total-steps", "128", "--run-dir", "run"]),
+    ));
     let checkpoints = folder.join("run/checkpoints");
     // Neither listed nor entered, or only listed, or only entered.
     for mode in [0o000, 0o444, 0o111] {
@@ -56,7 +62,11 @@ fn checkpoints_that_may_not_be_read_are_not_taken_for_none() {
             ["train", "--quiet", "--resume", "run"],
             ["train", "--quiet", "--fork", "run"],
         ] {
-            refused_to_a_user(folder, &args, "cannot read run/checkpoints: Permission denied");
+            refused_to_a_user(
+                folder,
+                &args,
+                "cannot read run/checkpoints: Permission denied",
+            );
         }
     }
     set_mode(&checkpoints, 0o755);
@@ -71,7 +81,15 @@ fn a_file_that_may_not_be_written_is_not_replaced() {
     set_mode(&own, 0o444);
     for args in [
         &["export", "--ckpt", "builtin", "--out", "own"][..],
-        &["play", "--ckpt", "zero", "--episodes", "1", "--out", "jsonl:own"],
+        &[
+            "play",
+            "--ckpt",
+            "zero",
+            "--episodes",
+            "1",
+            "--out",
+            "jsonl:own",
+        ],
     ] {
         refused_to_a_user(folder, args, "cannot write own: Permission denied");
         assert_eq!(fs::read_to_string(&own).unwrap(), "mine");

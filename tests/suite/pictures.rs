@@ -17,21 +17,37 @@ use shiguredo_mp4::bitstream::h264::{LengthSize, length_prefixed_to_annexb};
 use shiguredo_mp4::boxes::SampleEntry;
 use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-use crate::support::{colours_of_the_cube, command, must_be_possible, program, started, stderr, succeeded, task};
+use crate::support::{
+    colours_of_the_cube, command, must_be_possible, program, started, stderr, succeeded, task,
+};
 
 /// Returns whether pictures can be drawn here. Without EGL it prints a note, or fails if CI has installed EGL.
 fn can_draw() -> bool {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--out", "x.png"];
+    let args = [
+        "view",
+        "--plain",
+        "--quality",
+        "fast",
+        "--size",
+        "64x64",
+        "--out",
+        "x.png",
+    ];
     let output = program(folder.path(), &args);
     let said = stderr(&output);
-    assert!(output.status.success() || said.contains("apt install libegl1"), "{said}");
+    assert!(
+        output.status.success() || said.contains("apt install libegl1"),
+        "{said}"
+    );
     output.status.success() || must_be_possible("pictures: EGL is missing")
 }
 
 /// Returns the width and height, and the pixels, of a PNG file.
 pub(crate) fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
-    let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
+    let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap()))
+        .read_info()
+        .unwrap();
     let mut rgb = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut rgb).unwrap();
     assert_eq!(info.color_type, png::ColorType::Rgb);
@@ -40,13 +56,27 @@ pub(crate) fn picture(path: &Path) -> ([u32; 2], Vec<u8>) {
 
 /// Films an episode of two seconds, with `more` arguments.
 fn film(folder: &Path, more: &[&str]) {
-    let mut args = vec!["play", "--ckpt", "zero", "--set", "env.max_episode_seconds=2", "--plain", "--size", "160x120"];
+    let mut args = vec![
+        "play",
+        "--ckpt",
+        "zero",
+        "--set",
+        "env.max_episode_seconds=2",
+        "--plain",
+        "--size",
+        "160x120",
+    ];
     args.extend(more);
     let output = succeeded(program(folder, &args));
-    let leftovers =
-        fs::read_dir(folder).unwrap().filter(|e| e.as_ref().unwrap().path().extension().unwrap() == "partial");
+    let leftovers = fs::read_dir(folder)
+        .unwrap()
+        .filter(|e| e.as_ref().unwrap().path().extension().unwrap() == "partial");
     assert_eq!(leftovers.count(), 0);
-    assert!(!stderr(&output).contains("Warning"), "the encoder prints nothing: {}", stderr(&output));
+    assert!(
+        !stderr(&output).contains("Warning"),
+        "the encoder prints nothing: {}",
+        stderr(&output)
+    );
 }
 
 /// Returns the luminance of every frame of an MP4 file, the size of the frames, and the duration in seconds.
@@ -56,7 +86,10 @@ fn decode_mp4(path: &Path) -> (Vec<Vec<u8>>, [usize; 2], f64) {
     assert!(at(b"moov") < at(b"mdat"), "the index comes first");
     let mut demuxer = Mp4FileDemuxer::new();
     while let Some(wanted) = demuxer.required_input() {
-        demuxer.handle_input(Input { position: wanted.position, data: &bytes[wanted.position as usize..] });
+        demuxer.handle_input(Input {
+            position: wanted.position,
+            data: &bytes[wanted.position as usize..],
+        });
     }
     let track = &demuxer.tracks().unwrap()[0];
     let duration = track.duration as f64 / f64::from(track.timescale.get());
@@ -64,13 +97,23 @@ fn decode_mp4(path: &Path) -> (Vec<Vec<u8>>, [usize; 2], f64) {
     while let Some(sample) = demuxer.next_sample().unwrap() {
         if let Some(SampleEntry::Avc1(entry)) = sample.sample_entry {
             size = [entry.visual.width.into(), entry.visual.height.into()];
-            for set in entry.avcc_box.sps_list.iter().chain(&entry.avcc_box.pps_list) {
-                decoder.decode(&[&[0, 0, 0, 1], set.as_slice()].concat()).unwrap();
+            for set in entry
+                .avcc_box
+                .sps_list
+                .iter()
+                .chain(&entry.avcc_box.pps_list)
+            {
+                decoder
+                    .decode(&[&[0, 0, 0, 1], set.as_slice()].concat())
+                    .unwrap();
             }
         }
         let data = &bytes[sample.data_offset as usize..][..sample.data_size];
         let stream = length_prefixed_to_annexb(data, LengthSize::FourBytes).unwrap();
-        let frame = decoder.decode(&stream).unwrap().expect("each sample is a frame");
+        let frame = decoder
+            .decode(&stream)
+            .unwrap()
+            .expect("each sample is a frame");
         assert_eq!([frame.dimensions().0, frame.dimensions().1], size);
         frames.push(frame.y().to_vec());
     }
@@ -85,16 +128,35 @@ fn a_picture_needs_no_display_and_shows_the_cube_in_its_colours() {
     let folder = tempfile::tempdir().unwrap();
     for quality in ["fast", "high"] {
         // A hand that closes slowly would hide two of the sides.
-        let args = ["view", "--plain", "--set=env.act_moving_average=1", "--size=320x240"];
+        let args = [
+            "view",
+            "--plain",
+            "--set=env.act_moving_average=1",
+            "--size=320x240",
+        ];
         let args = [&args[..], &["--quality", quality, "--out"]].concat();
         succeeded(program(folder.path(), &[&args[..], &["near.png"]].concat()));
-        succeeded(program(folder.path(), &[&args[..], &["far.png", "--camera", "150,-27,10"]].concat()));
+        succeeded(program(
+            folder.path(),
+            &[&args[..], &["far.png", "--camera", "150,-27,10"]].concat(),
+        ));
         let (size, near) = picture(&folder.path().join("near.png"));
         assert_eq!(size, [320, 240]);
-        assert!(near.iter().map(|&c| u64::from(c)).sum::<u64>() / near.len() as u64 > 60, "not black");
-        assert!(colours_of_the_cube(&near) >= 3, "{}", colours_of_the_cube(&near));
+        assert!(
+            near.iter().map(|&c| u64::from(c)).sum::<u64>() / near.len() as u64 > 60,
+            "not black"
+        );
+        assert!(
+            colours_of_the_cube(&near) >= 3,
+            "{}",
+            colours_of_the_cube(&near)
+        );
         let (_, far) = picture(&folder.path().join("far.png"));
-        assert_eq!(colours_of_the_cube(&far), 0, "from far away the cube is hardly visible");
+        assert_eq!(
+            colours_of_the_cube(&far),
+            0,
+            "from far away the cube is hardly visible"
+        );
     }
 }
 
@@ -108,7 +170,10 @@ fn an_mp4_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
     let (frames, size, duration) = decode_mp4(&folder.path().join("film.mp4"));
     assert_eq!((frames.len(), size, duration), (100, [160, 120], 2.0));
     assert_ne!(frames[0], frames[40], "something moves");
-    film(folder.path(), &["--out", "slow.mp4", "--fps", "30", "--episodes", "2"]);
+    film(
+        folder.path(),
+        &["--out", "slow.mp4", "--fps", "30", "--episodes", "2"],
+    );
     let (frames, _, duration) = decode_mp4(&folder.path().join("slow.mp4"));
     assert_eq!((frames.len(), duration), (120, 4.0));
 }
@@ -122,13 +187,23 @@ fn a_gif_film_has_the_frames_the_size_and_the_duration_that_were_asked_for() {
     film(folder.path(), &["--out", "film.gif", "--fps", "30"]);
     let mut options = gif::DecodeOptions::new();
     options.set_color_output(gif::ColorOutput::RGBA);
-    let mut decoder = options.read_info(File::open(folder.path().join("film.gif")).unwrap()).unwrap();
+    let mut decoder = options
+        .read_info(File::open(folder.path().join("film.gif")).unwrap())
+        .unwrap();
     assert_eq!((decoder.width(), decoder.height()), (160, 120));
     let (mut frames, mut hundredths, mut colours) = (0, 0, 0);
     while let Some(frame) = decoder.read_next_frame().unwrap() {
         if frames == 0 {
-            assert_eq!((frame.width, frame.height), (160, 120), "the first frame is whole");
-            let rgb: Vec<u8> = frame.buffer.chunks_exact(4).flat_map(|pixel| pixel[..3].to_vec()).collect();
+            assert_eq!(
+                (frame.width, frame.height),
+                (160, 120),
+                "the first frame is whole"
+            );
+            let rgb: Vec<u8> = frame
+                .buffer
+                .chunks_exact(4)
+                .flat_map(|pixel| pixel[..3].to_vec())
+                .collect();
             colours = colours_of_the_cube(&rgb);
         }
         frames += 1;
@@ -144,9 +219,29 @@ fn a_film_shows_the_episodes_that_are_scored() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--ckpt", "random", "--episodes", "3", "--seed", "5", "--json", "--out"];
-    let scored = succeeded(program(folder.path(), &[&args[..], &["jsonl:scored"]].concat()));
-    let filmed = ["jsonl:filmed", "--plain", "--out", "film.mp4", "--size", "64x64"];
+    let args = [
+        "play",
+        "--ckpt",
+        "random",
+        "--episodes",
+        "3",
+        "--seed",
+        "5",
+        "--json",
+        "--out",
+    ];
+    let scored = succeeded(program(
+        folder.path(),
+        &[&args[..], &["jsonl:scored"]].concat(),
+    ));
+    let filmed = [
+        "jsonl:filmed",
+        "--plain",
+        "--out",
+        "film.mp4",
+        "--size",
+        "64x64",
+    ];
     let filmed = succeeded(program(folder.path(), &[&args[..], &filmed].concat()));
     assert_eq!(scored.stdout, filmed.stdout);
     let read = |name| fs::read(folder.path().join(name)).unwrap();
@@ -159,20 +254,51 @@ fn an_interrupted_film_shows_what_was_played() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--ckpt", "random", "--plain", "--out", "film.mp4", "--size", "64x64", "--episodes", "200"];
-    let child = command(folder.path(), &args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let args = [
+        "play",
+        "--ckpt",
+        "random",
+        "--plain",
+        "--out",
+        "film.mp4",
+        "--size",
+        "64x64",
+        "--episodes",
+        "200",
+    ];
+    let child = command(folder.path(), &args)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
     let unfinished = || {
-        let files = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
-        files.into_iter().find(|path| path.extension().unwrap() == "partial")
+        let files = fs::read_dir(folder.path())
+            .unwrap()
+            .map(|entry| entry.unwrap().path());
+        files
+            .into_iter()
+            .find(|path| path.extension().unwrap() == "partial")
     };
     let begun = Instant::now();
     // Frames follow the space that is reserved for the index.
-    while unfinished().and_then(|path| fs::metadata(path).ok()).map_or(0, |facts| facts.len()) < 200 * 501 * 16 + 20_000
+    while unfinished()
+        .and_then(|path| fs::metadata(path).ok())
+        .map_or(0, |facts| facts.len())
+        < 200 * 501 * 16 + 20_000
     {
-        assert!(begun.elapsed() < Duration::from_secs(120), "the film does not grow");
+        assert!(
+            begun.elapsed() < Duration::from_secs(120),
+            "the film does not grow"
+        );
         std::thread::sleep(Duration::from_millis(20));
     }
-    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert!(
+        Command::new("kill")
+            .args(["-INT", &child.id().to_string()])
+            .status()
+            .unwrap()
+            .success()
+    );
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     let (frames, ..) = decode_mp4(&folder.path().join("film.mp4"));
@@ -182,11 +308,16 @@ fn an_interrupted_film_shows_what_was_played() {
 
 #[test]
 fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
-    let tetrahedron = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n".to_vec();
+    let tetrahedron =
+        b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n".to_vec();
     let look = Look {
         dress: Some(dress("rh_", vec![tetrahedron; mesh_files().len()])),
         size: [320, 240],
-        camera: Some(Camera { azimuth: 10.0, elevation: -80.0, distance: 2.0 }),
+        camera: Some(Camera {
+            azimuth: 10.0,
+            elevation: -80.0,
+            distance: 2.0,
+        }),
         quality: Quality::Fast,
         plain: false,
     };
@@ -197,15 +328,22 @@ fn what_is_only_seen_does_not_change_the_physics_by_a_bit() {
 
 /// The number of shapes that a page draws of a task.
 fn drawn(task: &Task) -> usize {
-    task.scene.drawing(None, None).scene["geoms"].as_array().unwrap().len()
+    task.scene.drawing(None, None).scene["geoms"]
+        .as_array()
+        .unwrap()
+        .len()
 }
 
 /// Steps both tasks under the same actions, and compares every bit.
 fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
-    let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) = (started(plain), started(dressed));
+    let (mut plain, mut dressed): ((Repose, Vec<f32>), (Repose, Vec<f32>)) =
+        (started(plain), started(dressed));
     for step in 0..400 {
-        let action: Vec<f32> = (0..20).map(|i| ((step * (i + 3)) as f32 * 0.07).sin()).collect();
-        let transitions = [&mut plain, &mut dressed].map(|(env, observation)| env.step(&action, observation));
+        let action: Vec<f32> = (0..20)
+            .map(|i| ((step * (i + 3)) as f32 * 0.07).sin())
+            .collect();
+        let transitions =
+            [&mut plain, &mut dressed].map(|(env, observation)| env.step(&action, observation));
         assert_eq!(transitions[0], transitions[1]);
         assert_eq!(plain.1, dressed.1);
     }
@@ -215,34 +353,80 @@ fn same_physics(plain: &Arc<Task>, dressed: &Arc<Task>) {
 #[test]
 fn what_a_custom_scene_is_given_to_be_seen_does_not_change_its_physics_by_a_bit() {
     // The built-in scene without lights, sky and the plates on the cubes.
-    let words = ["<light ", "castshadow=\"false\"/>", "type=\"skybox\"", "size=\".0005", "size=\".022"];
+    let words = [
+        "<light ",
+        "castshadow=\"false\"/>",
+        "type=\"skybox\"",
+        "size=\".0005",
+        "size=\".022",
+    ];
     let text = include_str!("../../assets/shadow_hand/scene.xml");
-    let bare: Vec<&str> = text.lines().filter(|line| !words.iter().any(|word| line.contains(word))).collect();
+    let bare: Vec<&str> = text
+        .lines()
+        .filter(|line| !words.iter().any(|word| line.contains(word)))
+        .collect();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bare.xml");
     // What a class says about the mass of its geoms must not make the plates heavy.
-    let bare = bare.join("\n").replace("<default>\n", "<default>\n    <geom mass=\".02\"/>\n");
+    let bare = bare
+        .join("\n")
+        .replace("<default>\n", "<default>\n    <geom mass=\".02\"/>\n");
     assert!(bare.contains("<geom mass="));
     std::fs::write(&path, bare).unwrap();
     let plain = task(&[&format!("env.model={}", path.display())]);
-    let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast, plain: false };
+    let look = Look {
+        dress: None,
+        size: [320, 240],
+        camera: None,
+        quality: Quality::Fast,
+        plain: false,
+    };
     let furnished = plain.for_display(&look).unwrap();
     let geoms = [&plain, &furnished].map(|task| drawn(task));
-    assert_eq!(geoms[1], geoms[0] + 12, "a plate for each face of both cubes");
+    assert_eq!(
+        geoms[1],
+        geoms[0] + 12,
+        "a plate for each face of both cubes"
+    );
     same_physics(&plain, &furnished);
     if can_draw() {
-        let args = ["view", "--quality", "fast", "--size", "320x240", "--out", "x.png", "--set"];
-        succeeded(program(folder.path(), &[&args[..], &[&format!("env.model={}", path.display())]].concat()));
+        let args = [
+            "view",
+            "--quality",
+            "fast",
+            "--size",
+            "320x240",
+            "--out",
+            "x.png",
+            "--set",
+        ];
+        succeeded(program(
+            folder.path(),
+            &[&args[..], &[&format!("env.model={}", path.display())]].concat(),
+        ));
         let (_, rgb) = picture(&folder.path().join("x.png"));
-        assert!(colours_of_the_cube(&rgb) >= 2, "the faces of the cube can be told apart");
+        assert!(
+            colours_of_the_cube(&rgb) >= 2,
+            "the faces of the cube can be told apart"
+        );
     }
 }
 
 #[test]
 fn a_plain_box_and_a_goal_that_is_added_have_faces_that_can_be_told_apart() {
-    let model = concat!("env.model=", env!("CARGO_MANIFEST_DIR"), "/tests/suite/three_fingers.xml");
+    let model = concat!(
+        "env.model=",
+        env!("CARGO_MANIFEST_DIR"),
+        "/tests/suite/three_fingers.xml"
+    );
     let plain = task(&[model]);
-    let look = Look { dress: None, size: [320, 240], camera: None, quality: Quality::Fast, plain: false };
+    let look = Look {
+        dress: None,
+        size: [320, 240],
+        camera: None,
+        quality: Quality::Fast,
+        plain: false,
+    };
     let geoms = [&plain, &plain.for_display(&look).unwrap()].map(|task| drawn(task));
     assert_eq!(geoms[1], geoms[0] + 12);
 }
@@ -266,24 +450,48 @@ fn without_the_network_the_primitives_are_shown_and_it_is_said() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["view", "--quality", "fast", "--size", "64x64", "--out", "x.png"];
+    let args = [
+        "view",
+        "--quality",
+        "fast",
+        "--size",
+        "64x64",
+        "--out",
+        "x.png",
+    ];
     let mut command = command(folder.path(), &args);
     // Without a program named python3 nothing can be fetched.
-    let output =
-        command.env("XDG_CACHE_HOME", folder.path().join("cache")).env("PATH", folder.path()).output().unwrap();
+    let output = command
+        .env("XDG_CACHE_HOME", folder.path().join("cache"))
+        .env("PATH", folder.path())
+        .output()
+        .unwrap();
     let said = stderr(&succeeded(output));
-    assert!(said.contains("primitives are shown instead") && said.contains("python3 could not be started"), "{said}");
+    assert!(
+        said.contains("primitives are shown instead")
+            && said.contains("python3 could not be started"),
+        "{said}"
+    );
     assert!(folder.path().join("x.png").exists());
-    let cache: Vec<_> = fs::read_dir(folder.path().join("cache/shadow-repose")).into_iter().flatten().collect();
+    let cache: Vec<_> = fs::read_dir(folder.path().join("cache/shadow-repose"))
+        .into_iter()
+        .flatten()
+        .collect();
     assert!(cache.is_empty(), "no unfinished file is left");
 }
 
 #[test]
 fn without_egl_the_packages_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    for args in [["view", "--plain", "--out", "x.png"], ["play", "--ckpt=zero", "--plain", "--out=x.mp4"]] {
+    for args in [
+        ["view", "--plain", "--out", "x.png"],
+        ["play", "--ckpt=zero", "--plain", "--out=x.mp4"],
+    ] {
         let mut command = command(folder.path(), &args);
-        let output = command.env("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent").output().unwrap();
+        let output = command
+            .env("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent")
+            .output()
+            .unwrap();
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
         for part in ["cannot draw", "apt install libegl1 libgl1-mesa-dri"] {
@@ -300,17 +508,26 @@ fn learning_curves_are_drawn_as_png_too() {
     let mut table = "env_steps,time/collect_s,time/update_s,loss\n".to_owned();
     (0..100).for_each(|row| table += &format!("{row}000000,1,1,{}\n", 100 - row));
     fs::write(folder.path().join("metrics.csv"), table).unwrap();
-    let args = ["plot", ".", "--metric", "loss", "--smooth", "5", "--out", "x.png", "--size", "300x200"];
+    let args = [
+        "plot", ".", "--metric", "loss", "--smooth", "5", "--out", "x.png", "--size", "300x200",
+    ];
     succeeded(program(folder.path(), &args));
     let (size, rgb) = picture(&folder.path().join("x.png"));
     assert_eq!(size, [300, 200]);
     // The first curve is blue, and falls from the upper left to the lower right.
     let blue = |x: usize, y: usize| matches!(rgb[3 * (300 * y + x)..][..3], [r, g, b] if b > 150 && r < 60 && g < 160);
     let height = |columns: std::ops::Range<usize>| {
-        let found: Vec<usize> = columns.flat_map(|x| (0..200).filter(move |&y| blue(x, y))).collect();
+        let found: Vec<usize> = columns
+            .flat_map(|x| (0..200).filter(move |&y| blue(x, y)))
+            .collect();
         found.iter().sum::<usize>() as f64 / found.len() as f64
     };
-    assert!(height(200..220) > height(120..140) + 20.0, "{} {}", height(120..140), height(200..220));
+    assert!(
+        height(200..220) > height(120..140) + 20.0,
+        "{} {}",
+        height(120..140),
+        height(200..220)
+    );
 }
 
 #[test]
@@ -320,22 +537,57 @@ fn pictures_and_films_that_cannot_be_are_refused() {
         let output = program(folder.path(), args);
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(code), "{args:?} {said}");
-        assert!(said.contains(part) && !said.contains("panicked"), "{args:?} {said}");
+        assert!(
+            said.contains(part) && !said.contains("panicked"),
+            "{args:?} {said}"
+        );
     };
-    refused(&["view", "--out", "x.png", "--size", "640"], 2, "e.g. 640x480");
-    refused(&["view", "--out", "x.png", "--size", "8x8"], 2, "from 16 to 3840");
-    refused(&["view", "--out", "x.png", "--camera", "1,2"], 2, "three numbers");
-    refused(&["view", "--out", "x.png", "--camera", "1,2,-3"], 2, "from 0.05 to 10");
-    refused(&["view", "--out", "x.png", "--quality", "best"], 2, "possible values: fast, high");
+    refused(
+        &["view", "--out", "x.png", "--size", "640"],
+        2,
+        "e.g. 640x480",
+    );
+    refused(
+        &["view", "--out", "x.png", "--size", "8x8"],
+        2,
+        "from 16 to 3840",
+    );
+    refused(
+        &["view", "--out", "x.png", "--camera", "1,2"],
+        2,
+        "three numbers",
+    );
+    refused(
+        &["view", "--out", "x.png", "--camera", "1,2,-3"],
+        2,
+        "from 0.05 to 10",
+    );
+    refused(
+        &["view", "--out", "x.png", "--quality", "best"],
+        2,
+        "possible values: fast, high",
+    );
     refused(&["play", "--fps", "20"], 2, "it applies only to a film");
     refused(&["play", "--window", "--out", "x.mp4"], 2, "--window");
     if !can_draw() {
         return;
     }
-    let film = ["play", "--ckpt", "zero", "--plain", "--set", "env.max_episode_seconds=0.1", "--out"];
+    let film = [
+        "play",
+        "--ckpt",
+        "zero",
+        "--plain",
+        "--set",
+        "env.max_episode_seconds=0.1",
+        "--out",
+    ];
     let refused_film = |more: &[&str], part: &str| refused(&[&film[..], more].concat(), 1, part);
     for name in ["x.avi", "x", "avi:x", ".gif"] {
-        refused(&[&film[..], &[name]].concat(), 2, "must end in .mp4 or .gif");
+        refused(
+            &[&film[..], &[name]].concat(),
+            2,
+            "must end in .mp4 or .gif",
+        );
     }
     refused_film(&["x.mp4", "--size", "65x64"], "must be even");
     refused_film(&["x.mp4", "--episodes", "1000000"], "at most 2000000");
@@ -343,9 +595,21 @@ fn pictures_and_films_that_cannot_be_are_refused() {
     refused_film(&["missing/x.mp4"], "missing/x.mp4");
     symlink("/dev/full", folder.path().join("full.mp4")).unwrap();
     refused_film(&["full.mp4"], "full.mp4");
-    refused(&["view", "--plain", "--out", "x.jpg"], 2, "must end in .png");
-    refused(&["view", "--plain", "--out", "missing/x.png"], 1, "missing/x.png");
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "only the link");
+    refused(
+        &["view", "--plain", "--out", "x.jpg"],
+        2,
+        "must end in .png",
+    );
+    refused(
+        &["view", "--plain", "--out", "missing/x.png"],
+        1,
+        "missing/x.png",
+    );
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        1,
+        "only the link"
+    );
 }
 
 #[test]
@@ -356,8 +620,20 @@ fn the_camera_is_where_it_was_asked_to_be_with_another_mass_too() {
     let folder = tempfile::tempdir().unwrap();
     // The upper half shows the goal and the sky. The cube, below, moves according to its mass.
     let upper_half = |camera: &str, more: &[&str]| {
-        let args = ["view", "--plain", "--quality", "fast", "--size", "64x64", "--camera", camera];
-        succeeded(program(folder.path(), &[&args[..], &["--out", "x.png"], more].concat()));
+        let args = [
+            "view",
+            "--plain",
+            "--quality",
+            "fast",
+            "--size",
+            "64x64",
+            "--camera",
+            camera,
+        ];
+        succeeded(program(
+            folder.path(),
+            &[&args[..], &["--out", "x.png"], more].concat(),
+        ));
         let (_, rgb) = picture(&folder.path().join("x.png"));
         rgb[..rgb.len() / 2].to_vec()
     };

@@ -75,7 +75,10 @@ impl Env for PointMass {
             STEPS.. => Some(End::Truncated),
             age => (age % self.redirects == 0).then_some(End::Redirected),
         };
-        Transition { reward: -self.distance() as f32, end }
+        Transition {
+            reward: -self.distance() as f32,
+            end,
+        }
     }
 
     fn redirect(&mut self, observation: &mut [f32]) {
@@ -96,14 +99,35 @@ fn agent_of(envs: usize, settings: &PpoConfig, seed: u64) -> Agent<PointMass> {
 }
 
 /// Returns the agent of one of several ranks, with this number of its own points.
-pub(crate) fn of_ranks(envs: usize, settings: &PpoConfig, seed: u64, exchange: Exchange) -> Agent<PointMass> {
-    let point = |_| PointMass { position: [0.0; 2], age: 0, trap: None, redirects: STEPS };
-    Agent::new((0..envs).map(point).collect(), settings, seed, exchange, |_| ()).unwrap()
+pub(crate) fn of_ranks(
+    envs: usize,
+    settings: &PpoConfig,
+    seed: u64,
+    exchange: Exchange,
+) -> Agent<PointMass> {
+    let point = |_| PointMass {
+        position: [0.0; 2],
+        age: 0,
+        trap: None,
+        redirects: STEPS,
+    };
+    Agent::new(
+        (0..envs).map(point).collect(),
+        settings,
+        seed,
+        exchange,
+        |_| (),
+    )
+    .unwrap()
 }
 
 pub(crate) fn settings() -> PpoConfig {
-    let settings =
-        ["ppo.hidden=[32,32]", "ppo.reward_scale=0.2", "ppo.std={from=0.5,to=0.2,steps=25_000_000}", "ppo.gamma=0.9"];
+    let settings = [
+        "ppo.hidden=[32,32]",
+        "ppo.reward_scale=0.2",
+        "ppo.std={from=0.5,to=0.2,steps=25_000_000}",
+        "ppo.gamma=0.9",
+    ];
     config(&settings).ppo
 }
 
@@ -125,22 +149,40 @@ fn distances(settings: &PpoConfig, seed: u64) -> [f64; 2] {
 fn ppo_learns_to_bring_the_point_home_on_three_seeds_in_floats_and_in_bf16() {
     for precision in [Precision::F32, Precision::Bf16Rounded] {
         for seed in 0..3 {
-            let [first, last] = distances(&PpoConfig { precision, ..settings() }, seed);
-            assert!(first > 0.5 && last < 0.15, "{precision:?}, seed {seed}: {first} → {last}");
+            let [first, last] = distances(
+                &PpoConfig {
+                    precision,
+                    ..settings()
+                },
+                seed,
+            );
+            assert!(
+                first > 0.5 && last < 0.15,
+                "{precision:?}, seed {seed}: {first} → {last}"
+            );
         }
     }
 }
 
 #[test]
 fn ppo_learns_with_candles_tensors_too() {
-    let [first, last] = distances(&PpoConfig { backend: Backend::Candle, ..settings() }, 0);
+    let [first, last] = distances(
+        &PpoConfig {
+            backend: Backend::Candle,
+            ..settings()
+        },
+        0,
+    );
     assert!(first > 0.5 && last < 0.15, "{first} → {last}");
 }
 
 /// Only on a processor with a unit for bf16. On others, the tests of the program check the refusal.
 #[test]
 fn ppo_learns_in_bf16_where_the_processor_has_it() {
-    let settings = PpoConfig { precision: Precision::Bf16, ..settings() };
+    let settings = PpoConfig {
+        precision: Precision::Bf16,
+        ..settings()
+    };
     if Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).is_ok() {
         let [first, last] = distances(&settings, 0);
         assert!(first > 0.5 && last < 0.15, "{first} → {last}");
@@ -149,35 +191,73 @@ fn ppo_learns_in_bf16_where_the_processor_has_it() {
 
 #[test]
 fn the_standard_deviations_follow_their_ramp_by_equal_factors() {
-    let std = Ramp { from: 0.5, to: 0.125, steps: 100, after: 0 };
-    let settings = PpoConfig { std: Geometric(std), ..settings() };
+    let std = Ramp {
+        from: 0.5,
+        to: 0.125,
+        steps: 100,
+        after: 0,
+    };
+    let settings = PpoConfig {
+        std: Geometric(std),
+        ..settings()
+    };
     let mut ppo = Ppo::new(&settings, SPACES, 0, Exchange::alone(1)).unwrap();
     assert!((ppo.policy.std() - 0.5).abs() < 1e-6);
-    for (env_steps, expected) in [(0, 0.5f32), (50, 0.25), (100, 0.125), (1000, 0.125), (0, 0.5)] {
+    for (env_steps, expected) in [
+        (0, 0.5f32),
+        (50, 0.25),
+        (100, 0.125),
+        (1000, 0.125),
+        (0, 0.5),
+    ] {
         ppo.follow_ramps(env_steps, &mut ppo.rollout(&[1]));
         assert!((ppo.policy.std() - expected).abs() < 1e-6, "{env_steps}");
     }
-    let at_once = PpoConfig { std: Geometric(Ramp { steps: 0, ..std }), ..settings };
+    let at_once = PpoConfig {
+        std: Geometric(Ramp { steps: 0, ..std }),
+        ..settings
+    };
     let ppo = Ppo::new(&at_once, SPACES, 0, Exchange::alone(1)).unwrap();
-    assert!((ppo.policy.std() - 0.125).abs() < 1e-6, "0 steps: the final value from the start");
+    assert!(
+        (ppo.policy.std() - 0.125).abs() < 1e-6,
+        "0 steps: the final value from the start"
+    );
 }
 
 #[test]
 fn while_the_critic_learns_alone_the_policy_stands_still() {
     for backend in [Backend::Fused, Backend::Candle] {
-        let mut agent = agent(&PpoConfig { backend, critic_first: 2, ..settings() }, 3);
+        let mut agent = agent(
+            &PpoConfig {
+                backend,
+                critic_first: 2,
+                ..settings()
+            },
+            3,
+        );
         let nets = |agent: &Agent<PointMass>| {
             let policy = &agent.ppo.policy;
-            policy.layout.nets().map(|net| policy.parameters[net].to_vec())
+            policy
+                .layout
+                .nets()
+                .map(|net| policy.parameters[net].to_vec())
         };
         let [actor, mut critic] = nets(&agent);
         for iteration in 1..=3 {
-            let stats = agent.iterate(&NEVER).unwrap().expect("nothing stops it").update;
+            let stats = agent
+                .iterate(&NEVER)
+                .unwrap()
+                .expect("nothing stops it")
+                .update;
             let [acts, values] = nets(&agent);
             let alone = iteration <= 2;
             assert_eq!(acts == actor, alone, "iteration {iteration}");
             assert!(values != critic, "iteration {iteration}");
-            assert_eq!(stats.learning_rate == settings().learning_rate, alone, "no divergence leads the rate then");
+            assert_eq!(
+                stats.learning_rate == settings().learning_rate,
+                alone,
+                "no divergence leads the rate then"
+            );
             critic = values;
         }
     }
@@ -186,7 +266,11 @@ fn while_the_critic_learns_alone_the_policy_stands_still() {
 #[test]
 fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone() {
     let moved = |critic_first: u64| {
-        let settings = PpoConfig { critic_first, desired_kl: Geometric(Ramp::constant(0.0)), ..settings() };
+        let settings = PpoConfig {
+            critic_first,
+            desired_kl: Geometric(Ramp::constant(0.0)),
+            ..settings()
+        };
         let mut agent = agent(&settings, 3);
         (0..critic_first).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
         let actor = |agent: &Agent<PointMass>| {
@@ -196,7 +280,12 @@ fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone()
         };
         let before = actor(&agent);
         agent.iterate(&NEVER).unwrap();
-        actor(&agent).iter().zip(before).map(|(after, before)| f64::from(after - before).powi(2)).sum::<f64>().sqrt()
+        actor(&agent)
+            .iter()
+            .zip(before)
+            .map(|(after, before)| f64::from(after - before).powi(2))
+            .sum::<f64>()
+            .sqrt()
     };
     let (at_once, later) = (moved(0), moved(20));
     assert!(later < 1.2 * at_once, "{later} after {at_once}");
@@ -205,19 +294,45 @@ fn the_first_steps_of_an_actor_are_no_larger_after_the_critic_has_learnt_alone()
 #[test]
 fn the_first_minibatch_sees_the_very_policy_that_acted() {
     for backend in [Backend::Fused, Backend::Candle] {
-        let mut agent = agent(&PpoConfig { backend, ..settings() }, 3);
+        let mut agent = agent(
+            &PpoConfig {
+                backend,
+                ..settings()
+            },
+            3,
+        );
         for iteration in 1..=5 {
-            let stats = agent.iterate(&NEVER).unwrap().expect("nothing stops it").update;
-            assert!(stats.first.kl.abs() < 1e-5, "iteration {iteration}: KL {}", stats.first.kl);
-            assert!(stats.first.ratio_error < 1e-4, "iteration {iteration}: ratio off by {}", stats.first.ratio_error);
-            assert!(stats.losses.kl > 1e-4, "the policy must have changed in later minibatches: {}", stats.losses.kl);
+            let stats = agent
+                .iterate(&NEVER)
+                .unwrap()
+                .expect("nothing stops it")
+                .update;
+            assert!(
+                stats.first.kl.abs() < 1e-5,
+                "iteration {iteration}: KL {}",
+                stats.first.kl
+            );
+            assert!(
+                stats.first.ratio_error < 1e-4,
+                "iteration {iteration}: ratio off by {}",
+                stats.first.ratio_error
+            );
+            assert!(
+                stats.losses.kl > 1e-4,
+                "the policy must have changed in later minibatches: {}",
+                stats.losses.kl
+            );
         }
     }
 }
 
 #[test]
 fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
-    let Agent { mut ppo, mut rollout, .. } = {
+    let Agent {
+        mut ppo,
+        mut rollout,
+        ..
+    } = {
         let mut agent = agent(&settings(), 0);
         agent.collect(&NEVER).unwrap().expect("nothing stops it");
         agent
@@ -225,27 +340,44 @@ fn a_reward_that_is_not_finite_stops_the_learner_and_names_the_minibatch() {
     rollout.blocks[2].rewards[5] = f32::NAN;
     let before = answer(&ppo);
     let error = format!("{:#}", ppo.update(&mut rollout, 17, &NEVER).unwrap_err());
-    assert!(error.contains("epoch 0, minibatch") && error.contains("NaN"), "{error}");
+    assert!(
+        error.contains("epoch 0, minibatch") && error.contains("NaN"),
+        "{error}"
+    );
     assert_eq!(before, answer(&ppo), "nothing is learnt from it");
 }
 
 /// Returns the mean action of the policy for one observation.
 fn answer(ppo: &Ppo) -> [f32; 2] {
     let (policy, mut means) = (ppo.policy.freeze(), [0.0; 2]);
-    policy.compute(&[0.3, -0.4], [&mut means, &mut []], &mut policy.workspace(1));
+    policy.compute(
+        &[0.3, -0.4],
+        [&mut means, &mut []],
+        &mut policy.workspace(1),
+    );
     means
 }
 
 #[test]
 fn a_panic_in_an_environment_is_an_error_with_its_number_on_any_number_of_threads() {
     for threads in [1, 2, 8] {
-        let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let threads = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
         threads.install(|| {
             let mut agent = agent(&settings(), 0);
             let trapped = agent.pool.envs_mut().nth(43).unwrap();
-            trapped.trap = Some(if trapped.age + 3 <= STEPS { trapped.age + 3 } else { 3 });
+            trapped.trap = Some(if trapped.age + 3 <= STEPS {
+                trapped.age + 3
+            } else {
+                3
+            });
             let said = format!("{:#}", agent.iterate(&NEVER).unwrap_err());
-            assert!(said.contains("environment 43 panicked") && said.contains("the trap"), "{said}");
+            assert!(
+                said.contains("environment 43 panicked") && said.contains("the trap"),
+                "{said}"
+            );
         });
     }
 }
@@ -256,15 +388,21 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
     // One point starts so far out that its episode terminates at once.
     agent.rollout.blocks[0].first_observations_mut()[..2].copy_from_slice(&[5.0, 5.0]);
     agent.pool.envs_mut().next().unwrap().position = [5.0, 5.0];
-    agent.pool.envs_mut().skip(1).step_by(2).for_each(|env| env.redirects = 7);
+    agent
+        .pool
+        .envs_mut()
+        .skip(1)
+        .step_by(2)
+        .for_each(|env| env.redirects = 7);
     agent.collect(&NEVER).unwrap().expect("nothing stops it");
     let policy = agent.ppo.policy.freeze();
     let mut work = policy.workspace(1);
     let (mut truncated, mut redirected, mut terminated) = (0, 0, 0);
     let blocks = agent.rollout.blocks.iter();
     for (block, i) in blocks.flat_map(|block| (0..block.samples()).map(move |i| (block, i))) {
-        let moved =
-            [0, 1].map(|axis| block.observations[2 * i + axis] + 0.2 * block.actions[2 * i + axis].clamp(-1.0, 1.0));
+        let moved = [0, 1].map(|axis| {
+            block.observations[2 * i + axis] + 0.2 * block.actions[2 * i + axis].clamp(-1.0, 1.0)
+        });
         let distance = moved[0].hypot(moved[1]);
         let mut expected = -0.2 * distance;
         if block.dones[i] && distance <= 3.0 {
@@ -272,15 +410,27 @@ fn truncation_and_another_goal_bootstrap_from_the_final_observation_and_terminat
             policy.compute(&moved, [&mut [], &mut value], &mut work);
             expected += 0.9 * value[0];
             let next = 2 * (i + block.step(0, 1).len());
-            let goes_on = (0..2).all(|axis| (block.observations[next + axis] - moved[axis]).abs() < 1e-5);
-            *if goes_on { &mut redirected } else { &mut truncated } += 1;
+            let goes_on =
+                (0..2).all(|axis| (block.observations[next + axis] - moved[axis]).abs() < 1e-5);
+            *if goes_on {
+                &mut redirected
+            } else {
+                &mut truncated
+            } += 1;
         } else if block.dones[i] {
             terminated += 1;
         }
-        assert!((block.rewards[i] - expected).abs() < 1e-5, "sample {i}: {} not {expected}", block.rewards[i]);
+        assert!(
+            (block.rewards[i] - expected).abs() < 1e-5,
+            "sample {i}: {} not {expected}",
+            block.rewards[i]
+        );
     }
     let found = format!("{truncated} truncated, {redirected} redirected, {terminated} terminated");
-    assert!(truncated > 30 && redirected > 30 && terminated == 1, "{found}");
+    assert!(
+        truncated > 30 && redirected > 30 && terminated == 1,
+        "{found}"
+    );
 }
 
 #[test]
@@ -294,7 +444,10 @@ fn an_interrupted_collection_says_so() {
 fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
     for envs in [1, 9, 21] {
         let learn = |threads: usize| {
-            let threads = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let threads = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             threads.install(|| {
                 let mut agent = agent_of(envs, &settings(), 5);
                 (0..4).for_each(|_| assert!(agent.iterate(&NEVER).unwrap().is_some()));
@@ -303,15 +456,29 @@ fn pools_of_any_size_learn_the_same_bits_on_any_number_of_threads() {
         };
         let one = learn(1);
         assert!(one.1.len() >= 3 * envs, "episodes must end during the test");
-        assert!([2, 3, 8].into_iter().all(|threads| one == learn(threads)), "{envs} environments");
+        assert!(
+            [2, 3, 8].into_iter().all(|threads| one == learn(threads)),
+            "{envs} environments"
+        );
     }
 }
 
 #[test]
 fn iterations_and_steps_are_counted_where_they_are_made() {
-    let mut agent = agent_of(9, &PpoConfig { horizon: Ramp::constant(8.0), ..settings() }, 0);
+    let mut agent = agent_of(
+        9,
+        &PpoConfig {
+            horizon: Ramp::constant(8.0),
+            ..settings()
+        },
+        0,
+    );
     let made = agent.iterate(&NEVER).unwrap().expect("nothing stops it");
     assert_eq!((agent.iteration, agent.env_steps, made.steps), (1, 72, 72));
     assert!(agent.iterate(&AtomicBool::new(true)).unwrap().is_none());
-    assert_eq!((agent.iteration, agent.env_steps), (1, 72), "an iteration that was stopped is not counted");
+    assert_eq!(
+        (agent.iteration, agent.env_steps),
+        (1, 72),
+        "an iteration that was stopped is not counted"
+    );
 }

@@ -36,13 +36,19 @@ fn edited(from: &str, to: &str) -> String {
 fn refused_when_edited(edits: &[(&str, &str, &str)]) {
     for (from, to, part) in edits {
         let message = refusal(&edited(from, to));
-        assert!(message.contains(part) && message.contains("own_scene.xml"), "{part} is not in: {message}");
+        assert!(
+            message.contains(part) && message.contains("own_scene.xml"),
+            "{part} is not in: {message}"
+        );
     }
 }
 
 #[track_caller]
 fn assert_range(found: [f64; 2], expected: [f64; 2]) {
-    assert!((0..2).all(|i| (found[i] - expected[i]).abs() < 1e-12), "{found:?} instead of {expected:?}");
+    assert!(
+        (0..2).all(|i| (found[i] - expected[i]).abs() < 1e-12),
+        "{found:?} instead of {expected:?}"
+    );
 }
 
 #[test]
@@ -75,7 +81,10 @@ fn a_still_hand_holds_the_cube_in_most_orientations() {
     let mut observation = vec![0.0; OBSERVATION_SIZE];
     let mut held = 0;
     for episode in 0..20 {
-        env.reset(shadow_repose::rng::stream(0, "test", episode), &mut observation);
+        env.reset(
+            shadow_repose::rng::stream(0, "test", episode),
+            &mut observation,
+        );
         if (0..200).all(|_| env.step(&[0.0; 20], &mut observation).end.is_none()) {
             held += 1;
         }
@@ -95,7 +104,11 @@ fn two_halves_of_a_step_are_the_same_bits_as_a_whole_one() {
     bare.restore(&env.sim.state()).unwrap();
     let simulation = &mut env.sim;
     for step in 0..50 {
-        let ctrl: Vec<f64> = simulation.ctrl().iter().map(|c| c + 0.001 * f64::from(step)).collect();
+        let ctrl: Vec<f64> = simulation
+            .ctrl()
+            .iter()
+            .map(|c| c + 0.001 * f64::from(step))
+            .collect();
         simulation.ctrl_mut().copy_from_slice(&ctrl);
         assert!(!simulation.step(1));
         bare.ctrl_mut().copy_from_slice(&ctrl);
@@ -121,7 +134,12 @@ fn bodies_are_of_the_same_instant_as_joints() {
     assert_eq!(other.velocity(tip), env.sim.velocity(tip));
     let position: Vec<f32> = other.pose(tip).position.iter().map(|&x| x as f32).collect();
     assert_eq!(observation[72..75], position);
-    let linear: Vec<f32> = other.velocity(tip).linear.iter().map(|&x| x as f32).collect();
+    let linear: Vec<f32> = other
+        .velocity(tip)
+        .linear
+        .iter()
+        .map(|&x| x as f32)
+        .collect();
     assert_eq!(observation[79..82], linear);
 }
 
@@ -131,14 +149,21 @@ fn an_own_scene_may_list_its_parts_in_any_order() {
     let start = SCENE.find("    <position name=\"rh_A_WRJ2\"").unwrap();
     let end = SCENE.find("  </actuator>").unwrap();
     let reversed: Vec<&str> = SCENE[start..end].lines().rev().collect();
-    let text = format!("{}{}\n{}", &SCENE[..start], reversed.join("\n"), &SCENE[end..]);
+    let text = format!(
+        "{}{}\n{}",
+        &SCENE[..start],
+        reversed.join("\n"),
+        &SCENE[end..]
+    );
     let folder = tempfile::tempdir().unwrap();
     let setting = format!("env.model={}", write(&folder, &text).display());
     let run = |settings: &[&str]| {
         let task = task(settings);
         let (mut env, mut observation) = started(&task);
         let action: Vec<f32> = (0..20).map(|i| (i as f32 - 10.0) / 12.0).collect();
-        let rewards: Vec<f32> = (0..20).map(|_| env.step(&action, &mut observation).reward).collect();
+        let rewards: Vec<f32> = (0..20)
+            .map(|_| env.step(&action, &mut observation).reward)
+            .collect();
         (rewards, observation, env.sim.ctrl().to_vec())
     };
     let (builtin, own) = (run(&[]), run(&[&setting]));
@@ -159,9 +184,16 @@ fn parts_of_an_own_scene_may_have_other_names() {
         ("rh_", "lh_"),
     ] {
         let folder = tempfile::tempdir().unwrap();
-        let task = task(&[&format!("env.model={}", write(&folder, &edited(from, to)).display())]);
+        let task = task(&[&format!(
+            "env.model={}",
+            write(&folder, &edited(from, to)).display()
+        )]);
         let spaces = task.spaces();
-        assert_eq!((spaces.observation_size, spaces.action_size), (OBSERVATION_SIZE, 20), "{to}");
+        assert_eq!(
+            (spaces.observation_size, spaces.action_size),
+            (OBSERVATION_SIZE, 20),
+            "{to}"
+        );
     }
 }
 
@@ -169,10 +201,21 @@ fn parts_of_an_own_scene_may_have_other_names() {
 fn all_names_that_are_missing_come_in_one_message() {
     let folder = tempfile::tempdir().unwrap();
     let model = format!("env.model={}", write(&folder, SCENE).display());
-    let names = ["hand.joints=[\"a\",\"rh_WRJ1\",\"b\"]", "hand.fingertips=[\"c\"]", "hand.object=d", "hand.goal=e"];
+    let names = [
+        "hand.joints=[\"a\",\"rh_WRJ1\",\"b\"]",
+        "hand.fingertips=[\"c\"]",
+        "hand.object=d",
+        "hand.goal=e",
+    ];
     let config = config(&[&[&model[..]], &names[..]].concat());
     let message = format!("{:#}", Task::new(&config).err().unwrap());
-    for name in ["own_scene.xml: has no body `d`", "body `e`", "body or site `c`", "joint `a`", "joint `b`"] {
+    for name in [
+        "own_scene.xml: has no body `d`",
+        "body `e`",
+        "body or site `c`",
+        "joint `a`",
+        "joint `b`",
+    ] {
         assert!(message.contains(name), "{name}: {message}");
     }
     assert!(!message.contains("rh_WRJ1"), "{message}");
@@ -183,34 +226,84 @@ fn what_mujoco_says_of_a_scene_is_not_cut_off() {
     let file = format!("{}thumb.stl", "a_long_folder/".repeat(20));
     let mesh = format!("<asset>\n    <mesh name=\"m\" file=\"{file}\"/>");
     assert!(refusal(&edited("<asset>", &mesh)).contains(&file));
-    let text =
-        edited("name=\"rh_A_THJ4\"", "name=\"rh_A_THJ4\" dampratio_of_the_thumb_joint_that_is_no_attribute=\"1\"");
+    let text = edited(
+        "name=\"rh_A_THJ4\"",
+        "name=\"rh_A_THJ4\" dampratio_of_the_thumb_joint_that_is_no_attribute=\"1\"",
+    );
     assert!(refusal(&text).contains("line "), "{}", refusal(&text));
 }
 
 #[test]
 fn wrong_joints_and_actuators_in_an_own_scene_are_refused() {
     refused_when_edited(&[
-        ("<joint name=\"rh_THJ3\"", "<joint name=\"rh_THJ3\" type=\"slide\"", "`rh_THJ3` must be a hinge"),
-        ("<freejoint name=\"cube\"/>", "<joint name=\"c\" type=\"ball\"/>", "no body with a free joint"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ4\"/>", "`rh_A_FFJ3` must drive rh_FFJ3"),
-        ("joint=\"rh_MFJ1\" coef=\"1\"", "joint=\"rh_MFJ1\" coef=\"2\"", "`rh_A_MFJ0` must drive rh_MFJ1 + rh_MFJ2"),
-        ("ctrlrange=\"0 3.1415\"", "", "must have one control with a ctrlrange"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"2\"/>", "`rh_A_FFJ3` must have a gear of 1"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" gear=\"-1\"/>", "`rh_A_FFJ3` must have a gear of 1"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" timeconst=\".1\"/>", "`rh_A_FFJ3` must act at once"),
-        ("joint=\"rh_FFJ3\"/>", "joint=\"rh_FFJ3\" delay=\".02\" nsample=\"4\"/>", "`rh_A_FFJ3` must act at once"),
+        (
+            "<joint name=\"rh_THJ3\"",
+            "<joint name=\"rh_THJ3\" type=\"slide\"",
+            "`rh_THJ3` must be a hinge",
+        ),
+        (
+            "<freejoint name=\"cube\"/>",
+            "<joint name=\"c\" type=\"ball\"/>",
+            "no body with a free joint",
+        ),
+        (
+            "joint=\"rh_FFJ3\"/>",
+            "joint=\"rh_FFJ4\"/>",
+            "`rh_A_FFJ3` must drive rh_FFJ3",
+        ),
+        (
+            "joint=\"rh_MFJ1\" coef=\"1\"",
+            "joint=\"rh_MFJ1\" coef=\"2\"",
+            "`rh_A_MFJ0` must drive rh_MFJ1 + rh_MFJ2",
+        ),
+        (
+            "ctrlrange=\"0 3.1415\"",
+            "",
+            "must have one control with a ctrlrange",
+        ),
+        (
+            "joint=\"rh_FFJ3\"/>",
+            "joint=\"rh_FFJ3\" gear=\"2\"/>",
+            "`rh_A_FFJ3` must have a gear of 1",
+        ),
+        (
+            "joint=\"rh_FFJ3\"/>",
+            "joint=\"rh_FFJ3\" gear=\"-1\"/>",
+            "`rh_A_FFJ3` must have a gear of 1",
+        ),
+        (
+            "joint=\"rh_FFJ3\"/>",
+            "joint=\"rh_FFJ3\" timeconst=\".1\"/>",
+            "`rh_A_FFJ3` must act at once",
+        ),
+        (
+            "joint=\"rh_FFJ3\"/>",
+            "joint=\"rh_FFJ3\" delay=\".02\" nsample=\"4\"/>",
+            "`rh_A_FFJ3` must act at once",
+        ),
         (
             "<position name=\"rh_A_THJ4\" class=\"hand\" joint=\"rh_THJ4\" forcerange=\"-2 2\"/>",
             "<motor name=\"rh_A_THJ4\" joint=\"rh_THJ4\" ctrlrange=\"-1 1\"/>",
             "`rh_A_THJ4` must be a position servo",
         ),
-        ("  </actuator>", "<motor name=\"more\" joint=\"rh_WRJ1\"/></actuator>", "has 21 controls"),
+        (
+            "  </actuator>",
+            "<motor name=\"more\" joint=\"rh_WRJ1\"/></actuator>",
+            "has 21 controls",
+        ),
         ("integrator=\"implicitfast\"", "integrator=\"RK4\"", "RK4"),
         ("</mujoco>", "", "MuJoCo refuses this scene"),
     ]);
-    let missing = format!("{:#}", Task::new(&config(&["env.model=nowhere.xml"])).err().unwrap());
-    assert!(missing.contains("nowhere.xml") && missing.contains("no such file"), "{missing}");
+    let missing = format!(
+        "{:#}",
+        Task::new(&config(&["env.model=nowhere.xml"]))
+            .err()
+            .unwrap()
+    );
+    assert!(
+        missing.contains("nowhere.xml") && missing.contains("no such file"),
+        "{missing}"
+    );
 }
 
 #[test]
@@ -221,7 +314,10 @@ fn the_program_decides_the_timestep() {
     let _ = env.step(&[0.0; 20], &mut observation);
     let fallen = before - env.sim.qpos()[task.scene.free_body("cube").unwrap().qpos + 2];
     // In five steps of 2 ms the cube falls by g · dt² · (1 + 2 + 3 + 4 + 5).
-    assert!((fallen - 9.81 * 0.002 * 0.002 * 15.0).abs() < 1e-6, "fell by {fallen}");
+    assert!(
+        (fallen - 9.81 * 0.002 * 0.002 * 15.0).abs() < 1e-6,
+        "fell by {fallen}"
+    );
 }
 
 /// Except for the pairs that the scene excludes by name.
@@ -230,26 +326,55 @@ fn everything_solid_can_touch_everything_else() {
     use mujoco_rs::prelude::MjModel;
     let model = MjModel::from_xml_string(SCENE).unwrap();
     let (kind, affinity) = (model.geom_contype(), model.geom_conaffinity());
-    let solid: Vec<usize> = (0..kind.len()).filter(|&g| kind[g] != 0 || affinity[g] != 0).collect();
+    let solid: Vec<usize> = (0..kind.len())
+        .filter(|&g| kind[g] != 0 || affinity[g] != 0)
+        .collect();
     assert_eq!(solid.len(), 38 + 1, "geoms of the hand and the cube");
     for &a in &solid {
-        assert!(solid.iter().all(|&b| kind[a] & affinity[b] != 0), "geom {a}");
+        assert!(
+            solid.iter().all(|&b| kind[a] & affinity[b] != 0),
+            "geom {a}"
+        );
     }
 }
 
 #[test]
 fn a_number_that_is_none_in_an_own_scene_is_named() {
     refused_when_edited(&[
-        ("<body name=\"cube\" pos=\".33", "<body name=\"cube\" pos=\"nan", "body_pos of body `cube`"),
-        ("mass=\".028\" friction=\"1.2\"", "mass=\".028\" friction=\"nan\"", "geom_friction of geom `cube`"),
-        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" damping=\"nan\" class", "dof_damping of joint `rh_FFJ3`"),
-        ("name=\"rh_FFJ3\" class", "name=\"rh_FFJ3\" springref=\"nan\" stiffness=\"1\" class", "qpos_spring"),
+        (
+            "<body name=\"cube\" pos=\".33",
+            "<body name=\"cube\" pos=\"nan",
+            "body_pos of body `cube`",
+        ),
+        (
+            "mass=\".028\" friction=\"1.2\"",
+            "mass=\".028\" friction=\"nan\"",
+            "geom_friction of geom `cube`",
+        ),
+        (
+            "name=\"rh_FFJ3\" class",
+            "name=\"rh_FFJ3\" damping=\"nan\" class",
+            "dof_damping of joint `rh_FFJ3`",
+        ),
+        (
+            "name=\"rh_FFJ3\" class",
+            "name=\"rh_FFJ3\" springref=\"nan\" stiffness=\"1\" class",
+            "qpos_spring",
+        ),
         (
             "</worldbody>",
             "</worldbody><equality><weld body1=\"cube\" relpose=\"nan 0 0 1 0 0 0\"/></equality>",
             "eq_data",
         ),
-        ("</worldbody>", "</worldbody><equality><weld body1=\"cube\" solref=\"nan 1\"/></equality>", "eq_solref"),
-        ("<option ", "<option o_margin=\"nan\" ", "o_margin of OPTION"),
+        (
+            "</worldbody>",
+            "</worldbody><equality><weld body1=\"cube\" solref=\"nan 1\"/></equality>",
+            "eq_solref",
+        ),
+        (
+            "<option ",
+            "<option o_margin=\"nan\" ",
+            "o_margin of OPTION",
+        ),
     ]);
 }

@@ -38,7 +38,10 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("env.action_penalty_scale=-0.01", &[]),
     ("env.reach_goal_bonus=5", &["env.success_tolerance=3"]),
     ("env.success_tolerance=3", &[]),
-    ("env.max_consecutive_successes=2", &["env.success_tolerance=3"]),
+    (
+        "env.max_consecutive_successes=2",
+        &["env.success_tolerance=3"],
+    ),
     (
         "env.success_hold=consecutive",
         &[
@@ -94,7 +97,10 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("ppo.backend=candle", &[]),
     ("ppo.precision=bf16-rounded", &[]),
     ("ppo.learning_rate=1e-3", &[]),
-    ("ppo.learning_rate_range=[4e-4,6e-4]", &["ppo.desired_kl=1e-7"]),
+    (
+        "ppo.learning_rate_range=[4e-4,6e-4]",
+        &["ppo.desired_kl=1e-7"],
+    ),
     ("ppo.learning_rate_range=[4e-4,6e-4]", &["ppo.desired_kl=0"]),
     ("ppo.desired_kl=1e-7", &[]),
     ("ppo.gamma=0.9", &[]),
@@ -102,7 +108,10 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("ppo.clip=0.001", &[]),
     ("ppo.value_clip=0.001", &[]),
     ("ppo.value_coef=1", &[]),
-    ("ppo.bounds_coef=1", &["ppo.learning_rate=1", "ppo.desired_kl=0"]),
+    (
+        "ppo.bounds_coef=1",
+        &["ppo.learning_rate=1", "ppo.desired_kl=0"],
+    ),
     ("ppo.max_grad_norm=0.001", &[]),
     ("ppo.reward_scale=0.1", &[]),
     ("ppo.std=0.3", &[]),
@@ -120,14 +129,32 @@ const CHANGES: &[(&str, &[&str])] = &[
 
 /// What shows of a run with these settings, and what it says.
 fn trained(folder: &Path, settings: &[&str]) -> (String, String) {
-    let always = ["randomization.share=1", "run.threads=1", "run.total_steps=256"];
-    let settings = always.iter().chain(settings).flat_map(|setting| ["--set", setting]);
-    let output = program(folder, &train(&["--run-dir", "run"].into_iter().chain(settings).collect::<Vec<_>>()));
+    let always = [
+        "randomization.share=1",
+        "run.threads=1",
+        "run.total_steps=256",
+    ];
+    let settings = always
+        .iter()
+        .chain(settings)
+        .flat_map(|setting| ["--set", setting]);
+    let output = program(
+        folder,
+        &train(
+            &["--run-dir", "run"]
+                .into_iter()
+                .chain(settings)
+                .collect::<Vec<_>>(),
+        ),
+    );
     let said = stderr(&output);
     let run = folder.join("run");
     fs::create_dir_all(run.join("checkpoints")).unwrap();
     let rows = run.join("metrics.csv").exists().then(|| metrics(&run));
-    (format!("{rows:?} {:?}", names(&run.join("checkpoints"))), said)
+    (
+        format!("{rows:?} {:?}", names(&run.join("checkpoints"))),
+        said,
+    )
 }
 
 /// The change, if it does nothing and nothing is said of it.
@@ -137,14 +164,18 @@ fn ignored(change: &str, more: &[&str]) -> Option<String> {
     let (found, said) = trained(after.path(), &[more, &[change]].concat());
     let key = change.split('=').next().unwrap();
     let is_about = |line: &str| line.contains(key) || line.contains("nothing");
-    let is_told = said.lines().any(|line| is_about(line) && !usually_said.contains(line));
+    let is_told = said
+        .lines()
+        .any(|line| is_about(line) && !usually_said.contains(line));
     (found == usual && !is_told).then(|| format!("{change} {more:?}: {said}"))
 }
 
 #[test]
 fn no_setting_is_ignored_without_a_word() {
     let hand = task(&[]).hand.parts.clone();
-    let reversed = |key: &str, names: &[String]| format!("hand.{key}={:?}", Vec::from_iter(names.iter().rev()));
+    let reversed = |key: &str, names: &[String]| {
+        format!("hand.{key}={:?}", Vec::from_iter(names.iter().rev()))
+    };
     let lists = [
         reversed("joints", &hand.joints),
         reversed("actuators", &hand.actuators),
@@ -153,13 +184,22 @@ fn no_setting_is_ignored_without_a_word() {
     let lists: Vec<(&str, &[&str])> = lists.iter().map(|list| (&**list, &[][..])).collect();
     let changes = [CHANGES, &lists].concat();
     let base: toml::Table = BASE.parse().unwrap();
-    let sections = base.iter().map(|(section, keys)| (section, keys.as_table().unwrap()));
-    let keys = sections.flat_map(|(section, keys)| keys.keys().map(move |key| format!("{section}.{key}")));
+    let sections = base
+        .iter()
+        .map(|(section, keys)| (section, keys.as_table().unwrap()));
+    let keys =
+        sections.flat_map(|(section, keys)| keys.keys().map(move |key| format!("{section}.{key}")));
     let is_tried = |key: &String| changes.iter().any(|(change, _)| change.starts_with(&**key));
     // The height at which the goal is drawn shows in pictures alone, and threads only share the work.
     let untried: Vec<String> = keys.filter(|key| !is_tried(key)).collect();
     assert_eq!(untried, ["env.target_height", "run.threads"]);
-    assert_ne!(task(&["env.target_height=0.3"]).goal_place(), task(&[]).goal_place());
-    let ignored: Vec<String> = changes.par_iter().filter_map(|(change, more)| ignored(change, more)).collect();
+    assert_ne!(
+        task(&["env.target_height=0.3"]).goal_place(),
+        task(&[]).goal_place()
+    );
+    let ignored: Vec<String> = changes
+        .par_iter()
+        .filter_map(|(change, more)| ignored(change, more))
+        .collect();
     assert_eq!(ignored, [""; 0]);
 }

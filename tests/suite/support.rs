@@ -70,7 +70,11 @@ pub(crate) fn program(folder: &Path, args: &[&str]) -> Output {
 pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_shadow-repose"));
     // Otherwise the window of a test would open on the user's own display.
-    command.current_dir(folder).args(args).env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY");
+    command
+        .current_dir(folder)
+        .args(args)
+        .env_remove("DISPLAY")
+        .env_remove("WAYLAND_DISPLAY");
     // Commands that it prints depend on whether cargo has called it.
     command.env_remove("CARGO_PKG_NAME");
     command
@@ -79,7 +83,9 @@ pub(crate) fn command(folder: &Path, args: &[&str]) -> Command {
 /// Returns the arguments of `train` with the settings of [`SMALL`] and `more` arguments.
 pub(crate) fn train<'a>(more: &[&'a str]) -> Vec<&'a str> {
     let mut args = vec!["train"];
-    SMALL.iter().for_each(|setting| args.extend(["--set", setting]));
+    SMALL
+        .iter()
+        .for_each(|setting| args.extend(["--set", setting]));
     args.extend(more);
     args
 }
@@ -92,13 +98,21 @@ pub(crate) fn stderr(output: &Output) -> String {
 /// Fails with what the program printed on stderr unless it exited with 0.
 #[track_caller]
 pub(crate) fn succeeded(output: Output) -> Output {
-    assert!(output.status.success(), "{:?}\n{}", output.status, stderr(&output));
+    assert!(
+        output.status.success(),
+        "{:?}\n{}",
+        output.status,
+        stderr(&output)
+    );
     output
 }
 
 /// Prints that something cannot be tested here and returns false. Fails if CI has installed what the test needs.
 pub(crate) fn must_be_possible(what: &str) -> bool {
-    assert!(std::env::var_os("SHADOW_REPOSE_SEES").is_none(), "not possible here: {what}");
+    assert!(
+        std::env::var_os("SHADOW_REPOSE_SEES").is_none(),
+        "not possible here: {what}"
+    );
     eprintln!("not tested: {what}");
     false
 }
@@ -122,18 +136,29 @@ pub(crate) fn colours_of_the_cube(rgb: &[u8]) -> usize {
         } else {
             240.0 + 60.0 * (r - g) / range
         };
-        let hues = [-12.0..12.0, 18.0..38.0, 42.0..62.0, 90.0..160.0, 200.0..240.0];
+        let hues = [
+            -12.0..12.0,
+            18.0..38.0,
+            42.0..62.0,
+            90.0..160.0,
+            200.0..240.0,
+        ];
         if let Some(colour) = hues.iter().position(|hues| hues.contains(&hue)) {
             found[colour] += 1;
         }
     }
-    found.iter().filter(|&&pixels| pixels * 500 > rgb.len() / 3).count()
+    found
+        .iter()
+        .filter(|&&pixels| pixels * 500 > rgb.len() / 3)
+        .count()
 }
 
 /// Returns the names in a folder, sorted.
 pub(crate) fn names(folder: &Path) -> Vec<String> {
-    let mut names: Vec<String> =
-        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    let mut names: Vec<String> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
     names.sort();
     names
 }
@@ -143,7 +168,10 @@ pub(crate) fn metrics(run: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(run.join("metrics.csv")).unwrap();
     let header: Vec<&str> = text.lines().next().unwrap().split(',').collect();
     let kept = |row: &str| {
-        let cells = row.split(',').zip(&header).filter(|(_, name)| !name.starts_with("time/"));
+        let cells = row
+            .split(',')
+            .zip(&header)
+            .filter(|(_, name)| !name.starts_with("time/"));
         cells.map(|(cell, _)| cell.to_owned()).collect()
     };
     text.lines().map(kept).collect()
@@ -153,15 +181,22 @@ pub(crate) fn metrics(run: &Path) -> Vec<Vec<String>> {
 pub(crate) fn weights(path: PathBuf) -> Vec<(String, Vec<u8>)> {
     let bytes = fs::read(path).unwrap();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-    let mut found: Vec<_> = tensors.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();
+    let mut found: Vec<_> = tensors
+        .iter()
+        .map(|(name, view)| (name.to_owned(), view.data().to_vec()))
+        .collect();
     found.sort();
     found
 }
 
 /// Returns the events in the event files of a run, in order.
 pub(crate) fn events(run: &Path) -> Vec<tensorboard_proto::event::Event> {
-    let files = fs::read_dir(run).unwrap().map(|entry| entry.unwrap().path());
-    let mut files: Vec<PathBuf> = files.filter(|path| path.to_string_lossy().contains("tfevents")).collect();
+    let files = fs::read_dir(run)
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
+    let mut files: Vec<PathBuf> = files
+        .filter(|path| path.to_string_lossy().contains("tfevents"))
+        .collect();
     files.sort();
     let mut found = Vec::new();
     for file in files {

@@ -8,7 +8,10 @@ use std::time::{Duration, Instant};
 use crate::support::{SMALL, metrics, names, succeeded, weights};
 
 fn has_python() -> bool {
-    let found = Command::new("python3").args(["-c", "import tomllib"]).status().is_ok_and(|status| status.success());
+    let found = Command::new("python3")
+        .args(["-c", "import tomllib"])
+        .status()
+        .is_ok_and(|status| status.success());
     if !found {
         eprintln!("not tested: there is no Python 3.11");
     }
@@ -43,7 +46,9 @@ fn a_sweep_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     fs::write(folder.join("what.toml"), what).unwrap();
     let mut killed = sweep(folder).stdout(Stdio::null()).spawn().unwrap();
     let begun = Instant::now();
-    while !folder.join("runs/base-0/metrics.csv").exists() && begun.elapsed() < Duration::from_secs(60) {
+    while !folder.join("runs/base-0/metrics.csv").exists()
+        && begun.elapsed() < Duration::from_secs(60)
+    {
         std::thread::sleep(Duration::from_millis(20));
     }
     killed.kill().unwrap();
@@ -54,29 +59,53 @@ fn a_sweep_is_killed_goes_on_and_compares_its_variants_with_the_base() {
     for seed in [0, 1] {
         let [base, same] = ["base", "same"].map(|name| runs.join(format!("{name}-{seed}")));
         assert_eq!(metrics(&base), metrics(&same), "seed {seed}");
-        let [base, same] = [base, same].map(|run| weights(run.join("checkpoints/iteration-00000010.safetensors")));
+        let [base, same] =
+            [base, same].map(|run| weights(run.join("checkpoints/iteration-00000010.safetensors")));
         assert_eq!(base, same, "seed {seed}");
     }
     let kept = |name: &str| [0, 1].map(|seed| format!("{name}-{seed}-640.safetensors"));
-    assert_eq!(names(&runs.join("kept")), [kept("base"), kept("louder"), kept("same")].concat());
+    assert_eq!(
+        names(&runs.join("kept")),
+        [kept("base"), kept("louder"), kept("same")].concat()
+    );
     assert!(
-        said.contains("louder is stopped: policy/std at 640 steps is 1.3") && said.contains(", above 1.1 in all seeds"),
+        said.contains("louder is stopped: policy/std at 640 steps is 1.3")
+            && said.contains(", above 1.1 in all seeds"),
         "{said}"
     );
     assert_eq!(metrics(&runs.join("louder-1")).last().unwrap()[1], "640");
-    let row = said.lines().skip_while(|line| *line != "at 1,280 steps:").find(|line| line.starts_with("| same"));
-    assert!(row.is_some_and(|row| row.contains("(+0.000 ± 0.000, up in 0 of 2)")), "{said}");
+    let row = said
+        .lines()
+        .skip_while(|line| *line != "at 1,280 steps:")
+        .find(|line| line.starts_with("| same"));
+    assert!(
+        row.is_some_and(|row| row.contains("(+0.000 ± 0.000, up in 0 of 2)")),
+        "{said}"
+    );
     assert!(runs.join("picture.svg").exists());
-    succeeded(sweep(folder).args(["--publish", "published"]).output().unwrap());
+    succeeded(
+        sweep(folder)
+            .args(["--publish", "published"])
+            .output()
+            .unwrap(),
+    );
     let published = folder.join("published");
     assert!(published.join("README.md").exists() && published.join("sweep.toml").exists());
     let table = fs::read_to_string(published.join("louder-1/metrics.csv")).unwrap();
-    assert!(table.starts_with("env_steps,episode/goals,") && table.contains(",time/update_s\n"), "{table}");
+    assert!(
+        table.starts_with("env_steps,episode/goals,") && table.contains(",time/update_s\n"),
+        "{table}"
+    );
     // Other settings are refused in the same folder.
-    let changed = fs::read_to_string(folder.join("what.toml")).unwrap().replace("0.8", "0.9");
+    let changed = fs::read_to_string(folder.join("what.toml"))
+        .unwrap()
+        .replace("0.8", "0.9");
     fs::write(folder.join("what.toml"), changed).unwrap();
     let refused = sweep(folder).output().unwrap();
-    assert!(!refused.status.success() && String::from_utf8_lossy(&refused.stderr).contains("louder, seed 0"));
+    assert!(
+        !refused.status.success()
+            && String::from_utf8_lossy(&refused.stderr).contains("louder, seed 0")
+    );
 }
 
 #[test]
@@ -94,14 +123,33 @@ fn a_variant_that_fails_is_named_and_the_others_are_trained() {
     let said = String::from_utf8_lossy(&output.stdout);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("ppo.epoch: unknown key"), "{said}");
-    assert!(said.contains("failed: wrong, seed 0; wrong, seed 1; the same command tries again"), "{said}");
-    for (name, last) in [("base-0", "256"), ("base-1", "256"), ("short-0", "128"), ("short-1", "128")] {
-        assert_eq!(metrics(&folder.join("runs").join(name)).last().unwrap()[1], last, "{name}");
+    assert!(
+        said.contains("failed: wrong, seed 0; wrong, seed 1; the same command tries again"),
+        "{said}"
+    );
+    for (name, last) in [
+        ("base-0", "256"),
+        ("base-1", "256"),
+        ("short-0", "128"),
+        ("short-1", "128"),
+    ] {
+        assert_eq!(
+            metrics(&folder.join("runs").join(name)).last().unwrap()[1],
+            last,
+            "{name}"
+        );
     }
     // What had not begun may be corrected.
-    fs::write(folder.join("what.toml"), what.replace("ppo.epoch=2", "ppo.epochs=2")).unwrap();
+    fs::write(
+        folder.join("what.toml"),
+        what.replace("ppo.epoch=2", "ppo.epochs=2"),
+    )
+    .unwrap();
     succeeded(sweep(folder).output().unwrap());
-    assert_eq!(metrics(&folder.join("runs/wrong-1")).last().unwrap()[1], "256");
+    assert_eq!(
+        metrics(&folder.join("runs/wrong-1")).last().unwrap()[1],
+        "256"
+    );
 }
 
 #[test]
@@ -112,21 +160,37 @@ fn a_sweep_keeps_the_program_that_it_began_with_and_its_folder_for_itself() {
     let place = tempfile::tempdir().unwrap();
     let folder = place.path();
     // It trains for longer than this test.
-    fs::write(folder.join("what.toml"), format!("steps = 100_000_000\nseeds = [0]\nset = {SMALL:?}\n")).unwrap();
+    fs::write(
+        folder.join("what.toml"),
+        format!("steps = 100_000_000\nseeds = [0]\nset = {SMALL:?}\n"),
+    )
+    .unwrap();
     let own = folder.join("own");
     fs::copy(env!("CARGO_BIN_EXE_shadow-repose"), &own).unwrap();
     let mut first = sweep(folder);
-    let mut first = first.args(["--program", "own"]).stdout(Stdio::null()).spawn().unwrap();
+    let mut first = first
+        .args(["--program", "own"])
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
     let begun = Instant::now();
-    while !folder.join("runs/base-0/metrics.csv").exists() && begun.elapsed() < Duration::from_secs(60) {
+    while !folder.join("runs/base-0/metrics.csv").exists()
+        && begun.elapsed() < Duration::from_secs(60)
+    {
         std::thread::sleep(Duration::from_millis(20));
     }
     fs::write(&own, "rebuilt").unwrap();
     let second = sweep(folder).output().unwrap();
     first.kill().unwrap();
     first.wait().unwrap();
-    assert!(String::from_utf8_lossy(&second.stderr).contains("another sweep.py is at work here"), "{second:?}");
-    assert_eq!(fs::read(folder.join("runs/program")).unwrap(), fs::read(env!("CARGO_BIN_EXE_shadow-repose")).unwrap());
+    assert!(
+        String::from_utf8_lossy(&second.stderr).contains("another sweep.py is at work here"),
+        "{second:?}"
+    );
+    assert_eq!(
+        fs::read(folder.join("runs/program")).unwrap(),
+        fs::read(env!("CARGO_BIN_EXE_shadow-repose")).unwrap()
+    );
     let table = succeeded(sweep(folder).arg("--table").output().unwrap()).stdout;
     assert!(String::from_utf8_lossy(&table).contains("base, seed 0: "));
     // Its training saves and ends by itself. Until then the folder cannot be removed.

@@ -31,7 +31,10 @@ fn put_object(env: &mut Repose, task: &Task, orientation: Quat) {
 #[track_caller]
 fn assert_close(found: &[f32], expected: &[f64]) {
     assert_eq!(found.len(), expected.len());
-    let close = found.iter().zip(expected).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-6 * (1.0 + b.abs()));
+    let close = found
+        .iter()
+        .zip(expected)
+        .all(|(a, b)| (f64::from(*a) - b).abs() < 1e-6 * (1.0 + b.abs()));
     assert!(close, "{found:?}\n{expected:?}");
 }
 
@@ -54,16 +57,23 @@ fn observations_land_at_their_indices() {
     env.observe(&mut observation);
 
     let order = [
-        "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3", "MFJ2", "MFJ1", "RFJ4",
-        "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1", "WRJ2", "WRJ1",
+        "THJ5", "THJ4", "THJ3", "THJ2", "THJ1", "FFJ4", "FFJ3", "FFJ2", "FFJ1", "MFJ4", "MFJ3",
+        "MFJ2", "MFJ1", "RFJ4", "RFJ3", "RFJ2", "RFJ1", "LFJ5", "LFJ4", "LFJ3", "LFJ2", "LFJ1",
+        "WRJ2", "WRJ1",
     ];
     for (i, name) in order.iter().enumerate() {
         let joint = task.scene.hinge(&format!("rh_{name}")).unwrap();
         assert_close(&observation[i..=i], &[env.sim.qpos()[joint.qpos]]);
-        assert_close(&observation[24 + i..=24 + i], &[0.2 * env.sim.qvel()[joint.dof]]);
+        assert_close(
+            &observation[24 + i..=24 + i],
+            &[0.2 * env.sim.qvel()[joint.dof]],
+        );
     }
     assert_close(&observation[48..51], &[0.33, 0.0, 0.295]);
-    assert_close(&observation[51..55], &[FRAC_1_SQRT_2, 0.0, 0.0, FRAC_1_SQRT_2]);
+    assert_close(
+        &observation[51..55],
+        &[FRAC_1_SQRT_2, 0.0, 0.0, FRAC_1_SQRT_2],
+    );
     assert_close(&observation[55..58], &[0.1, 0.2, 0.3]);
     // Body frame (1, 2, 3), a quarter turn about z: (-2, 1, 3) in the world, times 0.2.
     assert_close(&observation[58..61], &[-0.4, 0.2, 0.6]);
@@ -71,11 +81,28 @@ fn observations_land_at_their_indices() {
     assert_close(&observation[64..68], &quat::canonical(env.goal));
     let relative = quat::canonical(quat::mul(orientation, quat::conj(env.goal)));
     assert_close(&observation[68..72], &relative);
-    for (i, name) in ["rh_ffdistal", "rh_mfdistal", "rh_rfdistal", "rh_lfdistal", "rh_thdistal"].iter().enumerate() {
+    for (i, name) in [
+        "rh_ffdistal",
+        "rh_mfdistal",
+        "rh_rfdistal",
+        "rh_lfdistal",
+        "rh_thdistal",
+    ]
+    .iter()
+    .enumerate()
+    {
         let body = task.scene.frame(name).unwrap();
-        let Pose { position, orientation: turned } = env.sim.pose(body);
+        let Pose {
+            position,
+            orientation: turned,
+        } = env.sim.pose(body);
         let Velocity { linear, angular } = env.sim.velocity(body);
-        let expected: Vec<f64> = position.into_iter().chain(turned).chain(linear).chain(angular).collect();
+        let expected: Vec<f64> = position
+            .into_iter()
+            .chain(turned)
+            .chain(linear)
+            .chain(angular)
+            .collect();
         assert_close(&observation[72 + 13 * i..85 + 13 * i], &expected);
         assert!(linear.iter().any(|v| v.abs() > 1e-3), "{name} moves");
     }
@@ -132,7 +159,10 @@ fn smoothing_averages_targets_and_begins_at_the_reset_joints() {
     let hand = &task.hand;
     let (mut env, mut observation) = started(&task);
     let angle = |env: &Repose, name: &str| env.sim.qpos()[task.scene.hinge(name).unwrap().qpos];
-    let (single, coupled) = (angle(&env, "rh_FFJ3"), angle(&env, "rh_FFJ2") + angle(&env, "rh_FFJ1"));
+    let (single, coupled) = (
+        angle(&env, "rh_FFJ3"),
+        angle(&env, "rh_FFJ2") + angle(&env, "rh_FFJ1"),
+    );
     assert!(coupled > 0.0, "the noise has moved the coupled joints");
     let _ = env.step(&[1.0; 20], &mut observation);
     let ctrl = |env: &Repose, i: usize| env.sim.ctrl()[hand.actuators[i].ctrl];
@@ -152,7 +182,10 @@ fn a_goal_is_reached_after_enough_steps_within_tolerance_and_the_episode_goes_on
         put_object(&mut env, &task, goal);
         let transition = env.step(&STILL, &mut observation);
         let details = env.last.clone();
-        assert_eq!((details.goal, details.reward[3], transition.end), (goal, 2.0, None));
+        assert_eq!(
+            (details.goal, details.reward[3], transition.end),
+            (goal, 2.0, None)
+        );
         assert!(details.rot_dist < 0.1);
         // The reward is computed against the goal in force.
         let rotation = 1.0 / (details.rot_dist + 0.1);
@@ -221,7 +254,10 @@ fn a_diverged_state_terminates_pays_nothing_and_leaves_no_trace_in_the_next_epis
         assert!(env.episode().diverged && env.last.diverged && !env.episode().dropped);
         assert!(observation.iter().all(|x| x.is_finite()));
         assert_eq!(env.take_sums().diverged, 1);
-        assert!(env.sim.ctrl().iter().any(|&c| c != 0.0), "the controls that were sent are still there");
+        assert!(
+            env.sim.ctrl().iter().any(|&c| c != 0.0),
+            "the controls that were sent are still there"
+        );
         env.reset(rng::stream(7, "test", 0), &mut observation);
         for _ in 0..10 {
             let _ = env.step(&[0.2; 20], &mut observation);
@@ -238,7 +274,10 @@ fn an_action_that_is_not_a_number_ends_the_episode_as_diverged() {
     let (mut env, mut observation) = started(&task);
     let mut action = STILL;
     action[3] = f32::NAN;
-    assert_eq!(env.step(&action, &mut observation).end, Some(End::Terminated));
+    assert_eq!(
+        env.step(&action, &mut observation).end,
+        Some(End::Terminated)
+    );
     assert!(env.episode().diverged);
 }
 
@@ -261,13 +300,20 @@ fn resets_stay_within_the_noise_and_the_joints_limits() {
         for (x, middle) in object.iter().zip([0.33, 0.0, 0.295]) {
             assert!((x - middle).abs() <= 0.01);
         }
-        assert!(qvel[hand.object.dof..hand.object.dof + 6].iter().all(|&v| v == 0.0));
+        assert!(
+            qvel[hand.object.dof..hand.object.dof + 6]
+                .iter()
+                .all(|&v| v == 0.0)
+        );
         let orientation: Quat = object[3..].try_into().unwrap();
         angles.push(quat::angle_between(orientation, env.goal));
         starts.push(qpos[hand.joints[0].qpos]);
     }
     let mean = angles.iter().sum::<f64>() / angles.len() as f64;
-    assert!((mean - 2.21).abs() < 0.15, "cube and goal are independent and uniform: mean angle {mean}");
+    assert!(
+        (mean - 2.21).abs() < 0.15,
+        "cube and goal are independent and uniform: mean angle {mean}"
+    );
     assert!(starts.iter().any(|&x| x > 0.15) && starts.iter().any(|&x| x < -0.15));
 }
 
@@ -283,12 +329,25 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
             simulation.qpos_mut()[7] = poison;
             simulation.qvel_mut()[20] = poison;
         }
-        let stats = agent.iterate(&never).unwrap().expect("nothing stops it").update;
+        let stats = agent
+            .iterate(&never)
+            .unwrap()
+            .expect("nothing stops it")
+            .update;
         assert!(stats.losses.value_error.is_finite() && stats.losses.kl.is_finite());
-        let diverged: u64 = agent.pool.envs_mut().map(|env| env.take_sums().diverged).sum();
+        let diverged: u64 = agent
+            .pool
+            .envs_mut()
+            .map(|env| env.take_sums().diverged)
+            .sum();
         assert_eq!(diverged, 2, "iteration {iteration}");
         assert_eq!(
-            agent.pool.take_finished().iter().filter(|episode| episode.diverged).count(),
+            agent
+                .pool
+                .take_finished()
+                .iter()
+                .filter(|episode| episode.diverged)
+                .count(),
             2,
             "only those episodes end"
         );
@@ -300,7 +359,12 @@ fn nan_in_a_hundredth_of_the_environments_each_iteration_is_counted_and_learning
 
 #[test]
 fn every_scale_of_the_reward_is_a_setting() {
-    let step = |action| Step { rot_dist: 0.3, goal_dist: 0.1, action: vec![action; 20], ..Step::default() };
+    let step = |action| Step {
+        rot_dist: 0.3,
+        goal_dist: 0.1,
+        action: vec![action; 20],
+        ..Step::default()
+    };
     let paid = |set: &str| task_reward(&env_config(&[set]), &step(0.5));
     let default = [1.0 / 0.4, -1.0, -0.0002 * 5.0, 0.0, 0.0];
     for (set, term, expected) in [
@@ -314,17 +378,34 @@ fn every_scale_of_the_reward_is_a_setting() {
     ] {
         for (i, (found, default)) in paid(set).into_iter().zip(default).enumerate() {
             let expected = if i == term { expected } else { default };
-            assert!((found - expected).abs() < 1e-12, "{set}: term {i} is {found}, not {expected}");
+            assert!(
+                (found - expected).abs() < 1e-12,
+                "{set}: term {i} is {found}, not {expected}"
+            );
         }
     }
-    let both = env_config(&["env.success_tolerance=0.35", "env.reach_goal_bonus=9", "env.fall_dist=0.05"]);
+    let both = env_config(&[
+        "env.success_tolerance=0.35",
+        "env.reach_goal_bonus=9",
+        "env.fall_dist=0.05",
+    ]);
     assert_eq!(task_reward(&both, &step(0.0))[3], 9.0);
 }
 
 #[test]
 fn where_cube_and_target_are_and_how_an_episode_begins_are_settings() {
-    let sets = ["env.goal_position=[0.3,0.02,0.31]", "env.target_height=0.4", "env.reset_position_noise=0"];
-    let task = task(&[&sets[..], &["env.reset_dof_pos_noise=0", "env.vel_obs_scale=0.5"]].concat());
+    let sets = [
+        "env.goal_position=[0.3,0.02,0.31]",
+        "env.target_height=0.4",
+        "env.reset_position_noise=0",
+    ];
+    let task = task(
+        &[
+            &sets[..],
+            &["env.reset_dof_pos_noise=0", "env.vel_obs_scale=0.5"],
+        ]
+        .concat(),
+    );
     let (mut env, mut observation) = started(&task);
     assert_close(&observation[48..51], &[0.3, 0.02, 0.31]);
     assert_close(&observation[61..64], &[0.3, 0.02, 0.31]);

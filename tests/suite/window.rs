@@ -24,23 +24,46 @@ impl Display {
         let folder = tempfile::tempdir().unwrap();
         let mut server = Command::new("Xvfb");
         server
-            .args(["-displayfd", "1", "-screen", "0", "1280x720x24", "-nolisten", "tcp", "-fbdir"])
+            .args([
+                "-displayfd",
+                "1",
+                "-screen",
+                "0",
+                "1280x720x24",
+                "-nolisten",
+                "tcp",
+                "-fbdir",
+            ])
             .arg(folder.path());
         let server = server.stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
-        let (Ok(mut server), true) = (server, Command::new("xdotool").arg("version").output().is_ok()) else {
+        let (Ok(mut server), true) = (
+            server,
+            Command::new("xdotool").arg("version").output().is_ok(),
+        ) else {
             must_be_possible("the window: Xvfb or xdotool is missing");
             return None;
         };
         let mut line = String::new();
-        BufReader::new(server.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        BufReader::new(server.stdout.take().unwrap())
+            .read_line(&mut line)
+            .unwrap();
         let name = format!(":{}", line.trim());
-        Some(Self { server, name, folder })
+        Some(Self {
+            server,
+            name,
+            folder,
+        })
     }
 
     /// Starts the program on this display.
     fn start(&self, folder: &Path, args: &[&str]) -> Child {
         let mut command = command(folder, args);
-        command.env("DISPLAY", &self.name).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+        command
+            .env("DISPLAY", &self.name)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap()
     }
 
     /// Presses keys in the window.
@@ -56,7 +79,9 @@ impl Display {
             "windowfocus",
         ]);
         // The window takes the focus a little later.
-        xdotool.args(["sleep", "0.5", "key", "--delay", "200"]).args(keys);
+        xdotool
+            .args(["sleep", "0.5", "key", "--delay", "200"])
+            .args(keys);
         // xdotool reports an error if a key closes the window. The caller checks what the keys did.
         xdotool.stderr(Stdio::null()).status().unwrap();
     }
@@ -78,12 +103,20 @@ impl Display {
         let path: PathBuf = self.folder.path().join("Xvfb_screen0");
         let dump = fs::read(path).unwrap();
         // XWD: a big-endian header, the palette, then rows of pixels.
-        let word = |i: usize| u32::from_be_bytes(dump[4 * i..4 * i + 4].try_into().unwrap()) as usize;
-        let (header, width, height, bytes_per_line, palette) = (word(0), word(4), word(5), word(12), word(19));
+        let word =
+            |i: usize| u32::from_be_bytes(dump[4 * i..4 * i + 4].try_into().unwrap()) as usize;
+        let (header, width, height, bytes_per_line, palette) =
+            (word(0), word(4), word(5), word(12), word(19));
         assert_eq!((width, height, word(11)), (1280, 720, 32));
         let pixels = &dump[header + 12 * palette..];
         let row = |y: usize| &pixels[y * bytes_per_line..][4 * columns.start..4 * columns.end];
-        (0..height).flat_map(|y| row(y).chunks_exact(4).flat_map(|bgrx| [bgrx[2], bgrx[1], bgrx[0]])).collect()
+        (0..height)
+            .flat_map(|y| {
+                row(y)
+                    .chunks_exact(4)
+                    .flat_map(|bgrx| [bgrx[2], bgrx[1], bgrx[0]])
+            })
+            .collect()
     }
 
     /// Waits until the scene passes the test, and returns it.
@@ -135,16 +168,22 @@ const WAVE: [&str; 12] = [
 
 #[test]
 fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
-    let Some(display) = Display::open() else { return };
+    let Some(display) = Display::open() else {
+        return;
+    };
     let folder = tempfile::tempdir().unwrap();
     let mut child = display.start(folder.path(), &WAVE);
-    display.wait("the cube is visible", |scene| colours_of_the_cube(scene) >= 2);
+    display.wait("the cube is visible", |scene| {
+        colours_of_the_cube(scene) >= 2
+    });
     let before = display.scene();
     display.wait("the hand moves", |scene| scene != before);
 
     display.press(&["space"]);
     let paused = display.wait_for_rest();
-    display.press(&["Right", "Right", "Right", "Right", "Right", "Right", "Right", "Right"]);
+    display.press(&[
+        "Right", "Right", "Right", "Right", "Right", "Right", "Right", "Right",
+    ]);
     display.wait("single steps move the hand", |scene| scene != paused);
     let stepped = display.wait_for_rest();
     display.press(&["g"]);
@@ -156,9 +195,14 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     display.press(&["space"]);
     display.wait("the hand moves again", |scene| scene != reset);
 
-    assert!(display.panel_at_the_left() < 0.1, "MuJoCo's own panel is closed");
+    assert!(
+        display.panel_at_the_left() < 0.1,
+        "MuJoCo's own panel is closed"
+    );
     display.press(&["x"]);
-    display.wait("a key opens MuJoCo's own panel", |_| display.panel_at_the_left() > 0.5);
+    display.wait("a key opens MuJoCo's own panel", |_| {
+        display.panel_at_the_left() > 0.5
+    });
 
     display.press(&["ctrl+q"]);
     let begun = Instant::now();
@@ -168,24 +212,56 @@ fn the_window_shows_the_cube_and_keys_pause_step_and_close_it() {
     let _ = child.kill();
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(stderr(&output).contains(" steps, 0 episodes completed"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains(" steps, 0 episodes completed"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[test]
 fn where_there_is_a_display_play_opens_a_window_that_closes_after_its_episodes() {
-    let Some(display) = Display::open() else { return };
+    let Some(display) = Display::open() else {
+        return;
+    };
     let folder = tempfile::tempdir().unwrap();
-    let mut args = vec!["play", "--ckpt", "zero", "--plain", "--quality", "fast", "--episodes", "2"];
+    let mut args = vec![
+        "play",
+        "--ckpt",
+        "zero",
+        "--plain",
+        "--quality",
+        "fast",
+        "--episodes",
+        "2",
+    ];
     args.extend(["--set", "env.max_episode_seconds=0.5"]);
-    let output = display.start(folder.path(), &args).wait_with_output().unwrap();
+    let output = display
+        .start(folder.path(), &args)
+        .wait_with_output()
+        .unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(stderr(&output).contains("shown: 100 steps, 2 episodes"), "{}", stderr(&output));
-    assert!(output.stdout.is_empty(), "episodes in a window are not scored");
+    assert!(
+        stderr(&output).contains("shown: 100 steps, 2 episodes"),
+        "{}",
+        stderr(&output)
+    );
+    assert!(
+        output.stdout.is_empty(),
+        "episodes in a window are not scored"
+    );
     // Options that request a result open no window.
     args.retain(|arg| !["--plain", "--quality", "fast"].contains(arg));
     for more in ["--headless", "--json"] {
-        let output = display.start(folder.path(), &[&args[..], &[more]].concat()).wait_with_output().unwrap();
-        assert!(output.status.success() && !output.stdout.is_empty(), "{}", stderr(&output));
+        let output = display
+            .start(folder.path(), &[&args[..], &[more]].concat())
+            .wait_with_output()
+            .unwrap();
+        assert!(
+            output.status.success() && !output.stdout.is_empty(),
+            "{}",
+            stderr(&output)
+        );
         assert!(!stderr(&output).contains("shown"), "{}", stderr(&output));
     }
 }
@@ -193,11 +269,19 @@ fn where_there_is_a_display_play_opens_a_window_that_closes_after_its_episodes()
 #[test]
 fn without_a_display_the_packages_and_the_ways_without_a_window_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    for args in [&["view", "--plain"][..], &["play", "--ckpt", "zero", "--plain", "--window"]] {
+    for args in [
+        &["view", "--plain"][..],
+        &["play", "--ckpt", "zero", "--plain", "--window"],
+    ] {
         let output = program(folder.path(), args);
         let said = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{said}");
-        for part in ["cannot open a window", "DISPLAY", "apt install libgl1 libxcursor1", "--web shows the hand"] {
+        for part in [
+            "cannot open a window",
+            "DISPLAY",
+            "apt install libgl1 libxcursor1",
+            "--web shows the hand",
+        ] {
             assert!(said.contains(part), "{said}");
         }
         assert!(!said.contains("panicked"), "{said}");
@@ -207,9 +291,25 @@ fn without_a_display_the_packages_and_the_ways_without_a_window_are_named() {
 #[test]
 fn a_display_that_does_not_answer_costs_a_word_and_not_the_score() {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["play", "--ckpt", "zero", "--plain", "--episodes", "1", "--set", "env.max_episode_seconds=0.1"];
-    let output = command(folder.path(), &args).env("DISPLAY", ":4242").output().unwrap();
+    let args = [
+        "play",
+        "--ckpt",
+        "zero",
+        "--plain",
+        "--episodes",
+        "1",
+        "--set",
+        "env.max_episode_seconds=0.1",
+    ];
+    let output = command(folder.path(), &args)
+        .env("DISPLAY", ":4242")
+        .output()
+        .unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(stderr(&output).contains("cannot open a window"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("cannot open a window"),
+        "{}",
+        stderr(&output)
+    );
     assert!(String::from_utf8_lossy(&output.stdout).contains("zero actions"));
 }

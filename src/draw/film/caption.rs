@@ -5,7 +5,8 @@ use ab_glyph::{Font, FontRef, OutlinedGlyph, PxScale, ScaleFont, point};
 /// Draws the lines into the top left corner of `rgb` `[height, width, 3]`. Text that does not fit is cut off.
 pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     // All letters of this font have the same width.
-    let font = FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR).expect("the font is part of the program");
+    let font = FontRef::try_from_slice(epaint_default_fonts::HACK_REGULAR)
+        .expect("the font is part of the program");
     let [width, height] = size.map(|pixels| pixels as usize);
     let scale = PxScale::from((height as f32 / 28.0).max(11.0));
     let scaled = font.as_scaled(scale);
@@ -13,18 +14,27 @@ pub fn draw(rgb: &mut [u8], size: [u32; 2], lines: &[String]) {
     let spacing = (scaled.height() * 1.15).ceil();
 
     let margin = (0.6 * scaled.height()).ceil();
-    let longest = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
+    let longest = lines
+        .iter()
+        .map(|line| line.chars().count())
+        .max()
+        .unwrap_or(0);
     let across = longest as f32 * advance + 2.0 * margin;
     let down = lines.len() as f32 * spacing + margin;
     for row in rgb.chunks_exact_mut(3 * width).take(down as usize) {
         let dark = &mut row[..3 * width.min(across as usize)];
-        dark.iter_mut().for_each(|channel| *channel = (u32::from(*channel) * 2 / 5) as u8);
+        dark.iter_mut()
+            .for_each(|channel| *channel = (u32::from(*channel) * 2 / 5) as u8);
     }
     for (i, line) in lines.iter().enumerate() {
         let baseline = 0.5 * margin + i as f32 * spacing + scaled.ascent();
         for (column, letter) in line.chars().enumerate() {
             let place = point(margin + column as f32 * advance, baseline);
-            if let Some(outline) = font.outline_glyph(scaled.glyph_id(letter).with_scale_and_position(scale, place)) {
+            if let Some(outline) = font.outline_glyph(
+                scaled
+                    .glyph_id(letter)
+                    .with_scale_and_position(scale, place),
+            ) {
                 draw_letter(rgb, [width, height], &outline);
             }
         }
@@ -40,7 +50,9 @@ fn draw_letter(rgb: &mut [u8], [width, height]: [usize; 2], outline: &OutlinedGl
             let at = 3 * (y as usize * width + x as usize);
             let cover = cover.clamp(0.0, 1.0);
             let channels = &mut rgb[at..at + 3];
-            channels.iter_mut().for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
+            channels
+                .iter_mut()
+                .for_each(|to| *to = (f32::from(*to) + (255.0 - f32::from(*to)) * cover) as u8);
         }
     });
 }
@@ -55,8 +67,14 @@ mod tests {
         let mut rgb = vec![100; 320 * 240 * 3];
         draw(&mut rgb, size, &["goals 3".into(), "error 12°".into()]);
         assert!(rgb.iter().any(|&channel| channel > 200), "text is drawn");
-        assert!(rgb[..3].iter().all(|&channel| channel == 40), "on a darkened background");
-        assert!(rgb[rgb.len() / 2..].iter().all(|&channel| channel == 100), "the rest is unchanged");
+        assert!(
+            rgb[..3].iter().all(|&channel| channel == 40),
+            "on a darkened background"
+        );
+        assert!(
+            rgb[rgb.len() / 2..].iter().all(|&channel| channel == 100),
+            "the rest is unchanged"
+        );
         draw(&mut rgb, size, &vec!["x".repeat(500); 100]);
     }
 }

@@ -23,18 +23,31 @@ const PIXELS_FOR_PALETTE: usize = 400_000;
 /// Fails if the pictures are too large for a GIF, or if the file cannot be written.
 pub fn encode(file: impl Write, format: FilmFormat, frames: Frames) -> Result<()> {
     let [width, height] = format.size.map(|pixels| pixels as usize);
-    let waiting: Vec<_> = Iterator::take(&mut *frames, BYTES_FOR_PALETTE / (3 * width * height).max(1)).collect();
+    let waiting: Vec<_> = Iterator::take(
+        &mut *frames,
+        BYTES_FOR_PALETTE / (3 * width * height).max(1),
+    )
+    .collect();
     let mut palette = Palette::new(&waiting);
     let columns = u16::try_from(width)?;
     let rows = u16::try_from(height)?;
-    let mut encoder = Encoder::new(BufWriter::new(file), columns, rows, &palette.quantizer.color_map_rgb())?;
+    let mut encoder = Encoder::new(
+        BufWriter::new(file),
+        columns,
+        rows,
+        &palette.quantizer.color_map_rgb(),
+    )?;
     encoder.set_repeat(Repeat::Infinite)?;
     let mut previous = Vec::new();
     for (number, rgb) in (0..).zip(waiting.into_iter().chain(frames)) {
         // Rounds times, not delays, to hundredths of a second, so that the film has the right length at any frame rate.
-        let hundredths = |frames: u64| (frames * 100 + u64::from(format.fps) / 2) / u64::from(format.fps);
+        let hundredths =
+            |frames: u64| (frames * 100 + u64::from(format.fps) / 2) / u64::from(format.fps);
         let delay = (hundredths(number + 1) - hundredths(number)) as u16;
-        encoder.write_frame(&Frame { delay, ..changes(&mut palette, width, &previous, &rgb) })?;
+        encoder.write_frame(&Frame {
+            delay,
+            ..changes(&mut palette, width, &previous, &rgb)
+        })?;
         previous = rgb;
     }
     Ok(encoder.into_inner()?.flush()?)
@@ -45,7 +58,9 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
     let height = rgb.len() / (3 * width);
     let pixel = |x: usize, y: usize| 3 * (y * width + x)..3 * (y * width + x) + 3;
     let changed = |x: usize, y: usize| previous.get(pixel(x, y)) != rgb.get(pixel(x, y));
-    let rows: Vec<usize> = (0..height).filter(|&y| (0..width).any(|x| changed(x, y))).collect();
+    let rows: Vec<usize> = (0..height)
+        .filter(|&y| (0..width).any(|x| changed(x, y)))
+        .collect();
     let top = *rows.first().unwrap_or(&0);
     let bottom = *rows.last().unwrap_or(&0);
     let in_column = |x: &usize| (top..=bottom).any(|y| changed(*x, y));
@@ -54,7 +69,11 @@ fn changes(palette: &mut Palette, width: usize, previous: &[u8], rgb: &[u8]) -> 
     let mut pixels = Vec::with_capacity((right + 1 - left) * (bottom + 1 - top));
     for y in top..=bottom {
         for x in left..=right {
-            pixels.push(if changed(x, y) { palette.index(&rgb[pixel(x, y)]) } else { TRANSPARENT });
+            pixels.push(if changed(x, y) {
+                palette.index(&rgb[pixel(x, y)])
+            } else {
+                TRANSPARENT
+            });
         }
     }
     Frame {
@@ -82,16 +101,25 @@ impl Palette {
         let pixels: usize = frames.iter().map(|rgb| rgb.len() / 3).sum();
         let every = pixels.div_ceil(PIXELS_FOR_PALETTE).max(1);
         let all = frames.iter().flat_map(|rgb| rgb.chunks_exact(3));
-        let sample: Vec<u8> = all.step_by(every).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
-        Self { quantizer: NeuQuant::new(10, COLOURS, &sample), known: vec![None; 1 << 18] }
+        let sample: Vec<u8> = all
+            .step_by(every)
+            .flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255])
+            .collect();
+        Self {
+            quantizer: NeuQuant::new(10, COLOURS, &sample),
+            known: vec![None; 1 << 18],
+        }
     }
 
     fn index(&mut self, rgb: &[u8]) -> u8 {
-        let key = rgb.iter().fold(0, |key, &channel| key << 6 | usize::from(channel >> 2));
+        let key = rgb
+            .iter()
+            .fold(0, |key, &channel| key << 6 | usize::from(channel >> 2));
         *self.known[key].get_or_insert_with(|| {
             // The middle of the colours that share the key.
             let middle = |channel: u8| channel & !3 | 2;
-            self.quantizer.index_of(&[middle(rgb[0]), middle(rgb[1]), middle(rgb[2]), 255]) as u8
+            self.quantizer
+                .index_of(&[middle(rgb[0]), middle(rgb[1]), middle(rgb[2]), 255]) as u8
         })
     }
 }

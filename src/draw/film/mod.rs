@@ -48,8 +48,15 @@ impl FilmWriter {
         );
         let [width, height] = format.size;
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
-        ensure!(is_gif || even, "{width}x{height}: the width and height of an MP4 film must be even");
-        ensure!(!is_gif || format.fps <= 50, "{} fps: a GIF has at most 50 frames per second", format.fps);
+        ensure!(
+            is_gif || even,
+            "{width}x{height}: the width and height of an MP4 film must be even"
+        );
+        ensure!(
+            !is_gif || format.fps <= 50,
+            "{} fps: a GIF has at most 50 frames per second",
+            format.fps
+        );
         ensure!(
             format.longest <= MOST_FRAMES,
             "{} frames: a film has at most {MOST_FRAMES}; use fewer or shorter episodes",
@@ -62,12 +69,22 @@ impl FilmWriter {
                 caption::draw(&mut rgb, format.size, &lines);
                 rgb
             });
-            let encoded =
-                if is_gif { gif::encode(&file.file, format, frames) } else { mp4::encode(&file.file, format, frames) };
+            let encoded = if is_gif {
+                gif::encode(&file.file, format, frames)
+            } else {
+                mp4::encode(&file.file, format, frames)
+            };
             encoded.map(|()| file)
         };
-        let encoder = thread::Builder::new().name("film".into()).spawn(encode).context("cannot start a thread")?;
-        Ok(Self { path: to.path.clone(), frames, encoder })
+        let encoder = thread::Builder::new()
+            .name("film".into())
+            .spawn(encode)
+            .context("cannot start a thread")?;
+        Ok(Self {
+            path: to.path.clone(),
+            frames,
+            encoder,
+        })
     }
 
     /// Adds a frame.
@@ -75,7 +92,10 @@ impl FilmWriter {
     /// # Errors
     /// Fails if the encoder has stopped early. [`FilmWriter::finish`] returns the reason.
     pub fn push(&mut self, frame: CaptionedFrame) -> Result<()> {
-        self.frames.send(frame).ok().context("the film cannot be continued")
+        self.frames
+            .send(frame)
+            .ok()
+            .context("the film cannot be continued")
     }
 
     /// Completes the file. Without `keep`, abandons the film and leaves an existing file as it was.
@@ -84,7 +104,10 @@ impl FilmWriter {
     /// Fails if the encoder or the file failed, on this or an earlier frame.
     pub fn finish(self, keep: bool) -> Result<()> {
         drop(self.frames);
-        let encoded = self.encoder.join().unwrap_or_else(|_| bail!("the encoder failed"));
+        let encoded = self
+            .encoder
+            .join()
+            .unwrap_or_else(|_| bail!("the encoder failed"));
         let finished = encoded.and_then(|file| if keep { file.complete() } else { Ok(()) });
         finished.with_context(|| format!("cannot write the film {}", self.path.display()))
     }

@@ -6,15 +6,19 @@ use std::num::NonZeroU32;
 use anyhow::{Context, Result, ensure};
 use openh264::OpenH264API;
 use openh264::encoder::{
-    Complexity, Encoder, EncoderConfig, FrameRate, FrameType, IntraFramePeriod, RateControlMode, VuiConfig,
+    Complexity, Encoder, EncoderConfig, FrameRate, FrameType, IntraFramePeriod, RateControlMode,
+    VuiConfig,
 };
 use openh264::formats::{RgbSliceU8, YUVBuffer};
 use shiguredo_mp4::TrackKind;
 use shiguredo_mp4::bitstream::h264::{
-    H264NalUnitType, H264SampleEntryConfig, LengthSize, build_avc1_box_from_annexb, parse_annexb_nal_units,
+    H264NalUnitType, H264SampleEntryConfig, LengthSize, build_avc1_box_from_annexb,
+    parse_annexb_nal_units,
 };
 use shiguredo_mp4::boxes::SampleEntry;
-use shiguredo_mp4::mux::{Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size};
+use shiguredo_mp4::mux::{
+    Mp4FileMuxer, Mp4FileMuxerOptions, Sample, estimate_maximum_moov_box_size,
+};
 
 use super::format::{FilmFormat, Frames};
 
@@ -30,9 +34,13 @@ pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Re
     let size = (format.size[0] as usize, format.size[1] as usize);
     let mut encoder = encoder(format.fps)?;
     let mut yuv = YUVBuffer::new(size.0, size.1);
-    let timescale = NonZeroU32::new(format.fps).context("the frame rate of a film must not be 0")?;
+    let timescale =
+        NonZeroU32::new(format.fps).context("the frame rate of a film must not be 0")?;
     let reserved_moov_box_size = estimate_maximum_moov_box_size(&[format.longest]);
-    let mut muxer = Mp4FileMuxer::with_options(Mp4FileMuxerOptions { reserved_moov_box_size, ..Default::default() })?;
+    let mut muxer = Mp4FileMuxer::with_options(Mp4FileMuxerOptions {
+        reserved_moov_box_size,
+        ..Default::default()
+    })?;
     let mut file = BufWriter::new(file);
     file.write_all(muxer.initial_boxes_bytes())?;
     let mut data_offset = muxer.initial_boxes_bytes().len() as u64;
@@ -42,7 +50,9 @@ pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Re
         let keyframe = matches!(stream.frame_type(), FrameType::IDR | FrameType::I);
         let stream = stream.to_vec();
         // The first frame carries the description of the stream.
-        let config = H264SampleEntryConfig { length_size: LengthSize::FourBytes };
+        let config = H264SampleEntryConfig {
+            length_size: LengthSize::FourBytes,
+        };
         let describe = || build_avc1_box_from_annexb(&stream, &config).map(SampleEntry::Avc1);
         let sample_entry = (number == 0).then(describe).transpose()?;
         let data = units_with_lengths(&stream)?;
@@ -61,7 +71,10 @@ pub fn encode(file: impl Write + Seek, format: FilmFormat, frames: Frames) -> Re
         data_offset += data.len() as u64;
     }
     let boxes = muxer.finalize()?;
-    ensure!(boxes.is_faststart_enabled(), "the film has more frames than announced");
+    ensure!(
+        boxes.is_faststart_enabled(),
+        "the film has more frames than announced"
+    );
     for (offset, bytes) in boxes.offset_and_bytes_pairs() {
         file.seek(SeekFrom::Start(offset))?;
         file.write_all(bytes)?;
@@ -74,7 +87,10 @@ fn units_with_lengths(stream: &[u8]) -> Result<Vec<u8>> {
     let mut data = Vec::with_capacity(stream.len());
     for unit in parse_annexb_nal_units(stream)? {
         // The parameter sets go into the index.
-        if !matches!(unit.nal_unit_type, H264NalUnitType::Sps | H264NalUnitType::Pps) {
+        if !matches!(
+            unit.nal_unit_type,
+            H264NalUnitType::Sps | H264NalUnitType::Pps
+        ) {
             data.extend_from_slice(&u32::try_from(unit.data.len())?.to_be_bytes());
             data.extend_from_slice(unit.data);
         }

@@ -34,7 +34,9 @@ impl Batch {
     /// # Errors
     /// Fails if the shapes do not match.
     fn log_prob(&self, means: &Tensor) -> Result<Tensor> {
-        let z = (&self.actions - means)?.broadcast_div(&self.log_std.exp()?)?.broadcast_div(&self.scales)?;
+        let z = (&self.actions - means)?
+            .broadcast_div(&self.log_std.exp()?)?
+            .broadcast_div(&self.scales)?;
         let constant = 0.5 * std::f64::consts::TAU.ln() * self.log_std.elem_count() as f64;
         let log_scale = (self.log_std.sum_all()? + constant)?;
         (z.sqr()?.sum_keepdim(D::Minus1)? * -0.5)?.broadcast_sub(&log_scale)
@@ -46,7 +48,10 @@ impl Batch {
     /// # Errors
     /// Fails if the shapes do not match.
     fn kl(&self, means: &Tensor) -> Result<Tensor> {
-        let moved = (&self.old_means - means.detach())?.broadcast_div(&self.scales)?.sqr()?.mean(0)?;
+        let moved = (&self.old_means - means.detach())?
+            .broadcast_div(&self.scales)?
+            .sqr()?
+            .mean(0)?;
         (moved / (&self.log_std * 2.0)?.exp()?)?.sum_all()? * 0.5
     }
 }
@@ -58,20 +63,33 @@ impl Batch {
 ///
 /// # Errors
 /// Fails if the shapes do not match.
-pub fn losses(config: &PpoConfig, batch: &Batch, means: &Tensor, values: &Tensor) -> Result<(Tensor, Losses)> {
+pub fn losses(
+    config: &PpoConfig,
+    batch: &Batch,
+    means: &Tensor,
+    values: &Tensor,
+) -> Result<(Tensor, Losses)> {
     let ratios = (batch.log_prob(means)? - &batch.old_log_probs)?.exp()?;
     let clipped = ratios.clamp(1.0 - config.clip, 1.0 + config.clip)?;
     let surrogate = (&ratios * &batch.advantages)?.minimum(&(clipped * &batch.advantages)?)?;
     let policy = surrogate.mean_all()?.neg()?;
     let step = (values - &batch.old_values)?.clamp(-config.value_clip(), config.value_clip())?;
     let clipped = (&batch.old_values + step)?;
-    let value = (values - &batch.returns)?.sqr()?.maximum(&(clipped - &batch.returns)?.sqr()?)?.mean_all()?;
-    let excess = (means - means.clamp(-1.0, 1.0)?.detach())?.sqr()?.sum(D::Minus1)?.mean_all()?;
+    let value = (values - &batch.returns)?
+        .sqr()?
+        .maximum(&(clipped - &batch.returns)?.sqr()?)?
+        .mean_all()?;
+    let excess = (means - means.clamp(-1.0, 1.0)?.detach())?
+        .sqr()?
+        .sum(D::Minus1)?
+        .mean_all()?;
     let total = ((&policy + (&value * config.value_coef)?)? + (&excess * config.bounds_coef)?)?;
 
     let ratios = ratios.flatten_all()?.to_vec1::<f32>()?;
     let errors = || ratios.iter().map(|ratio| f64::from((ratio - 1.0).abs()));
-    let sum = |mean: &Tensor| -> Result<f64> { Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64) };
+    let sum = |mean: &Tensor| -> Result<f64> {
+        Ok(f64::from(mean.to_scalar::<f32>()?) * ratios.len() as f64)
+    };
     let sums = Losses {
         surrogate: -sum(&policy)?,
         value_error: sum(&value)?,
@@ -94,7 +112,11 @@ mod tests {
     }
 
     /// A batch of Gaussians with standard deviations of e^-0.5 and e^0.2 times the scales, whose log-densities are -2.
-    fn batch(actions: &[f32], old_means: &[f32], [scales, old_values, advantages, returns]: [&[f32]; 4]) -> Batch {
+    fn batch(
+        actions: &[f32],
+        old_means: &[f32],
+        [scales, old_values, advantages, returns]: [&[f32]; 4],
+    ) -> Batch {
         let column = |values: &[f32]| tensor(values, &[values.len(), 1]);
         Batch {
             observations: column(&vec![0.0; scales.len()]),
@@ -112,8 +134,14 @@ mod tests {
     #[track_caller]
     fn assert_close(found: &Tensor, expected: &[f32]) {
         let found: Vec<f32> = found.flatten_all().unwrap().to_vec1().unwrap();
-        let close = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
-        assert!(close && found.len() == expected.len(), "{found:?} instead of {expected:?}");
+        let close = found
+            .iter()
+            .zip(expected)
+            .all(|(a, b)| (a - b).abs() < 2e-6 * (1.0 + b.abs()));
+        assert!(
+            close && found.len() == expected.len(),
+            "{found:?} instead of {expected:?}"
+        );
     }
 
     /// The expected values come from this program (PyTorch). Clipping takes effect on one ratio and one value. Each
@@ -150,18 +178,45 @@ mod tests {
         let mut batch = batch(
             &[0.5, -1.0, -0.3, 0.9, 0.2, 1.5],
             &[-0.1, -0.1, 0.4, 0.5, -0.5, 0.5],
-            [&[1.0, 1.5, 0.8], &[0.2, -0.1, 1.0], &[1.0, 0.5, -2.0], &[0.5, 0.1, 1.9]],
+            [
+                &[1.0, 1.5, 0.8],
+                &[0.2, -0.1, 1.0],
+                &[1.0, 0.5, -2.0],
+                &[0.5, 0.1, 1.9],
+            ],
         );
         batch.old_log_probs = batch.log_prob(&batch.old_means).unwrap();
         let (total, sums) = losses(&config, &batch, &mean, &value).unwrap();
         let means = sums.means(3);
-        assert_close(&batch.log_prob(&mean).unwrap(), &[-1.969_842_1, -1.978_102_7, -2.559_000_7]);
-        let found = [means.ratio_error, -means.surrogate, means.value_error, means.kl].map(|x| x as f32);
-        assert_close(&tensor(&found, &[4]), &[0.721_431, 0.599_859_9, 0.296_666_7, 0.046_028_256]);
+        assert_close(
+            &batch.log_prob(&mean).unwrap(),
+            &[-1.969_842_1, -1.978_102_7, -2.559_000_7],
+        );
+        let found = [
+            means.ratio_error,
+            -means.surrogate,
+            means.value_error,
+            means.kl,
+        ]
+        .map(|x| x as f32);
+        assert_close(
+            &tensor(&found, &[4]),
+            &[0.721_431, 0.599_859_9, 0.296_666_7, 0.046_028_256],
+        );
         let grads = total.backward().unwrap();
-        let mean_grad = [0.0, 0.0, 0.142_810_8, -0.026_412_528, 2.924_584_2, 0.841_392_4];
+        let mean_grad = [
+            0.0,
+            0.0,
+            0.142_810_8,
+            -0.026_412_528,
+            2.924_584_2,
+            0.841_392_4,
+        ];
         assert_close(grads.get(&mean).unwrap(), &mean_grad);
-        assert_close(grads.get(&value).unwrap(), &[-0.266_666_65, -0.933_333_4, 0.0]);
+        assert_close(
+            grads.get(&value).unwrap(),
+            &[-0.266_666_65, -0.933_333_4, 0.0],
+        );
     }
 
     #[test]

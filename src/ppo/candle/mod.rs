@@ -26,12 +26,20 @@ pub struct Reference {
 
 /// Gathers these samples of a rollout.
 fn gathered(policy: &Policy, rollout: &Rollout, samples: &[u32]) -> Result<Batch> {
-    let Spaces { observation_size, action_size, .. } = policy.spaces;
+    let Spaces {
+        observation_size,
+        action_size,
+        ..
+    } = policy.spaces;
     let array = |width: usize, of: fn(&RolloutBlock) -> &[f32]| -> Vec<f32> {
         let located = samples.iter().map(|&sample| rollout.locate(sample));
-        located.flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)]).copied().collect()
+        located
+            .flat_map(|(block, i)| &of(block)[RolloutBlock::row(width, i)])
+            .copied()
+            .collect()
     };
-    let tensor = |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
+    let tensor =
+        |width: usize, values| Tensor::from_vec(values, (samples.len(), width), &Device::Cpu);
     let column = |of| tensor(1, array(1, of));
     let raw = array(observation_size, |block| &block.observations);
     let mut observations = vec![0.0; raw.len()];
@@ -63,8 +71,18 @@ impl GradientBackend for Reference {
         for group in groups {
             let batch = gathered(policy, rollout, group)?;
             let mut variables = Vec::new();
-            let means = forward(policy, &policy.layout.actor, &batch.observations, &mut variables)?;
-            let values = forward(policy, &policy.layout.critic, &batch.observations, &mut variables)?;
+            let means = forward(
+                policy,
+                &policy.layout.actor,
+                &batch.observations,
+                &mut variables,
+            )?;
+            let values = forward(
+                policy,
+                &policy.layout.critic,
+                &batch.observations,
+                &mut variables,
+            )?;
             let (total, losses) = loss::losses(&self.config, &batch, &means, &values)?;
             sums.push(losses);
             let grads = (total * (group.len() as f64 / count as f64))?.backward()?;
@@ -82,9 +100,23 @@ impl GradientBackend for Reference {
 
 /// What the net of these layers computes from `x` `[M, O]`. Adds to `variables` the variables that hold its parameters,
 /// each with the range of its values among the parameters of the policy.
-fn forward(policy: &Policy, layers: &[Layer], x: &Tensor, variables: &mut Vec<(Range<usize>, Var)>) -> Result<Tensor> {
+fn forward(
+    policy: &Policy,
+    layers: &[Layer],
+    x: &Tensor,
+    variables: &mut Vec<(Range<usize>, Var)>,
+) -> Result<Tensor> {
     let mut x = x.clone();
-    for (i, Layer { inputs, outputs, weight, bias }) in layers.iter().enumerate() {
+    for (
+        i,
+        Layer {
+            inputs,
+            outputs,
+            weight,
+            bias,
+        },
+    ) in layers.iter().enumerate()
+    {
         let mut variable = |range: &Range<usize>, shape: &[usize]| -> Result<Tensor> {
             let variable = Var::from_slice(&policy.parameters[range.clone()], shape, &Device::Cpu)?;
             variables.push((range.clone(), variable.clone()));
@@ -97,7 +129,10 @@ fn forward(policy: &Policy, layers: &[Layer], x: &Tensor, variables: &mut Vec<(R
                 Activation::Tanh => x.tanh(),
             }?;
         }
-        let layer = Linear::new(variable(weight, &[*outputs, *inputs])?, Some(variable(bias, &[*outputs])?));
+        let layer = Linear::new(
+            variable(weight, &[*outputs, *inputs])?,
+            Some(variable(bias, &[*outputs])?),
+        );
         x = layer.forward(&x)?;
     }
     Ok(x)

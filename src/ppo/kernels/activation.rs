@@ -59,11 +59,25 @@ pub fn add_bias(x: &mut [f32], bias: &[f32], activation: Option<Activation>) {
 /// `sums` `[C]`.
 ///
 /// `outputs` `[B, C]` are the outputs of the activation, which determine its derivatives.
-pub fn slopes_and_sums(grad: &mut [f32], outputs: &[f32], activation: Option<Activation>, sums: &mut [f32]) {
+pub fn slopes_and_sums(
+    grad: &mut [f32],
+    outputs: &[f32],
+    activation: Option<Activation>,
+    sums: &mut [f32],
+) {
     match activation {
         None => each_and_sum(grad, outputs, sums, |g, _| g),
-        Some(Activation::Elu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { g * (y + 1.0) }),
-        Some(Activation::Relu) => each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { 0.0 }),
+        Some(Activation::Elu) => {
+            each_and_sum(
+                grad,
+                outputs,
+                sums,
+                |g, y| if y > 0.0 { g } else { g * (y + 1.0) },
+            )
+        }
+        Some(Activation::Relu) => {
+            each_and_sum(grad, outputs, sums, |g, y| if y > 0.0 { g } else { 0.0 })
+        }
         Some(Activation::Tanh) => each_and_sum(grad, outputs, sums, |g, y| g * (1.0 - y * y)),
     }
 }
@@ -114,7 +128,10 @@ mod tests {
     }
 
     fn inputs() -> Vec<f32> {
-        (-100_000..=100_000).map(|i| i as f32 * 2e-4).chain([-1e30, -100.0, 100.0, 1e30, 0.0, 1e-30, -1e-30]).collect()
+        (-100_000..=100_000)
+            .map(|i| i as f32 * 2e-4)
+            .chain([-1e30, -100.0, 100.0, 1e30, 0.0, 1e-30, -1e-30])
+            .collect()
     }
 
     #[test]
@@ -137,7 +154,10 @@ mod tests {
     fn small_inputs_keep_their_relative_accuracy() {
         for x in [1e-3f32, -1e-3, 1e-6, -1e-6, 1e-20, -1e-20] {
             let relative = |y: f32, expected: f64| ((f64::from(y) - expected) / expected).abs();
-            assert!(relative(exp_m1(x), f64::from(x).exp_m1()) < 3e-7, "exp_m1({x})");
+            assert!(
+                relative(exp_m1(x), f64::from(x).exp_m1()) < 3e-7,
+                "exp_m1({x})"
+            );
             assert!(relative(tanh(x), f64::from(x).tanh()) < 3e-7, "tanh({x})");
         }
     }
@@ -163,8 +183,12 @@ mod tests {
                 assert_eq!(sums[0], 1.0 + grad[0]);
                 let step = 1e-6;
                 let x = f64::from(x);
-                let slope = (exact(activation, x + step) - exact(activation, x - step)) / (2.0 * step);
-                assert!((f64::from(grad[0]) - 2.0 * slope).abs() < 1e-5, "{activation:?} at {x}");
+                let slope =
+                    (exact(activation, x + step) - exact(activation, x - step)) / (2.0 * step);
+                assert!(
+                    (f64::from(grad[0]) - 2.0 * slope).abs() < 1e-5,
+                    "{activation:?} at {x}"
+                );
             }
         }
     }

@@ -36,7 +36,9 @@ pub fn request() -> Result<&'static dyn Unit, &'static str> {
     }
     let (low, high): (u32, u32);
     // SAFETY: OSXSAVE guarantees that the instruction exists. It only reads.
-    unsafe { asm!("xgetbv", in("ecx") 0, out("eax") low, out("edx") high, options(nomem, nostack)) };
+    unsafe {
+        asm!("xgetbv", in("ecx") 0, out("eax") low, out("edx") high, options(nomem, nostack))
+    };
     if (u64::from(high) << 32 | u64::from(low)) & TILE_STATE != TILE_STATE {
         return Err("the kernel does not save the processor's tiles (AMX)");
     }
@@ -46,7 +48,11 @@ pub fn request() -> Result<&'static dyn Unit, &'static str> {
         asm!("syscall", inlateout("rax") ARCH_PRCTL => answer, in("rdi") ARCH_REQ_XCOMP_PERM,
             in("rsi") XFEATURE_XTILEDATA, lateout("rcx") _, lateout("r11") _, options(nostack));
     }
-    if answer == 0 { Ok(&Tiles(())) } else { Err("the kernel does not permit the use of tiles (AMX)") }
+    if answer == 0 {
+        Ok(&Tiles(()))
+    } else {
+        Err("the kernel does not permit the use of tiles (AMX)")
+    }
 }
 
 /// The configuration of tiles: layout ("palette"), reserved bytes, and for each tile the bytes in a row and the rows.
@@ -54,7 +60,12 @@ pub fn request() -> Result<&'static dyn Unit, &'static str> {
 struct Setup(u8, [u8; 15], [[u16; 8]; 2], [[u8; 8]; 2]);
 
 /// Eight tiles of sixteen rows of 64 bytes.
-const SETUP: Setup = Setup(1, [0; 15], [[ROW_BYTES as u16; 8], [0; 8]], [[LINES as u8; 8], [0; 8]]);
+const SETUP: Setup = Setup(
+    1,
+    [0; 15],
+    [[ROW_BYTES as u16; 8], [0; 8]],
+    [[LINES as u8; 8], [0; 8]],
+);
 
 /// The configured tiles of this thread, released on drop.
 struct Configured;
@@ -73,9 +84,13 @@ impl Unit for Tiles {
         unsafe { asm!("ldtilecfg [{}]", in(reg) &SETUP, options(readonly, nostack)) };
         let _configured = Configured;
         // SAFETY: the tiles are configured. `in_blocks` ensures the rest.
-        in_blocks(out, columns, operands, add, |out, columns, tiles, add| unsafe {
-            multiply(out, columns, tiles, add)
-        });
+        in_blocks(
+            out,
+            columns,
+            operands,
+            add,
+            |out, columns, tiles, add| unsafe { multiply(out, columns, tiles, add) },
+        );
     }
 }
 
@@ -86,7 +101,13 @@ impl Unit for Tiles {
 /// there are along a line, at least two, and both equally many.
 unsafe fn multiply(out: &mut [f32], columns: usize, [lhs, rhs]: [&[Tile]; 2], add: bool) {
     let depth = lhs.len() / 2;
-    const { assert!(size_of::<Tile>() == LINES * ROW_BYTES && DEPTH * 2 == ROW_BYTES && size_of::<Setup>() == 64) };
+    const {
+        assert!(
+            size_of::<Tile>() == LINES * ROW_BYTES
+                && DEPTH * 2 == ROW_BYTES
+                && size_of::<Setup>() == 64
+        )
+    };
     // SAFETY: the caller has configured the tiles. Each operand is 2 × `depth` consecutive tiles of 1024 bytes, and each of
     // the `depth` iterations of the loop reads one tile of each half. `out` has 32 rows of 32 values at that distance.
     unsafe {

@@ -2,11 +2,14 @@
 //!
 //! `vdpbf16ps` adds two products to each of sixteen sums: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2.
 
-#![expect(unsafe_code, reason = "instructions that not every processor has, on pointers")]
+#![expect(
+    unsafe_code,
+    reason = "instructions that not every processor has, on pointers"
+)]
 
 use std::arch::x86_64::{
-    __m512bh, __m512i, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_ps,
-    _mm512_storeu_ps,
+    __m512bh, __m512i, _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_set1_epi32,
+    _mm512_setzero_ps, _mm512_storeu_ps,
 };
 use std::mem::transmute;
 
@@ -25,34 +28,53 @@ struct Dots(());
 /// # Errors
 /// Fails if it does not have them.
 pub fn request() -> Result<&'static dyn Unit, &'static str> {
-    let there = std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512bf16");
-    if there { Ok(&Dots(())) } else { Err("it has no bf16 dot products (AVX-512 BF16)") }
+    let there = std::arch::is_x86_feature_detected!("avx512f")
+        && std::arch::is_x86_feature_detected!("avx512bf16");
+    if there {
+        Ok(&Dots(()))
+    } else {
+        Err("it has no bf16 dot products (AVX-512 BF16)")
+    }
 }
 
 impl Unit for Dots {
     /// Dot products read either order. The result is the order that needs no transposition.
     fn order_of_left(&self, lhs: Matrix) -> Order {
         let [_, along] = lhs.strides();
-        if along == 1 { Order::Lines } else { Order::Pairs }
+        if along == 1 {
+            Order::Lines
+        } else {
+            Order::Pairs
+        }
     }
 
     fn product(&self, out: &mut [f32], columns: usize, operands: [&Packed; 2], add: bool) {
         let left = operands[0].order;
-        in_blocks(out, columns, operands, add, |out, columns, [lhs, rhs], add| {
-            let depth = lhs.len() / 2;
-            for first in (0..BLOCK).step_by(ROWS) {
-                let lhs = &lhs[first / LINES * depth..][..depth];
-                let out = &mut out[first * columns..];
-                // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `in_blocks`
-                // ensures that `out` has eight more rows of 32 values at that distance, and `rhs` twice as many tiles as `lhs`.
-                unsafe {
-                    match left {
-                        Order::Lines => rows::<DEPTH, 2>(out, columns, lhs, first % LINES, rhs, add),
-                        Order::Pairs => rows::<2, DEPTH>(out, columns, lhs, first % LINES, rhs, add),
+        in_blocks(
+            out,
+            columns,
+            operands,
+            add,
+            |out, columns, [lhs, rhs], add| {
+                let depth = lhs.len() / 2;
+                for first in (0..BLOCK).step_by(ROWS) {
+                    let lhs = &lhs[first / LINES * depth..][..depth];
+                    let out = &mut out[first * columns..];
+                    // SAFETY: `request` alone creates `Dots`, and only where the processor has these instructions. `in_blocks`
+                    // ensures that `out` has eight more rows of 32 values at that distance, and `rhs` twice as many tiles as `lhs`.
+                    unsafe {
+                        match left {
+                            Order::Lines => {
+                                rows::<DEPTH, 2>(out, columns, lhs, first % LINES, rhs, add)
+                            }
+                            Order::Pairs => {
+                                rows::<2, DEPTH>(out, columns, lhs, first % LINES, rhs, add)
+                            }
+                        }
                     }
                 }
-            }
-        });
+            },
+        );
     }
 }
 
@@ -85,11 +107,17 @@ unsafe fn rows<const LINE: usize, const PAIR: usize>(
     for ((Tile(lhs), Tile(left)), Tile(right)) in lhs.iter().zip(left).zip(right) {
         for pair in 0..DEPTH / 2 {
             // SAFETY: a tile has `DEPTH / 2` rows of sixteen pairs, and as many pairs for each of sixteen lines.
-            let [left, right] = [left, right].map(|tile| unsafe { tile.as_ptr().add(pair * DEPTH).cast() });
+            let [left, right] =
+                [left, right].map(|tile| unsafe { tile.as_ptr().add(pair * DEPTH).cast() });
             let [left, right] = [left, right].map(|row| bf16(unsafe { _mm512_loadu_si512(row) }));
             for (row, [a, b]) in sums.iter_mut().enumerate() {
                 // SAFETY: as above.
-                let one = unsafe { lhs.as_ptr().add((first + row) * LINE + pair * PAIR).cast::<i32>().read() };
+                let one = unsafe {
+                    lhs.as_ptr()
+                        .add((first + row) * LINE + pair * PAIR)
+                        .cast::<i32>()
+                        .read()
+                };
                 let all = bf16(_mm512_set1_epi32(one));
                 *a = _mm512_dpbf16_ps(*a, all, left);
                 *b = _mm512_dpbf16_ps(*b, all, right);

@@ -51,18 +51,34 @@ pub trait Unit: Sync {
 ///
 /// # Panics
 /// Panics if the sizes do not match.
-pub fn in_blocks<F>(out: &mut [f32], columns: usize, [lhs, rhs]: [&Packed; 2], add: bool, multiply: F)
-where
+pub fn in_blocks<F>(
+    out: &mut [f32],
+    columns: usize,
+    [lhs, rhs]: [&Packed; 2],
+    add: bool,
+    multiply: F,
+) where
     F: Fn(&mut [f32], usize, [&[Tile]; 2], bool),
 {
     let rows = out.len() / columns;
     let depth = lhs.depth;
     assert_eq!(out.len(), rows * columns, "elements of the product");
-    assert!(depth > 0 && depth == rhs.depth, "tiles along the lines of both matrices");
+    assert!(
+        depth > 0 && depth == rhs.depth,
+        "tiles along the lines of both matrices"
+    );
     assert_eq!(rhs.order, Order::Pairs, "order of the right matrix");
     let pair = 2 * depth;
-    assert_eq!(lhs.tiles.len(), rows.div_ceil(BLOCK) * pair, "tiles of the left matrix");
-    assert_eq!(rhs.tiles.len(), columns.div_ceil(BLOCK) * pair, "tiles of the right matrix");
+    assert_eq!(
+        lhs.tiles.len(),
+        rows.div_ceil(BLOCK) * pair,
+        "tiles of the left matrix"
+    );
+    assert_eq!(
+        rhs.tiles.len(),
+        columns.div_ceil(BLOCK) * pair,
+        "tiles of the right matrix"
+    );
     // The tiles of the right matrix in use stay in the cache while the tiles of the left one stream past.
     for (j, rhs) in rhs.tiles.chunks_exact(pair).enumerate() {
         for (i, lhs) in lhs.tiles.chunks_exact(pair).enumerate() {
@@ -114,24 +130,31 @@ impl Packed {
     }
 
     /// Makes room for the same. Each of the jobs packs a part of it.
-    pub fn jobs<'a>(&'a mut self, matrix: Matrix<'a>, order: Order) -> impl Iterator<Item = impl FnOnce() + Send + 'a> {
+    pub fn jobs<'a>(
+        &'a mut self,
+        matrix: Matrix<'a>,
+        order: Order,
+    ) -> impl Iterator<Item = impl FnOnce() + Send + 'a> {
         let [lines, numbers] = matrix.size();
         self.depth = numbers.div_ceil(DEPTH);
         self.order = order;
         let groups = lines.div_ceil(2 * LINES) * 2;
         let depth = self.depth;
         self.tiles.resize(groups * depth, Tile([0; LINES * DEPTH]));
-        self.tiles.chunks_mut(PART).enumerate().map(move |(part, tiles)| {
-            move || {
-                widest!({
-                    for (i, Tile(tile)) in (part * PART..).zip(tiles) {
-                        let line = i / depth * LINES;
-                        let number = i % depth * DEPTH;
-                        pack_tile(tile, matrix, [line, number], order);
-                    }
-                });
-            }
-        })
+        self.tiles
+            .chunks_mut(PART)
+            .enumerate()
+            .map(move |(part, tiles)| {
+                move || {
+                    widest!({
+                        for (i, Tile(tile)) in (part * PART..).zip(tiles) {
+                            let line = i / depth * LINES;
+                            let number = i % depth * DEPTH;
+                            pack_tile(tile, matrix, [line, number], order);
+                        }
+                    });
+                }
+            })
     }
 }
 
@@ -140,7 +163,12 @@ const PART: usize = 32;
 
 /// Fills a tile, starting at this line and this position in the line.
 #[inline(always)]
-fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [usize; 2], order: Order) {
+fn pack_tile(
+    tile: &mut [u16; LINES * DEPTH],
+    matrix: Matrix,
+    [line, number]: [usize; 2],
+    order: Order,
+) {
     let [lines, numbers] = matrix.size();
     let lines = lines.saturating_sub(line).min(LINES);
     let numbers = (numbers - number).min(DEPTH);
@@ -162,7 +190,10 @@ fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [u
             let mut column = [0; LINES];
             if j < numbers {
                 let from = &matrix.data()[(number + j) * along + line..][..lines];
-                column.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
+                column
+                    .iter_mut()
+                    .zip(from)
+                    .for_each(|(to, &x)| *to = round(x));
             }
             column
         };
@@ -176,7 +207,10 @@ fn pack_tile(tile: &mut [u16; LINES * DEPTH], matrix: Matrix, [line, number]: [u
 #[inline(always)]
 fn put_line(tile: &mut [u16; LINES * DEPTH], i: usize, from: &[f32], order: Order) {
     match order {
-        Order::Lines => tile[i * DEPTH..].iter_mut().zip(from).for_each(|(to, &x)| *to = round(x)),
+        Order::Lines => tile[i * DEPTH..]
+            .iter_mut()
+            .zip(from)
+            .for_each(|(to, &x)| *to = round(x)),
         Order::Pairs => {
             let mut row = [0; DEPTH];
             row.iter_mut().zip(from).for_each(|(to, &x)| *to = round(x));
@@ -190,12 +224,19 @@ fn put_line(tile: &mut [u16; LINES * DEPTH], i: usize, from: &[f32], order: Orde
 
 /// Puts the values `j` and `j + 1` of all lines of a tile in their places.
 #[inline(always)]
-fn put_columns(tile: &mut [u16; LINES * DEPTH], j: usize, [even, odd]: [[u16; LINES]; 2], order: Order) {
+fn put_columns(
+    tile: &mut [u16; LINES * DEPTH],
+    j: usize,
+    [even, odd]: [[u16; LINES]; 2],
+    order: Order,
+) {
     let pairs = even.into_iter().zip(odd);
     match order {
         Order::Pairs => {
             let (to, _) = tile[j * LINES..][..DEPTH].as_chunks_mut::<2>();
-            to.iter_mut().zip(pairs).for_each(|(to, (even, odd))| *to = [even, odd]);
+            to.iter_mut()
+                .zip(pairs)
+                .for_each(|(to, (even, odd))| *to = [even, odd]);
         }
         Order::Lines => {
             for (to, (even, odd)) in tile.chunks_mut(DEPTH).zip(pairs) {
@@ -224,7 +265,10 @@ mod tests {
             assert_eq!(rounded(x), expected, "{x}");
         }
         assert!(rounded(f32::NAN).is_nan());
-        assert!(rounded(f32::from_bits(0xff80_0001)).is_nan(), "a NaN whose upper half alone would be infinity");
+        assert!(
+            rounded(f32::from_bits(0xff80_0001)).is_nan(),
+            "a NaN whose upper half alone would be infinity"
+        );
     }
 
     #[test]
@@ -232,14 +276,28 @@ mod tests {
         let rows = 37;
         let columns = 70;
         let number = |row: usize, column: usize| ((row * columns + column) % 251) as f32;
-        let by_rows: Vec<f32> = (0..rows * columns).map(|i| number(i / columns, i % columns)).collect();
-        let by_columns: Vec<f32> = (0..rows * columns).map(|i| number(i % rows, i / rows)).collect();
-        for matrix in [Matrix::new(&by_rows, rows, columns), Matrix::new(&by_columns, columns, rows).transposed()] {
+        let by_rows: Vec<f32> = (0..rows * columns)
+            .map(|i| number(i / columns, i % columns))
+            .collect();
+        let by_columns: Vec<f32> = (0..rows * columns)
+            .map(|i| number(i % rows, i / rows))
+            .collect();
+        for matrix in [
+            Matrix::new(&by_rows, rows, columns),
+            Matrix::new(&by_columns, columns, rows).transposed(),
+        ] {
             for order in [Order::Lines, Order::Pairs] {
                 // Left from a previous matrix.
-                let mut packed = Packed { tiles: vec![Tile([7; LINES * DEPTH]); 20], depth: 3, order };
+                let mut packed = Packed {
+                    tiles: vec![Tile([7; LINES * DEPTH]); 20],
+                    depth: 3,
+                    order,
+                };
                 packed.pack(matrix, order);
-                assert_eq!((packed.depth, packed.order), (columns.div_ceil(DEPTH), order));
+                assert_eq!(
+                    (packed.depth, packed.order),
+                    (columns.div_ceil(DEPTH), order)
+                );
                 let groups = rows.div_ceil(2 * LINES) * 2;
                 assert_eq!(packed.tiles.len(), groups * packed.depth);
                 for (i, &x) in packed.tiles.iter().flat_map(|Tile(tile)| tile).enumerate() {

@@ -27,9 +27,9 @@ impl Arithmetic {
         Ok(match precision {
             Precision::F32 => Self::F32,
             Precision::Bf16Rounded => Self::Rounded,
-            Precision::Bf16 => Self::Bf16(
-                units::request().context("ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"")?,
-            ),
+            Precision::Bf16 => Self::Bf16(units::request().context(
+                "ppo.precision = \"bf16\" is unavailable here; start the run with \"f32\"",
+            )?),
         })
     }
 }
@@ -44,7 +44,11 @@ pub(crate) struct Multiplier {
 impl Multiplier {
     /// Creates a multiplier with empty buffers. They grow to the size that the largest product needs.
     pub(crate) fn new(arithmetic: Arithmetic) -> Self {
-        Self { arithmetic, rounded: Default::default(), packed: Default::default() }
+        Self {
+            arithmetic,
+            rounded: Default::default(),
+            packed: Default::default(),
+        }
     }
 
     /// Writes the product to `out`, by rows, or adds it if `add` is set. `ready` is the right operand
@@ -52,7 +56,14 @@ impl Multiplier {
     ///
     /// # Panics
     /// Panics if the sizes do not match.
-    pub(crate) fn product(&mut self, out: &mut [f32], lhs: Matrix, rhs: Matrix, ready: Option<&Packed>, add: bool) {
+    pub(crate) fn product(
+        &mut self,
+        out: &mut [f32],
+        lhs: Matrix,
+        rhs: Matrix,
+        ready: Option<&Packed>,
+        add: bool,
+    ) {
         match self.arithmetic {
             Arithmetic::F32 => product(out, lhs, rhs, add),
             Arithmetic::Rounded => {

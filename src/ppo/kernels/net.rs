@@ -50,7 +50,10 @@ impl Workspace {
     pub fn new(layers: &[parameters::Layer], rows: usize, arithmetic: Arithmetic) -> Self {
         Self {
             inputs: vec![0.0; rows * layers[0].inputs],
-            outputs: layers.iter().map(|layer| vec![0.0; rows * layer.outputs]).collect(),
+            outputs: layers
+                .iter()
+                .map(|layer| vec![0.0; rows * layer.outputs])
+                .collect(),
             grads: Default::default(),
             multiplier: Multiplier::new(arithmetic),
             rows,
@@ -60,25 +63,46 @@ impl Workspace {
     /// The outputs of a net with `outputs` outputs for `rows` rows, and the buffer for the gradient with
     /// respect to them, which the first call makes.
     pub fn outputs_and_grad(&mut self, rows: usize, outputs: usize) -> (&[f32], &mut [f32]) {
-        let widest = self.outputs.iter().map(Vec::len).max().expect("a net has layers");
-        self.grads.iter_mut().for_each(|grad| grad.resize(widest, 0.0));
+        let widest = self
+            .outputs
+            .iter()
+            .map(Vec::len)
+            .max()
+            .expect("a net has layers");
+        self.grads
+            .iter_mut()
+            .for_each(|grad| grad.resize(widest, 0.0));
         let last = self.outputs.last().expect("a net has layers");
-        (&last[..rows * outputs], &mut self.grads[0][..rows * outputs])
+        (
+            &last[..rows * outputs],
+            &mut self.grads[0][..rows * outputs],
+        )
     }
 }
 
 impl<'a> Net<'a> {
     /// Creates the net of these layers, whose ranges refer to `parameters`.
-    pub(crate) fn new(layers: &[parameters::Layer], parameters: &'a [f32], activation: Activation) -> Self {
+    pub(crate) fn new(
+        layers: &[parameters::Layer],
+        parameters: &'a [f32],
+        activation: Activation,
+    ) -> Self {
         let layer = |layer: &parameters::Layer| Dense {
-            weight: Matrix::new(&parameters[layer.weight.clone()], layer.outputs, layer.inputs),
+            weight: Matrix::new(
+                &parameters[layer.weight.clone()],
+                layer.outputs,
+                layer.inputs,
+            ),
             weight_t: None,
             packed: [None, None],
             bias: &parameters[layer.bias.clone()],
             inputs: layer.inputs,
             outputs: layer.outputs,
         };
-        Self { layers: layers.iter().map(layer).collect(), activation }
+        Self {
+            layers: layers.iter().map(layer).collect(),
+            activation,
+        }
     }
 
     /// Gives nets rearranged copies of their weights, which each product would otherwise make anew. The results are the same, bit
@@ -92,7 +116,10 @@ impl<'a> Net<'a> {
             }
             if let Arithmetic::Bf16(_) = arithmetic {
                 // The lines of the right operands of the forward and of the backward pass.
-                let lines = [Some(layer.weight), learns.then_some(layer.weight.transposed())];
+                let lines = [
+                    Some(layer.weight),
+                    learns.then_some(layer.weight.transposed()),
+                ];
                 for (packed, lines) in layer.packed.iter_mut().zip(lines.into_iter().flatten()) {
                     jobs.extend(packed.insert(Packed::default()).jobs(lines, Order::Pairs));
                 }
@@ -118,7 +145,8 @@ impl<'a> Net<'a> {
             let x = below.last().unwrap_or(&work.inputs);
             let y = &mut outputs[0][..rows * layer.outputs];
             let packed = layer.packed[0].as_ref();
-            work.multiplier.product(y, layer.x(x, rows), layer.weight_t(rows), packed, false);
+            work.multiplier
+                .product(y, layer.x(x, rows), layer.weight_t(rows), packed, false);
             add_bias(y, layer.bias, self.activation_of(l));
         }
         &work.outputs[self.layers.len() - 1][..rows * self.outputs()]
@@ -126,7 +154,13 @@ impl<'a> Net<'a> {
 
     /// Propagates the gradient with respect to the outputs of the last forward pass, which is in `work`, back through
     /// the net. Writes the gradient of the parameters, in their order, to `gradient`, or adds it if `add` is set.
-    pub(crate) fn backward(&self, rows: usize, work: &mut Workspace, gradient: &mut [f32], add: bool) {
+    pub(crate) fn backward(
+        &self,
+        rows: usize,
+        work: &mut Workspace,
+        gradient: &mut [f32],
+        add: bool,
+    ) {
         let mut rest = gradient;
         let [above, below] = &mut work.grads;
         for (l, layer) in self.layers.iter().enumerate().rev() {
@@ -138,14 +172,25 @@ impl<'a> Net<'a> {
             if !add {
                 bias_grad.fill(0.0);
             }
-            slopes_and_sums(grad, &work.outputs[l][..grad.len()], self.activation_of(l), bias_grad);
+            slopes_and_sums(
+                grad,
+                &work.outputs[l][..grad.len()],
+                self.activation_of(l),
+                bias_grad,
+            );
             let grad = Matrix::new(grad, rows, layer.outputs);
-            let x = if l == 0 { &work.inputs } else { &work.outputs[l - 1] };
-            work.multiplier.product(weight_grad, grad.transposed(), layer.x(x, rows), None, add);
+            let x = if l == 0 {
+                &work.inputs
+            } else {
+                &work.outputs[l - 1]
+            };
+            work.multiplier
+                .product(weight_grad, grad.transposed(), layer.x(x, rows), None, add);
             if l > 0 {
                 let out = &mut below[..rows * layer.inputs];
                 let packed = layer.packed[1].as_ref();
-                work.multiplier.product(out, grad, layer.weight, packed, false);
+                work.multiplier
+                    .product(out, grad, layer.weight, packed, false);
                 std::mem::swap(above, below);
             }
         }
@@ -157,7 +202,11 @@ impl Dense<'_> {
     fn transposed(&self) -> Vec<f32> {
         let mut weight_t = vec![0.0; self.inputs * self.outputs];
         for (output, row) in self.weight.data().chunks_exact(self.inputs).enumerate() {
-            weight_t[output..].iter_mut().step_by(self.outputs).zip(row).for_each(|(to, &from)| *to = from);
+            weight_t[output..]
+                .iter_mut()
+                .step_by(self.outputs)
+                .zip(row)
+                .for_each(|(to, &from)| *to = from);
         }
         weight_t
     }
@@ -184,14 +233,22 @@ mod tests {
     use crate::config::Precision;
     use crate::spaces::Spaces;
 
-    const SPACES: Spaces =
-        Spaces { observation_size: 70, action_size: 20, object_and_goal: None, distance: |_, _| 0.0 };
+    const SPACES: Spaces = Spaces {
+        observation_size: 70,
+        action_size: 20,
+        object_and_goal: None,
+        distance: |_, _| 0.0,
+    };
 
     #[test]
     fn packed_weights_change_no_bit() {
-        let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else { return };
+        let Ok(arithmetic) = Arithmetic::new(Precision::Bf16) else {
+            return;
+        };
         let layout = ParameterLayout::new(&[70, 33], &SPACES);
-        let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
+        let parameters: Vec<f32> = (0..layout.count())
+            .map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0)
+            .collect();
         for rows in [1, 32, 50] {
             let [plain, packed] = [false, true].map(|packed| {
                 let mut nets = [Net::new(&layout.actor, &parameters, Activation::Elu)];
@@ -200,24 +257,37 @@ mod tests {
                 }
                 let [net] = nets;
                 let mut work = Workspace::new(&layout.actor, rows, arithmetic);
-                work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
+                work.inputs
+                    .iter_mut()
+                    .enumerate()
+                    .for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
                 let outputs = net.forward(rows, &mut work).to_vec();
                 let (_, grad) = work.outputs_and_grad(rows, net.outputs());
-                grad.iter_mut().enumerate().for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
+                grad.iter_mut()
+                    .enumerate()
+                    .for_each(|(i, grad)| *grad = (i % 7) as f32 - 3.0);
                 let mut gradient = vec![0.0; layout.nets()[0].len()];
                 net.backward(rows, &mut work, &mut gradient, false);
                 (outputs, gradient)
             });
-            assert!(plain.1.iter().any(|&x| x != 0.0) && plain == packed, "{rows} rows");
+            assert!(
+                plain.1.iter().any(|&x| x != 0.0) && plain == packed,
+                "{rows} rows"
+            );
         }
     }
 
     #[test]
     fn copies_of_the_weights_for_few_rows_change_no_bit() {
         let layout = ParameterLayout::new(&[300, 64], &SPACES);
-        let parameters: Vec<f32> = (0..layout.count()).map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0).collect();
+        let parameters: Vec<f32> = (0..layout.count())
+            .map(|i| ((i * 37 % 101) as f32 - 50.0) / 300.0)
+            .collect();
         let mut work = Workspace::new(&layout.actor, 64, Arithmetic::F32);
-        work.inputs.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
+        work.inputs
+            .iter_mut()
+            .enumerate()
+            .for_each(|(i, x)| *x = ((i * 61 % 97) as f32 - 48.0) / 20.0);
         for layers in [&layout.actor, &layout.critic] {
             let net = || Net::new(layers, &parameters, Activation::Elu);
             for rows in [1, 2, 5, 13, 32, 64] {

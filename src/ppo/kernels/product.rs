@@ -22,7 +22,11 @@ impl<'a> Matrix<'a> {
     /// Panics if `data` does not have `rows * columns` elements.
     pub fn new(data: &'a [f32], rows: usize, columns: usize) -> Self {
         assert_eq!(data.len(), rows * columns, "elements of a matrix");
-        Self { data, size: [rows, columns], strides: [columns as isize, 1] }
+        Self {
+            data,
+            size: [rows, columns],
+            strides: [columns as isize, 1],
+        }
     }
 
     /// The values in memory order.
@@ -43,14 +47,22 @@ impl<'a> Matrix<'a> {
     /// A matrix of other data with the same layout.
     pub fn with_data<'b>(&self, data: &'b [f32]) -> Matrix<'b> {
         assert_eq!(data.len(), self.data.len(), "elements of a matrix");
-        Matrix { data, size: self.size, strides: self.strides }
+        Matrix {
+            data,
+            size: self.size,
+            strides: self.strides,
+        }
     }
 
     /// The transposed matrix, without copying.
     pub fn transposed(self) -> Self {
         let [rows, columns] = self.size;
         let [down, right] = self.strides;
-        Self { data: self.data, size: [columns, rows], strides: [right, down] }
+        Self {
+            data: self.data,
+            size: [columns, rows],
+            strides: [right, down],
+        }
     }
 }
 
@@ -61,7 +73,10 @@ impl<'a> Matrix<'a> {
 pub fn product(out: &mut [f32], lhs: Matrix, rhs: Matrix, add: bool) {
     let [m, k] = lhs.size;
     let [rhs_rows, n] = rhs.size;
-    assert_eq!(k, rhs_rows, "columns of the first and rows of the second matrix");
+    assert_eq!(
+        k, rhs_rows,
+        "columns of the first and rows of the second matrix"
+    );
     assert_eq!(out.len(), m * n, "elements of the product");
     let [down, right] = lhs.strides;
     let [rhs_down, rhs_right] = rhs.strides;
@@ -87,9 +102,19 @@ mod tests {
         let a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
         let b = [1.0, -1.0, 2.0, 0.5, 0.0, 3.0];
         let mut out = [9.0; 4];
-        product(&mut out, Matrix::new(&a, 2, 3), Matrix::new(&b, 3, 2), false);
+        product(
+            &mut out,
+            Matrix::new(&a, 2, 3),
+            Matrix::new(&b, 3, 2),
+            false,
+        );
         assert_eq!(out, [5.0, 9.0, 14.0, 16.5]);
-        product(&mut out, Matrix::new(&a, 2, 3), Matrix::new(&b, 2, 3).transposed(), true);
+        product(
+            &mut out,
+            Matrix::new(&a, 2, 3),
+            Matrix::new(&b, 2, 3).transposed(),
+            true,
+        );
         assert_eq!(out, [10.0, 18.5, 25.0, 36.5]);
     }
 }

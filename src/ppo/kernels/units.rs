@@ -31,8 +31,15 @@ fn dots() -> Answer<&'static str> {
 pub fn request() -> Result<&'static dyn Unit> {
     static ANSWER: OnceLock<Answer<String>> = OnceLock::new();
     let answer = ANSWER.get_or_init(|| {
-        checked(tiles(), "the tiles (AMX) of this processor multiply wrongly").or_else(|no_tiles| {
-            let dots = checked(dots(), "its dot products (AVX-512 BF16) are computed wrongly");
+        checked(
+            tiles(),
+            "the tiles (AMX) of this processor multiply wrongly",
+        )
+        .or_else(|no_tiles| {
+            let dots = checked(
+                dots(),
+                "its dot products (AVX-512 BF16) are computed wrongly",
+            );
             dots.map_err(|no_dots| format!("{no_tiles}, and {no_dots}"))
         })
     });
@@ -40,7 +47,13 @@ pub fn request() -> Result<&'static dyn Unit> {
 }
 
 fn checked(unit: Answer<&'static str>, wrong: &'static str) -> Answer<&'static str> {
-    unit.and_then(|unit| if multiplies_rightly(unit) { Ok(unit) } else { Err(wrong) })
+    unit.and_then(|unit| {
+        if multiplies_rightly(unit) {
+            Ok(unit)
+        } else {
+            Err(wrong)
+        }
+    })
 }
 
 /// Whether products of whole numbers, which need no rounding, are exact.
@@ -48,7 +61,11 @@ fn multiplies_rightly(unit: &dyn Unit) -> bool {
     let rows = 37;
     let depth = 70;
     let columns = 50;
-    let numbers = |count: usize, step: usize| (0..count).map(|i| (i * step % 17) as f32 - 8.0).collect::<Vec<f32>>();
+    let numbers = |count: usize, step: usize| {
+        (0..count)
+            .map(|i| (i * step % 17) as f32 - 8.0)
+            .collect::<Vec<f32>>()
+    };
     let a = numbers(rows * depth, 5);
     let b = numbers(depth * columns, 3);
     let by_rows = Matrix::new(&a, rows, depth);
@@ -64,7 +81,8 @@ fn multiplies_rightly(unit: &dyn Unit) -> bool {
         (0..rows * columns).all(|i| {
             let row = i / columns;
             let column = i % columns;
-            let terms = (0..depth).map(|k| a.data()[row * down + k * right] * b[k * columns + column]);
+            let terms =
+                (0..depth).map(|k| a.data()[row * down + k * right] * b[k * columns + column]);
             out[i] == 1.0 + terms.sum::<f32>()
         })
     })
@@ -96,19 +114,33 @@ mod tests {
 
     fn products_agree_with_doubles(unit: &dyn Unit) {
         let mut rng = rng::stream(0, "test", 0);
-        for (rows, depth, columns) in
-            [(32, 32, 32), (1, 1, 1), (256, 155, 256), (20, 256, 64), (100, 33, 17), (3, 70, 500)]
-        {
-            let mut random =
-                |count: usize| -> Vec<f32> { (0..count).map(|_| rng::uniform(&mut rng, -2.0, 2.0) as f32).collect() };
+        for (rows, depth, columns) in [
+            (32, 32, 32),
+            (1, 1, 1),
+            (256, 155, 256),
+            (20, 256, 64),
+            (100, 33, 17),
+            (3, 70, 500),
+        ] {
+            let mut random = |count: usize| -> Vec<f32> {
+                (0..count)
+                    .map(|_| rng::uniform(&mut rng, -2.0, 2.0) as f32)
+                    .collect()
+            };
             let a = random(rows * depth);
             let b = random(depth * columns);
             let before = random(rows * columns);
             for add in [false, true] {
                 // Both operands, once stored by rows and once by columns.
                 for (lhs, rhs) in [
-                    (Matrix::new(&a, rows, depth), Matrix::new(&b, depth, columns)),
-                    (Matrix::new(&a, depth, rows).transposed(), Matrix::new(&b, columns, depth).transposed()),
+                    (
+                        Matrix::new(&a, rows, depth),
+                        Matrix::new(&b, depth, columns),
+                    ),
+                    (
+                        Matrix::new(&a, depth, rows).transposed(),
+                        Matrix::new(&b, columns, depth).transposed(),
+                    ),
                 ] {
                     let mut left = Packed::default();
                     let mut right = Packed::default();
@@ -117,14 +149,21 @@ mod tests {
                     let mut out = before.clone();
                     unit.product(&mut out, columns, [&left, &right], add);
                     let at = |m: Matrix, i: usize, j: usize| {
-                        f64::from(rounded(m.data()[i * m.strides()[0] as usize + j * m.strides()[1] as usize]))
+                        f64::from(rounded(
+                            m.data()[i * m.strides()[0] as usize + j * m.strides()[1] as usize],
+                        ))
                     };
                     for (i, &found) in out.iter().enumerate() {
-                        let terms = (0..depth).map(|k| at(lhs, i / columns, k) * at(rhs, k, i % columns));
+                        let terms =
+                            (0..depth).map(|k| at(lhs, i / columns, k) * at(rhs, k, i % columns));
                         let start = if add { f64::from(before[i]) } else { 0.0 };
-                        let (sum, size) = terms.fold((start, start.abs()), |(s, z), x| (s + x, z + x.abs()));
+                        let (sum, size) =
+                            terms.fold((start, start.abs()), |(s, z), x| (s + x, z + x.abs()));
                         let error = (f64::from(found) - sum).abs();
-                        assert!(error <= 1e-6 * size.max(1.0), "{rows}×{depth}×{columns}: {found} not {sum}");
+                        assert!(
+                            error <= 1e-6 * size.max(1.0),
+                            "{rows}×{depth}×{columns}: {found} not {sum}"
+                        );
                     }
                 }
             }

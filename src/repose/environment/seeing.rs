@@ -10,7 +10,10 @@ impl Repose {
     pub fn object(&self) -> Pose {
         let at = self.task.hand.object.qpos;
         let q = self.sim.qpos();
-        Pose { position: [q[at], q[at + 1], q[at + 2]], orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]] }
+        Pose {
+            position: [q[at], q[at + 1], q[at + 2]],
+            orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]],
+        }
     }
 
     /// Records what the rewards of a step depend on, after its physics.
@@ -21,7 +24,8 @@ impl Repose {
         let last = &mut self.last;
         let qpos = self.sim.qpos();
         let qvel = self.sim.qvel();
-        let offset = [0, 1, 2].map(|axis| object.position[axis] - task.config.goal_position.value[axis]);
+        let offset =
+            [0, 1, 2].map(|axis| object.position[axis] - task.config.goal_position.value[axis]);
         last.goal = self.goal;
         last.rot_dist_before = rot_dist_before;
         last.rot_dist = quat::angle_between(object.orientation, self.goal);
@@ -39,11 +43,15 @@ impl Repose {
 
     /// The velocity of the object, in the world frame.
     fn object_velocity(&self) -> Velocity {
-        let [vx, vy, vz, spin @ ..] =
-            self.sim.qvel()[self.task.hand.object.dof..].first_chunk::<6>().expect("a free joint");
+        let [vx, vy, vz, spin @ ..] = self.sim.qvel()[self.task.hand.object.dof..]
+            .first_chunk::<6>()
+            .expect("a free joint");
         // MuJoCo stores the angular velocity of a free joint in the body's frame.
         let angular = quat::rotate(self.object().orientation, *spin);
-        Velocity { linear: [*vx, *vy, *vz], angular }
+        Velocity {
+            linear: [*vx, *vy, *vz],
+            angular,
+        }
     }
 
     /// Writes the observation of the current state as the policy sees it: mirrored, if its hand is on the other side.
@@ -61,10 +69,21 @@ impl Repose {
         let qpos = self.sim.qpos();
         let qvel = self.sim.qvel();
         let mut cells = Writer::new(&hand.layout, observation);
-        cells.put("joint_pos", hand.joints.iter().map(|joint| qpos[joint.qpos]));
-        cells.put("joint_vel", hand.joints.iter().map(|joint| config.vel_obs_scale * qvel[joint.dof]));
+        cells.put(
+            "joint_pos",
+            hand.joints.iter().map(|joint| qpos[joint.qpos]),
+        );
+        cells.put(
+            "joint_vel",
+            hand.joints
+                .iter()
+                .map(|joint| config.vel_obs_scale * qvel[joint.dof]),
+        );
 
-        let Pose { position, orientation } = self.object();
+        let Pose {
+            position,
+            orientation,
+        } = self.object();
         let Velocity { linear, angular } = self.object_velocity();
         cells.put("cube_pos", position);
         cells.put("cube_quat", quat::canonical(orientation));
@@ -72,18 +91,28 @@ impl Repose {
         cells.put("cube_angvel", angular.map(|x| config.vel_obs_scale * x));
         cells.put("goal_pos", config.goal_position.value);
         cells.put("goal_quat", quat::canonical(self.goal));
-        cells.put("relative_quat", quat::canonical(quat::mul(orientation, quat::conj(self.goal))));
+        cells.put(
+            "relative_quat",
+            quat::canonical(quat::mul(orientation, quat::conj(self.goal))),
+        );
 
         for &tip in &hand.fingertips {
-            let Pose { position, orientation } = self.sim.pose(tip);
+            let Pose {
+                position,
+                orientation,
+            } = self.sim.pose(tip);
             let Velocity { linear, angular } = self.sim.velocity(tip);
             cells.put("fingertips", position);
             cells.put("fingertips", orientation);
             cells.put("fingertips", linear);
             cells.put("fingertips", angular);
         }
-        cells.put("previous_action", self.last.action.iter().copied().map(f64::from));
+        cells.put(
+            "previous_action",
+            self.last.action.iter().copied().map(f64::from),
+        );
         cells.finish();
-        self.conditions.disturb(&self.rng, self.episode.length, &self.task, observation);
+        self.conditions
+            .disturb(&self.rng, self.episode.length, &self.task, observation);
     }
 }

@@ -17,7 +17,10 @@ pub(super) type Imports = BTreeMap<PathBuf, BTreeSet<PathBuf>>;
 
 /// The imports of a crate with this name, as paths within its folder `src`.
 pub(super) fn imports(src: &Path, name: &'static str) -> Imports {
-    let mut house = House { name, modules: BTreeMap::new() };
+    let mut house = House {
+        name,
+        modules: BTreeMap::new(),
+    };
     let mut paths: Vec<(PathBuf, Module, Vec<String>)> = Vec::new();
     for path in super::sources(src) {
         let file = path.strip_prefix(src).unwrap().to_owned();
@@ -28,7 +31,11 @@ pub(super) fn imports(src: &Path, name: &'static str) -> Imports {
     let mut found = Imports::new();
     for (file, module, path) in paths {
         let used = found.entry(file.clone()).or_default();
-        used.extend(house.file_of(&module, &path, 0).filter(|other| *other != file));
+        used.extend(
+            house
+                .file_of(&module, &path, 0)
+                .filter(|other| *other != file),
+        );
     }
     found
 }
@@ -36,14 +43,27 @@ pub(super) fn imports(src: &Path, name: &'static str) -> Imports {
 /// The imports between the files of a Python package. They are written `from .file import name` or `from . import file`.
 pub(super) fn of_python(package: &Path) -> Imports {
     let mut found = Imports::new();
-    for path in super::sources(package).iter().filter(|path| path.extension().is_some_and(|ending| ending == "py")) {
+    for path in super::sources(package)
+        .iter()
+        .filter(|path| path.extension().is_some_and(|ending| ending == "py"))
+    {
         let file = path.strip_prefix(package).unwrap();
         let text = fs::read_to_string(path).unwrap();
         let used = found.entry(file.to_owned()).or_default();
-        for line in text.lines().filter_map(|line| line.trim().strip_prefix("from .")) {
+        for line in text
+            .lines()
+            .filter_map(|line| line.trim().strip_prefix("from ."))
+        {
             let (place, names) = line.split_once(" import ").unwrap();
-            let places = if place.is_empty() { names.split(", ").collect() } else { vec![place] };
-            for place in places.into_iter().filter(|place| !package.join(format!("{place}.pyi")).exists()) {
+            let places = if place.is_empty() {
+                names.split(", ").collect()
+            } else {
+                vec![place]
+            };
+            for place in places
+                .into_iter()
+                .filter(|place| !package.join(format!("{place}.pyi")).exists())
+            {
                 let other = PathBuf::from(format!("{place}.py"));
                 let is_file = package.join(&other).exists();
                 used.insert(if is_file { other } else { "__init__.py".into() });
@@ -56,7 +76,11 @@ pub(super) fn of_python(package: &Path) -> Imports {
 
 /// The module of a file: a::b for `a/b.rs` and `a/b/mod.rs`.
 fn module_of(file: &Path) -> Module {
-    let mut names: Module = file.with_extension("").iter().map(|part| part.to_str().unwrap().to_owned()).collect();
+    let mut names: Module = file
+        .with_extension("")
+        .iter()
+        .map(|part| part.to_str().unwrap().to_owned())
+        .collect();
     let last = names.pop().unwrap();
     match last.as_str() {
         "mod" | "lib" => {}
@@ -92,11 +116,18 @@ impl House {
         items: &[syn::Item],
         paths: &mut Vec<(PathBuf, Module, Vec<String>)>,
     ) {
-        let mut names = Names { file: file.to_owned(), ..Names::default() };
+        let mut names = Names {
+            file: file.to_owned(),
+            ..Names::default()
+        };
         let mut written = Written::default();
         for item in items.iter().filter(|item| !is_of_tests(item)) {
             match item {
-                syn::Item::Mod(syn::ItemMod { ident, content: Some((_, inner)), .. }) => {
+                syn::Item::Mod(syn::ItemMod {
+                    ident,
+                    content: Some((_, inner)),
+                    ..
+                }) => {
                     let inside = [module, &[ident.to_string()]].concat();
                     self.add(file, &inside, inner, paths);
                 }
@@ -109,7 +140,9 @@ impl House {
                         match name {
                             Some(name) => drop(names.imported.insert(name, path)),
                             // Globs of other crates are ignored.
-                            None if ["crate", "self", "super"].contains(&path[0].as_str()) => names.globs.push(path),
+                            None if ["crate", "self", "super"].contains(&path[0].as_str()) => {
+                                names.globs.push(path)
+                            }
                             None => {}
                         }
                     });
@@ -120,7 +153,12 @@ impl House {
                 }
             }
         }
-        paths.extend(written.0.into_iter().map(|path| (file.to_owned(), module.to_vec(), path)));
+        paths.extend(
+            written
+                .0
+                .into_iter()
+                .map(|path| (file.to_owned(), module.to_vec(), path)),
+        );
         // Of a module with several cfgs, the first counts.
         self.modules.entry(module.to_vec()).or_insert(names);
     }
@@ -138,13 +176,24 @@ impl House {
         let names = self.modules.get(module)?;
         let is_known = names.defined.contains(first)
             || names.imported.contains_key(first)
-            || self.modules.contains_key(&[module, std::slice::from_ref(first)].concat())
+            || self
+                .modules
+                .contains_key(&[module, std::slice::from_ref(first)].concat())
             || !names.globs.is_empty();
-        if is_known { self.below(module, path, depth) } else { None }
+        if is_known {
+            self.below(module, path, depth)
+        } else {
+            None
+        }
     }
 
     /// Resolves what follows a `super`, which may be another `super`.
-    fn file_of_or_below(&self, module: &[String], path: &[String], depth: usize) -> Option<PathBuf> {
+    fn file_of_or_below(
+        &self,
+        module: &[String],
+        path: &[String],
+        depth: usize,
+    ) -> Option<PathBuf> {
         match path.first().is_some_and(|first| first == "super") {
             true => self.file_of(module, path, depth),
             false => self.below(module, path, depth),
@@ -163,10 +212,17 @@ impl House {
             return self.below(&child, rest, depth);
         }
         // Not an item with the name of its crate, such as anyhow.
-        if let Some(origin) = names.imported.get(first).filter(|origin| origin[0] != *first) {
+        if let Some(origin) = names
+            .imported
+            .get(first)
+            .filter(|origin| origin[0] != *first)
+        {
             return self.file_of(module, &[origin, rest].concat(), depth + 1);
         }
-        names.globs.iter().find_map(|origin| self.file_of(module, &[origin, path].concat(), depth + 1))
+        names
+            .globs
+            .iter()
+            .find_map(|origin| self.file_of(module, &[origin, path].concat(), depth + 1))
     }
 }
 
@@ -176,17 +232,25 @@ struct Written(Vec<Vec<String>>);
 
 impl<'ast> Visit<'ast> for Written {
     fn visit_path(&mut self, path: &'ast syn::Path) {
-        self.0.push(path.segments.iter().map(|segment| segment.ident.to_string()).collect());
+        self.0.push(
+            path.segments
+                .iter()
+                .map(|segment| segment.ident.to_string())
+                .collect(),
+        );
         visit::visit_path(self, path);
     }
 
     fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
-        imported(&item.tree, &mut Vec::new(), &mut |path, _| self.0.push(path));
+        imported(&item.tree, &mut Vec::new(), &mut |path, _| {
+            self.0.push(path)
+        });
     }
 
     fn visit_macro(&mut self, item: &'ast syn::Macro) {
         // Arguments that are expressions between commas, as of `format!`, `assert!` and `vec!`. Others are skipped.
-        let expressions = item.parse_body_with(Punctuated::<syn::Expr, syn::Token![,]>::parse_terminated);
+        let expressions =
+            item.parse_body_with(Punctuated::<syn::Expr, syn::Token![,]>::parse_terminated);
         for expression in expressions.into_iter().flatten() {
             let mut inside = Written::default();
             inside.visit_expr(&expression);
@@ -203,21 +267,36 @@ impl<'ast> Visit<'ast> for Written {
 }
 
 /// Calls `tell` with the path and the local name of everything that a `use` imports. A glob has no name.
-fn imported(tree: &syn::UseTree, before: &mut Vec<String>, tell: &mut dyn FnMut(Vec<String>, Option<String>)) {
+fn imported(
+    tree: &syn::UseTree,
+    before: &mut Vec<String>,
+    tell: &mut dyn FnMut(Vec<String>, Option<String>),
+) {
     match tree {
         syn::UseTree::Path(part) => {
             before.push(part.ident.to_string());
             imported(&part.tree, before, tell);
             before.pop();
         }
-        syn::UseTree::Group(group) => group.items.iter().for_each(|tree| imported(tree, before, tell)),
-        syn::UseTree::Name(part) if part.ident == "self" => tell(before.clone(), before.last().cloned()),
+        syn::UseTree::Group(group) => group
+            .items
+            .iter()
+            .for_each(|tree| imported(tree, before, tell)),
+        syn::UseTree::Name(part) if part.ident == "self" => {
+            tell(before.clone(), before.last().cloned())
+        }
         syn::UseTree::Name(part) => {
             let name = part.ident.to_string();
-            tell([&before[..], std::slice::from_ref(&name)].concat(), Some(name));
+            tell(
+                [&before[..], std::slice::from_ref(&name)].concat(),
+                Some(name),
+            );
         }
         syn::UseTree::Rename(part) => {
-            tell([&before[..], &[part.ident.to_string()]].concat(), Some(part.rename.to_string()));
+            tell(
+                [&before[..], &[part.ident.to_string()]].concat(),
+                Some(part.rename.to_string()),
+            );
         }
         _ => tell(before.clone(), None),
     }

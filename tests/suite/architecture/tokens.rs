@@ -69,7 +69,8 @@ struct Contents {
 impl Contents {
     fn add(&mut self, signature: &syn::Signature, block: &syn::Block) {
         let first = signature.span().start().line;
-        self.functions.push((signature.ident.to_string(), first, block.span().end().line));
+        self.functions
+            .push((signature.ident.to_string(), first, block.span().end().line));
     }
 }
 
@@ -129,7 +130,15 @@ fn files() -> Vec<(String, String, Contents)> {
         let text = fs::read_to_string(path).unwrap();
         let mut contents = Contents::default();
         contents.visit_file(&syn::parse_file(&text).unwrap());
-        (path.strip_prefix(src()).unwrap().to_str().unwrap().to_owned(), text, contents)
+        (
+            path.strip_prefix(src())
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .to_owned(),
+            text,
+            contents,
+        )
     };
     sources(&src()).iter().map(|path| read(path)).collect()
 }
@@ -145,10 +154,20 @@ fn a_token_is_a_word_a_string_or_a_mark() {
 #[test]
 fn files_are_short() {
     for (file, text, _) in files() {
-        let size = text.lines().take_while(|line| !line.trim().starts_with("#[cfg(test)]")).map(tokens).sum::<usize>();
+        let size = text
+            .lines()
+            .take_while(|line| !line.trim().starts_with("#[cfg(test)]"))
+            .map(tokens)
+            .sum::<usize>();
         let is_exempt = LONGER_FILES.contains(&file.as_str());
-        assert!(size <= FILE || is_exempt, "{file} has {size} tokens, more than {FILE}");
-        assert!(size > FILE || !is_exempt, "{file} is short enough: LONGER_FILES must not name it");
+        assert!(
+            size <= FILE || is_exempt,
+            "{file} has {size} tokens, more than {FILE}"
+        );
+        assert!(
+            size > FILE || !is_exempt,
+            "{file} is short enough: LONGER_FILES must not name it"
+        );
     }
 }
 
@@ -156,8 +175,14 @@ fn files_are_short() {
 fn tests_are_at_the_end_of_a_file() {
     for (file, text, _) in files() {
         let items = syn::parse_file(&text).unwrap().items;
-        let after = items.iter().skip_while(|item| !is_of_tests(item)).find(|item| !is_of_tests(item));
-        assert!(after.is_none(), "{file}: there is more than tests after the first `#[cfg(test)]`");
+        let after = items
+            .iter()
+            .skip_while(|item| !is_of_tests(item))
+            .find(|item| !is_of_tests(item));
+        assert!(
+            after.is_none(),
+            "{file}: there is more than tests after the first `#[cfg(test)]`"
+        );
     }
 }
 
@@ -176,19 +201,36 @@ fn functions_are_short() {
         }
     }
     assert!(counted > 500, "most functions were not found");
-    let new: Vec<&String> = longer.iter().filter(|function| !LONGER_FUNCTIONS.contains(&function.as_str())).collect();
-    assert!(new.is_empty(), "these have more than {FUNCTION} tokens: {new:#?}");
+    let new: Vec<&String> = longer
+        .iter()
+        .filter(|function| !LONGER_FUNCTIONS.contains(&function.as_str()))
+        .collect();
+    assert!(
+        new.is_empty(),
+        "these have more than {FUNCTION} tokens: {new:#?}"
+    );
     let is_short = |function: &&&str| !longer.iter().any(|longer| longer == **function);
     let short: Vec<&&str> = LONGER_FUNCTIONS.iter().filter(is_short).collect();
-    assert!(short.is_empty(), "these are short enough, so LONGER_FUNCTIONS must not name them: {short:#?}");
+    assert!(
+        short.is_empty(),
+        "these are short enough, so LONGER_FUNCTIONS must not name them: {short:#?}"
+    );
 }
 
 #[test]
 fn a_statement_sets_one_variable() {
     let places: Vec<String> = files()
         .iter()
-        .flat_map(|(file, _, contents)| contents.several_at_once.iter().map(move |line| format!("{file}:{line}")))
+        .flat_map(|(file, _, contents)| {
+            contents
+                .several_at_once
+                .iter()
+                .map(move |line| format!("{file}:{line}"))
+        })
         .collect();
     let count = places.len();
-    assert!(count <= SEVERAL_AT_ONCE, "{count} statements set several variables: {places:#?}");
+    assert!(
+        count <= SEVERAL_AT_ONCE,
+        "{count} statements set several variables: {places:#?}"
+    );
 }
