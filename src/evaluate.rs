@@ -126,8 +126,10 @@ impl Lane {
 
     /// The record of the episode, once.
     fn episode(&mut self) -> EpisodeStats {
+        let sums = self.env.take_sums();
         EpisodeStats {
-            turned: self.env.take_sums().turned,
+            turned: sums.turned,
+            unpredicted: sums.unpredicted,
             ..self.env.episode()
         }
     }

@@ -13,7 +13,7 @@ use crate::config::{BUILTIN_MODEL, Config, MODEL, Override, PpoConfig, Reader, S
 use crate::evaluate::Actor;
 use crate::os::{self, say};
 use crate::ppo::{Checkpoint, Damaged, Policy, Progress};
-use crate::repose::{Record, Task};
+use crate::repose::{Record, Task, is_physical};
 use crate::run;
 
 /// A policy that is built into the program.
@@ -196,7 +196,14 @@ impl Loaded {
     /// Fails as [`settings`] does, or if the scene cannot be used, or has another hand.
     pub fn task(&self, overrides: &[Override]) -> Result<Arc<Task>> {
         let config = self.settings(overrides)?;
-        Task::new(&config)?.for_policy(&self.record)
+        let task = Task::new(&config)?.for_policy(&self.record)?;
+        if config.env.prediction == 0 {
+            return Ok(task);
+        }
+        // Who predicts knows the physics that the policy was trained with, whatever the world is.
+        let mut sets = overrides.to_vec();
+        sets.retain(|set| !set.key.strip_prefix("env.").is_some_and(is_physical));
+        Ok(task.predicted_by(&*Task::new(&self.settings(&sets)?)?))
     }
 }
 

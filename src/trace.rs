@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use crate::env::{End, Env};
 use crate::evaluate::Moment;
-use crate::repose::{Group, Task, add_settings, named, task_terms};
+use crate::repose::{Group, Task, add_settings, named, physical, task_terms};
 
 /// The number of records at which writing stops. Episodes are written whole and in order.
 const ENOUGH: usize = 2000;
@@ -57,6 +57,8 @@ impl Trace {
             "vel_obs_scale": config.vel_obs_scale,
             "mirror_matrix": mirror,
         });
+        header["prediction"] = json!(config.prediction);
+        header["predicted_with"] = json!(task.predicted_with().map(physical));
         add_settings(config, &mut header);
         Self {
             header,

@@ -21,14 +21,17 @@ import onnxruntime
 SCENE = pathlib.Path(__file__).parents[2] / "assets/shadow_hand/scene.xml"
 # Settings that older files do not have.
 NOMINAL = dict.fromkeys(["hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale"], 1.0)
-NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "action_delay": 0, "noise": {}, "bias": {}}
+NOMINAL |= {"cube_com": [0, 0, 0], "gravity": [0, 0, 0], "cone": "scene", "action_delay": 0, "prediction": 0, "noise": {}, "bias": {}}
+# Settings in which the world of a trace may differ from the policy's: what moves, and what is late.
+OF_WORLD = ["friction_scale", "cube_mass_scale", "hand_mass_scale", "cube_size_scale", "gains_scale", "damping_scale", "frictionloss_scale",
+            "cube_com", "gravity", "cone", "sim_dt", "action_delay", "prediction"]
 # What the file and its settings must say.
 FACTS = set("action_offset action_scale config ema_alpha fingertip_names hinge_names joint_names object_name observation_names "
             "observation_sizes start_keyframe".split())
 SETTINGS = set("sim_dt ctrl_dt friction_scale cube_mass_scale goal_position reset_position_noise reset_dof_pos_noise "
                "reset_dof_vel_noise vel_obs_scale fall_dist success_tolerance success_hold max_consecutive_successes "
                "max_episode_seconds".split())
-OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off
+OBSERVATION_LIMIT, ACTION_LIMIT = 1e-6, 1e-5  # how far a check may be off; with a prediction, observations too may be 1e-5 off
 
 
 @contextlib.contextmanager
@@ -73,8 +76,9 @@ class Policy:
 class Hand:
     """The simulated hand: what the policy sees of it, and what its actions do."""
 
-    def __init__(self, policy, scene):
-        env = NOMINAL | tomllib.loads(policy.facts["config"])["env"]
+    def __init__(self, policy, scene, other=None):
+        """Builds the policy's hand, or one in a world with `other` settings."""
+        env = NOMINAL | tomllib.loads(policy.facts["config"])["env"] | (other or {})
         self.env = env
         if missing := SETTINGS - env.keys():
             raise KeyError(f"no env.{', env.'.join(sorted(missing))}")
@@ -135,9 +139,12 @@ class Hand:
         self.place(qpos, qvel)
         self.goal = uniform_rotation(random)
         self.previous_action = np.zeros(len(self.actuators))
-        # The targets begin where the actuators are.
+        self.start_targets()
+
+    def start_targets(self):
+        """Begins with targets where the actuators are, as if they had been sent all the time."""
         self.targets = np.clip(self.data.actuator_length[self.controls], self.low, self.high)
-        self.under_way = [self.targets] * env["action_delay"]
+        self.sent = [self.targets] * (1 + max(self.env["action_delay"], self.env["prediction"]))
 
     def observe(self):
         """Returns the values that the policy sees, in the order of `observation_names`."""
@@ -167,14 +174,40 @@ class Hand:
             self.previous_action,
         ]).astype(np.float32)
 
-    def step(self, action):
-        """Turns the action into smoothed targets, and lets the physics run for one control step."""
+    def predict(self, hand, observation):
+        """Returns what the policy sees of `hand`, whose model this is, if it acts on where the hand will be: the observation after the last
+        targets. A prediction that diverges gives the observation as it is."""
+        values, scale = observation.astype(float), self.env["vel_obs_scale"]
+        angles, speeds, values = np.split(values, [len(self.angle), 2 * len(self.angle)])
+        pose, linear, angular = values[:7], values[7:10], values[10:13] / scale
+        qpos, qvel = self.model.qpos0.copy(), np.zeros(self.model.nv)
+        qpos[self.angle], qvel[self.speed] = angles, speeds / scale
+        qpos[self.cube:self.cube + 7] = pose
+        qvel[self.cube_speed:self.cube_speed + 6] = *linear, *rotated(conjugate(pose[3:]), angular)
+        self.place(qpos, qvel)
+        for targets in hand.sent[-hand.env["prediction"]:]:
+            self.move(targets)
+        self.goal, self.previous_action = hand.goal, hand.previous_action
+        bad = [mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC]
+        diverged = any(self.data.warning[kind].number for kind in bad)
+        return observation if diverged else self.observe()
+
+    def send(self, action):
+        """Turns the action into smoothed targets, the newest ones that were sent."""
         self.previous_action = np.clip(action, -1, 1).astype(float)
-        asked = self.offset + self.scale * self.previous_action
+        # In the order of the program's arithmetic: where contacts begin, a rounding error can grow.
+        asked = self.low + (self.previous_action + 1) / 2 * (self.high - self.low)
         self.targets = np.clip(self.alpha * asked + (1 - self.alpha) * self.targets, self.low, self.high)
-        # With env.action_delay, they take effect later.
-        self.under_way.append(self.targets)
-        self.data.ctrl[self.controls] = self.under_way.pop(0)
+        self.sent = [*self.sent[1:], self.targets]
+
+    def step(self, action):
+        """Sends the targets of an action, and lets the physics run for one control step. With env.action_delay, targets take effect later."""
+        self.send(action)
+        self.move(self.sent[-1 - self.env["action_delay"]])
+
+    def move(self, targets):
+        """Lets the physics run for one control step under these targets."""
+        self.data.ctrl[self.controls] = targets
         for _ in range(self.substeps):
             # mj_step in the other order, so that bodies and joints end at the same instant.
             mujoco.mj_step2(self.model, self.data)
@@ -248,8 +281,13 @@ def varied_model(env, scene, policy, drawn=None):
 
 def product(a, b):
     """The quaternion product: first the rotation b, then a."""
-    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([w, *v])
+    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    return np.array([
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ])
 
 
 def conjugate(q):
@@ -270,15 +308,16 @@ def uniform_rotation(random):
     return q / np.linalg.norm(q)
 
 
-def play(policy, hand, episodes, seed):
-    """Returns goals, length and whether the cube was dropped, for each episode."""
+def play(policy, hand, model, episodes, seed):
+    """Returns goals, length and whether the cube was dropped, for each episode. The policy acts on what the `model` predicts, if any."""
     env, played = hand.env, []
     for episode in range(episodes):
         random = np.random.default_rng([seed, episode])
         hand.reset(random)
         goals = held = steps = 0
         while steps < round(env["max_episode_seconds"] / env["ctrl_dt"]):
-            hand.step(policy.act(hand.observe()))
+            observation = hand.observe()
+            hand.step(policy.act(model.predict(hand, observation) if model else observation))
             steps += 1
             if hand.dropped():
                 break
@@ -304,8 +343,9 @@ def score(played):
             "episode_length": lengths.mean()}
 
 
-def check(policy, hand, trace):
-    """Puts the hand into each state of a trace, and compares what is seen and done there. Returns the largest differences."""
+def check(policy, scene, model, trace):
+    """Puts a hand into each state of a trace, and compares what is seen and done there. Returns whether all is alike. The world of the
+    trace may have another physics than the `model` of the policy."""
     try:
         header, *records = [json.loads(line) for line in pathlib.Path(trace).read_text().splitlines()]
     except (OSError, ValueError) as error:
@@ -314,9 +354,13 @@ def check(policy, hand, trace):
         sys.exit(f"error: {trace} does not begin with the header of a trace, so its task is not known")
     if header.get("noise") or header.get("bias"):
         sys.exit(f"error: {trace} was written with noise or bias, so its observations cannot be computed from its states")
-    for key in sorted(header.keys() & hand.env.keys() - {"model"}):
-        if header[key] != hand.env[key]:
-            sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {hand.env[key]}")
+    for key in sorted(header.keys() & model.env.keys() - {"model", *OF_WORLD}):
+        if header[key] != model.env[key]:
+            sys.exit(f"error: {trace} was written with env.{key} = {header[key]}, but the policy is exported for {model.env[key]}")
+    for key, value in (header.get("predicted_with") or {}).items():
+        if value != model.env[key]:
+            sys.exit(f"error: {trace} was predicted with env.{key} = {value}, but the policy is exported for {model.env[key]}")
+    hand = Hand(policy, scene, {key: header[key] for key in OF_WORLD if key in header})
     # A policy for the hand on the other side sees the mirror image of this one.
     mirror = np.eye(hand.size)
     if header.get("mirror_matrix"):
@@ -331,8 +375,14 @@ def check(policy, hand, trace):
         hand.place(record["qpos"], record["qvel"])
         # Where a goal was reached, the observation already shows the next one.
         hand.goal = np.array(after["goal"] if same else record["goal"])
-        hand.previous_action = np.clip(record["action"], -1, 1) if not record.get("reset") else np.zeros(len(hand.actuators))
+        if record.get("reset"):
+            hand.previous_action = np.zeros(len(hand.actuators))
+            hand.start_targets()
+        else:
+            hand.send(np.array(record["action"]))
         observation, expected = hand.observe(), np.array(record["obs"])
+        if hand.env["prediction"]:
+            observation = model.predict(hand, observation)
         seen = observation @ mirror
         if not same:  # the goal after an episode's last step is in no record
             goal = slice(hand.goal_at, hand.goal_at + 8)
@@ -344,7 +394,8 @@ def check(policy, hand, trace):
             largest[1] = np.maximum(largest[1], np.abs(action - np.clip(after["action"], -1, 1)).max())
             compared += 1
     print(f"{len(records)} observations: {largest[0]:.1e} off at most; {compared} actions: {largest[1]:.1e}")
-    return largest[0] <= OBSERVATION_LIMIT and largest[1] <= ACTION_LIMIT and compared > 0
+    limit = ACTION_LIMIT if hand.env["prediction"] else OBSERVATION_LIMIT
+    return largest[0] <= limit and largest[1] <= ACTION_LIMIT and compared > 0
 
 
 def main():
@@ -365,10 +416,11 @@ def main():
         hand = Hand(policy, args.scene)
     if args.check:
         with read_from(args.check):
-            alike = check(policy, hand, args.check)
+            alike = check(policy, args.scene, hand, args.check)
         sys.exit(0 if alike else "error: too far off")
     with read_from(args.policy):
-        found = score(play(policy, hand, args.episodes, args.seed))
+        model = Hand(policy, args.scene) if hand.env["prediction"] else None
+        found = score(play(policy, hand, model, args.episodes, args.seed))
     if args.json:
         print(json.dumps(found))
     else:

@@ -35,6 +35,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         seed: the seed of the episodes until `reset` names another. Environment i plays the episodes i, i + N, i + 2 N, …
         config: a settings file of the program. Its `[ppo]` and `[run]` are not used.
         set: single settings, as `--set`: `{"env.friction_scale": 0.8}`.
+        world: settings that change how the hand and the object move, but are unknown to the model that predicts (`env.prediction`).
         policy: a policy, or a place that `Policy.load` takes. The task is then the policy's training task.
         training: the task as `train` teaches it at `env_steps`: shaping rewards, tolerance, hold, randomisation.
         goal_change: what a new goal means to a learner. `"continue"`: nothing ends, the next observation shows it. `"truncate"`:
@@ -62,6 +63,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         seed: int = 0,
         config: str | os.PathLike[str] | None = None,
         set: Mapping[str, Any] | None = None,
+        world: Mapping[str, Any] | None = None,
         policy: Policy | str | os.PathLike[str] | None = None,
         training: bool = False,
         goal_change: Literal["continue", "truncate"] = "continue",
@@ -81,12 +83,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"autoreset_mode = {autoreset_mode!r}: must be one of {', '.join(AutoresetMode.__members__)}")
         if goal_change == "truncate" and mode is not AutoresetMode.SAME_STEP:
             raise ValueError('goal_change = "truncate" needs autoreset_mode = SAME_STEP: the hand goes on under the new goal at once')
-        pairs(set)  # reports wrong settings before anything is loaded
+        pairs(set), pairs(world)  # report wrong settings before anything is loaded
         if policy is not None and not isinstance(policy, Policy):
             of_task = {key: value for key, value in (set or {}).items() if key.split(".")[0] in ("env", "hand")}
             policy = Policy.load(policy, set=of_task)
         self._made: dict[str, Any] = {
             "threads": number("threads", threads, most=65536), "seed": number("seed", seed), "set": absolute(set), "policy": policy,
+            "world": dict(world or {}),
             "config": None if config is None else _found(os.fspath(config)), "training": bool(training),
             "mode": mode.value, "truncates": goal_change == "truncate", "terms": bool(reward_terms),
         }  # fmt: skip
@@ -109,7 +112,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Creates the environments anew."""
         made = self._made
         policy = None if made["policy"] is None else made["policy"]._native
-        settings = made["config"], policy, pairs(made["set"])
+        settings = made["config"], policy, pairs(made["set"]), pairs(made["world"])
         how = made["training"], made["mode"], made["truncates"], made["terms"]
         self._hands = _native.Hands(self.num_envs, made["threads"], made["seed"], *settings, *how)
         return self._hands
@@ -287,13 +290,14 @@ class Env(gymnasium.Env):
         seed: int = 0,
         config: str | os.PathLike[str] | None = None,
         set: Mapping[str, Any] | None = None,
+        world: Mapping[str, Any] | None = None,
         policy: Policy | str | os.PathLike[str] | None = None,
         training: bool = False,
         reward_terms: bool = False,
         render_mode: None = None,
     ) -> None:
         self.vector = VectorEnv(
-            1, threads=1, seed=seed, config=config, set=set, policy=policy, training=training,
+            1, threads=1, seed=seed, config=config, set=set, world=world, policy=policy, training=training,
             reward_terms=reward_terms, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED,
         )  # fmt: skip
         """The hand as a `VectorEnv` of one."""

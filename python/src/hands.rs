@@ -23,7 +23,7 @@ use shadow_repose::repose::{
 use crate::episodes::columns;
 use crate::errors::{guarded, refused};
 use crate::policy::Policy;
-use crate::settings::{Set, overrides, resolve, text};
+use crate::settings::{Set, of_world, overrides, resolve, text};
 use crate::workers::Workers;
 
 /// The most environments, as in a training run.
@@ -302,7 +302,7 @@ impl State {
 #[pymethods]
 impl Hands {
     #[new]
-    #[pyo3(signature = (count, threads, seed, config, policy, set, training, autoreset, truncates, terms))]
+    #[pyo3(signature = (count, threads, seed, config, policy, set, world, training, autoreset, truncates, terms))]
     #[expect(clippy::too_many_arguments, reason = "Python names each of them")]
     fn new(
         py: Python,
@@ -312,6 +312,7 @@ impl Hands {
         config: Option<PathBuf>,
         policy: Option<Py<Policy>>,
         set: Set,
+        world: Set,
         training: bool,
         autoreset: &str,
         truncates: bool,
@@ -330,18 +331,21 @@ impl Hands {
         let mut workers = Workers::new(threads);
         let made = workers.long(py, |stop| {
             let overrides = overrides(set, training)?;
+            let world = of_world(world)?;
             ensure!(
                 (1..=MOST_HANDS).contains(&count),
                 "num_envs = {count}: must lie in [1, {MOST_HANDS}]"
             );
             let (config, task) = match &policy {
-                None => resolve(config.as_deref(), &overrides)?,
+                None => resolve(config.as_deref(), &overrides, &world)?,
                 Some(policy) => {
                     ensure!(
                         config.is_none(),
                         "give config or policy, not both: a policy brings the settings of its task"
                     );
-                    policy.get().resolve(&overrides, training)?
+                    policy
+                        .get()
+                        .resolve(&[overrides, world].concat(), training)?
                 }
             };
             let randomization = if training {

@@ -257,7 +257,7 @@ pub(crate) fn evaluate(
         };
         let task = match loaded {
             Some(policy) => policy.loaded.task(&policy.with(&set))?,
-            None => resolve(None, &set)?.1,
+            None => resolve(None, &set, &[])?.1,
         };
         let loaded = loaded.map(|policy| &policy.loaded);
         let outside = |observations: &[f32], actions: &mut [f32]| {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Result, ensure};
 use serde_json::json;
 use shadow_repose::config::{Config, Override, Settings};
-use shadow_repose::repose::Task;
+use shadow_repose::repose::{Task, is_physical};
 
 /// Settings as a user gives them: dotted keys, and values in TOML.
 pub(crate) type Set = Vec<(String, String)>;
@@ -38,19 +38,39 @@ pub(crate) fn overrides(set: Set, training: bool) -> Result<Vec<Override>> {
         .collect())
 }
 
-/// The settings and the task of environments without a policy.
+/// The settings in the form of the library, if they say how the world moves.
+///
+/// # Errors
+/// Fails if one of them says something else.
+pub(crate) fn of_world(world: Set) -> Result<Vec<Override>> {
+    for (key, _) in &world {
+        let is_of_world = key.strip_prefix("env.").is_some_and(is_physical);
+        ensure!(
+            is_of_world,
+            "{key}: `world` holds only settings that say how the hand and the object move"
+        );
+    }
+    Ok(world
+        .into_iter()
+        .map(|(key, value)| Override { key, value })
+        .collect())
+}
+
+/// The settings and the task of environments without a policy. What `world` changes, no prediction knows.
 ///
 /// # Errors
 /// Fails if the settings are invalid, or if the scene cannot be used.
 pub(crate) fn resolve(
     config: Option<&Path>,
     overrides: &[Override],
+    world: &[Override],
 ) -> Result<(Config, Arc<Task>)> {
-    let config = Settings::new()
-        .user_file(config)?
-        .sets(overrides)
-        .resolve()?;
-    let task = Task::new(&config)?;
+    let resolve = |sets: &[Override]| Settings::new().user_file(config)?.sets(sets).resolve();
+    let config = resolve(&[overrides, world].concat())?;
+    let mut task = Task::new(&config)?;
+    if !world.is_empty() {
+        task = task.predicted_by(&*Task::new(&resolve(overrides)?)?);
+    }
     Ok((
         Config {
             env: task.config.clone(),

@@ -424,3 +424,18 @@ def test_hands_step_only_after_a_reset_and_not_after_close():
     for call in (lambda: envs.step(np.zeros((2, 20))), envs.reset, envs.get_state, lambda: envs.env_steps, lambda: envs.settings):
         with pytest.raises(RuntimeError, match="closed"):
             call()
+
+
+def test_what_world_changes_is_unknown_to_the_model_that_predicts():
+    late = {"env.prediction": 5}
+    heavy = {"env.gravity": [0.0, 0.0, 5.0]}
+    first = {}
+    for name, set, world in [("usual", late, None), ("world", late, heavy), ("both", late | heavy, None)]:
+        envs = VectorEnv(2, threads=1, seed=3, set=set, world=world)
+        first[name], _ = envs.reset(seed=3)
+        envs.step(np.zeros((2, 20), np.float32))
+        envs.close()
+    assert np.array_equal(first["usual"], first["world"])
+    assert not np.array_equal(first["usual"], first["both"])
+    with pytest.raises(ValueError, match="env.noise: `world` holds only"):
+        VectorEnv(2, world={"env.noise": {"joint_pos": 0.01}})

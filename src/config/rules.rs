@@ -242,11 +242,24 @@ fn randomization(config: &Config, table: &Table, rules: &mut Rules) {
         u32::MAX
     };
     let rule = format!("be shorter than an episode, which lasts {steps} steps");
+    for (key, value) in [
+        ("env.action_delay", env.action_delay),
+        ("env.prediction", env.prediction),
+    ] {
+        rules.check(value < steps, key, value, &rule);
+        rules.check(
+            value <= LONGEST_DELAY,
+            key,
+            value,
+            format!("be at most {LONGEST_DELAY}"),
+        );
+    }
+    let is_seen = env.prediction == 0 || env.vel_obs_scale != 0.0;
     rules.check(
-        env.action_delay < steps,
-        "env.action_delay",
-        env.action_delay,
-        rule,
+        is_seen,
+        "env.vel_obs_scale",
+        env.vel_obs_scale,
+        "not be 0 with env.prediction: velocities must be observed",
     );
     let rule =
         format!("be, with env.action_delay, shorter than an episode, which lasts {steps} steps");

@@ -50,6 +50,7 @@ pub struct EnvConfig {
     pub gravity: [f64; 3],
     pub cone: Cone,
     pub action_delay: u32,
+    pub prediction: u32,
     pub noise: ByGroup,
     pub bias: ByGroup,
     pub max_episode_seconds: f64,

@@ -87,6 +87,7 @@ fn metadata(loaded: &Loaded, task: &Task) -> Vec<(&'static str, String)> {
         ("object_name", parts.object.clone()),
         ("observation_names", list(groups.map(|group| group.name))),
         ("observation_sizes", list(groups.map(|group| group.length))),
+        ("prediction", config.prediction.to_string()),
         (
             "program",
             concat!("shadow-repose ", env!("CARGO_PKG_VERSION")).into(),

@@ -65,12 +65,12 @@ impl Conditions {
     }
 
     /// The largest delay of any episode.
-    pub fn most_delay(&self, task: &Task) -> usize {
+    pub fn most_delay(&self, task: &Task) -> u32 {
         let drawn = self
             .randomization
             .as_ref()
             .map_or(0, |randomization| randomization.config.delay[1]);
-        (task.config.action_delay + drawn) as usize
+        task.config.action_delay + drawn
     }
 
     /// Applies the random force on the object that belongs to a step (from 0) of the episode of `rng`, and returns it, N.

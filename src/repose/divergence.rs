@@ -59,6 +59,16 @@ pub fn divergence(diverged: u64, steps: u64) -> Option<String> {
     })
 }
 
+/// A warning if more than 1 % of the predictions diverged.
+pub fn unpredicted(count: u64, steps: u64) -> Option<String> {
+    (count * 100 > steps).then(|| {
+        format!(
+            "in {count} of {steps} steps the prediction diverged, and the policy saw what was measured: a model cannot go on \
+             from such a measurement (env.prediction, env.noise, env.bias)"
+        )
+    })
+}
+
 /// The number of steps between two kept states.
 const STEPS: usize = 16;
 

@@ -57,11 +57,13 @@ impl Repose {
 
     /// Creates an environment of `task` some of whose episodes are randomised.
     pub fn randomized(task: &Arc<Task>, randomization: Option<&Arc<Randomization>>) -> Self {
+        let conditions = Conditions::new(randomization);
+        let memory = conditions.most_delay(task).max(task.config.prediction) as usize;
         let scene = randomization.map_or(&task.scene, |randomization| &randomization.nominal);
         Self {
             sim: Simulation::new(scene),
-            servos: Servos::new(task.hand.actuators.len()),
-            conditions: Conditions::new(randomization),
+            servos: Servos::new(task.hand.actuators.len(), memory),
+            conditions,
             task: task.clone(),
             lesson: Lesson::task(&task.config),
             rng: rng::stream(0, "unused", 0),
@@ -178,14 +180,11 @@ impl Repose {
     /// Draws a new goal and resets the hold counter.
     fn replace_goal(&mut self) {
         self.goal = self.draw_rotation();
-        let position = self.task.goal_place();
-        self.sim.place(
-            self.task.hand.goal,
-            Pose {
-                position,
-                orientation: self.goal,
-            },
-        );
+        let pose = Pose {
+            position: self.task.goal_place(),
+            orientation: self.goal,
+        };
+        self.sim.place(self.task.hand.goal, pose);
         self.held = 0;
         // The target may affect the physics of a custom scene, so nothing may depend on its old pose.
         self.sim.refresh();
@@ -351,11 +350,7 @@ impl Resumable for Repose {
             .extend(self.last.action.iter().copied().map(f64::from));
         state.numbers.extend(&self.servos.targets);
         self.episode.save(state);
-        // As long as it can become, so that all environments of a run have equally many values.
-        state.put_list(
-            self.servos
-                .under_way(self.conditions.most_delay(&self.task)),
-        );
+        state.put_list(self.servos.sent.iter().copied());
     }
 
     fn restore(&mut self, state: &mut SavedEnv, observation: &mut [f32]) -> Result<()> {
@@ -399,14 +394,14 @@ impl Resumable for Repose {
             randomized: self.conditions.draw.is_some(),
             ..EpisodeStats::saved(state)?
         };
-        let under_way = state.list()?;
+        let sent = state.list()?;
         ensure!(
-            under_way.len().is_multiple_of(actuators),
-            "it has {} targets under way",
-            under_way.len()
+            sent.len().is_multiple_of(actuators),
+            "it has {} targets of earlier steps",
+            sent.len()
         );
         self.servos
-            .restore(targets, under_way, self.conditions.delay(&self.task));
+            .restore(targets, sent, self.conditions.delay(&self.task));
         self.sums = StepSums::default();
         self.recorder = Recorder::default();
         self.show(observation);

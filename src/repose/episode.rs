@@ -29,6 +29,8 @@ pub struct EpisodeStats {
     pub randomized: bool,
     /// Sum of the rotation towards the goal, rad (negative away from it). Only known for an episode that was played for a score.
     pub turned: f64,
+    /// Observations whose prediction diverged, in an episode that is scored.
+    pub unpredicted: u64,
 }
 
 impl EpisodeStats {
@@ -83,6 +85,8 @@ pub struct StepSums {
     pub turned: f64,
     /// Steps in which the physics diverged.
     pub diverged: u64,
+    /// Observations whose prediction diverged: the policy saw what was measured.
+    pub unpredicted: u64,
 }
 
 impl StepSums {
@@ -109,5 +113,6 @@ impl AddAssign for StepSums {
         add(&mut self.training, other.training);
         self.turned += other.turned;
         self.diverged += other.diverged;
+        self.unpredicted += other.unpredicted;
     }
 }

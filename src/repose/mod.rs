@@ -9,6 +9,7 @@ mod lesson;
 mod mirror;
 mod observation;
 mod physics;
+mod prediction;
 mod randomization;
 mod record;
 mod reward;
@@ -17,13 +18,13 @@ mod sensing;
 mod servos;
 mod task;
 
-pub use divergence::{Diverged, Tail, divergence};
+pub use divergence::{Diverged, Tail, divergence, unpredicted};
 pub use environment::Repose;
 pub use episode::{EpisodeStats, StepSums};
 pub use hand::{ACTUATORS, FINGERTIPS, Hand, JOINTS};
 pub use lesson::Lesson;
 pub use observation::{Group, Layout};
-pub use physics::{Physics, QUANTITIES, Quantity, add_settings};
+pub use physics::{Physics, QUANTITIES, Quantity, add_settings, is_physical, physical};
 pub use randomization::{EpisodePhysics, Randomization};
 pub use record::Record;
 pub use reward::{

@@ -234,6 +234,22 @@ impl Index<&str> for Physics {
     }
 }
 
+/// Whether a setting of `[env]` says how the world moves, and not when actions take effect or what is seen.
+pub fn is_physical(name: &str) -> bool {
+    let mut names = QUANTITIES
+        .iter()
+        .map(|quantity| quantity.setting)
+        .chain(["cone", "sim_dt"]);
+    name != "action_delay" && names.any(|known| known == name)
+}
+
+/// The settings that say how the world of a task moves.
+pub fn physical(config: &EnvConfig) -> Table {
+    let mut table = Table::try_from(config).expect("settings are a table");
+    table.retain(|name, _| is_physical(name));
+    table
+}
+
 /// Adds to a JSON object the settings of a task that vary its physics, what is observed, and when actions take effect.
 pub fn add_settings(config: &EnvConfig, object: &mut Value) {
     let table = Table::try_from(config).expect("settings are a table");

@@ -7,7 +7,7 @@ use std::ops::Index;
 
 use serde_json::{Map, Value, json};
 
-use super::divergence::divergence;
+use super::divergence::{divergence, unpredicted};
 use super::{EpisodeStats, TaskReward, add, named, task_terms};
 use crate::os::number;
 
@@ -214,6 +214,8 @@ pub struct Score {
     pub reward: TaskReward,
     /// Episodes that ended because the physics diverged.
     pub diverged: usize,
+    /// Observations whose prediction diverged.
+    pub unpredicted: u64,
     /// The values of [`MEASURES`].
     values: [f64; MEASURES.len()],
 }
@@ -238,6 +240,7 @@ impl Score {
             goals_ci95: played.goals_ci95(),
             reward: played.reward().map(|term| term / played.count()),
             diverged: played.diverged(),
+            unpredicted: episodes.iter().map(|episode| episode.unpredicted).sum(),
             values: MEASURES.each_ref().map(|measure| (measure.value)(&played)),
         }
     }
@@ -245,6 +248,7 @@ impl Score {
     /// A warning if many of the steps diverged. Each such step ended an episode.
     pub fn divergence(&self) -> Option<String> {
         divergence(self.diverged as u64, self.env_steps)
+            .or_else(|| unpredicted(self.unpredicted, self.env_steps))
     }
 
     /// The values of all measures, in order.
@@ -273,6 +277,9 @@ impl Score {
         }
         put("reward", Value::Object(reward.collect()));
         put("diverged", json!(self.diverged));
+        if self.unpredicted > 0 {
+            put("unpredicted", json!(self.unpredicted));
+        }
         object
     }
 }

@@ -11,30 +11,37 @@ pub struct Servos {
     pub targets: Vec<f64>,
     /// The targets that take effect now.
     pub due: Vec<f64>,
-    /// The targets that have not taken effect yet, the oldest first: as many sets as there are control steps of delay.
-    under_way: VecDeque<f64>,
+    /// The targets of the last `memory` control steps, the oldest first.
+    pub sent: VecDeque<f64>,
+    memory: usize,
+    /// The control steps after which targets take effect.
+    delay: usize,
 }
 
 impl Servos {
-    pub fn new(actuators: usize) -> Self {
+    /// Servos that remember so many control steps. No delay may be longer.
+    pub fn new(actuators: usize, memory: usize) -> Self {
         Self {
             targets: vec![0.0; actuators],
             due: vec![0.0; actuators],
-            under_way: VecDeque::new(),
+            sent: VecDeque::new(),
+            memory,
+            delay: 0,
         }
     }
 
-    /// Starts with `targets`, which stay in effect during the delay.
+    /// Starts with `targets`, as if they had been sent all the time before.
     pub fn reset(&mut self, targets: impl IntoIterator<Item = f64>, delay: usize) {
         self.targets
             .iter_mut()
             .zip(targets)
             .for_each(|(own, target)| *own = target);
-        self.under_way.clear();
-        for _ in 0..delay {
-            self.under_way.extend(&self.targets);
-        }
         self.due.copy_from_slice(&self.targets);
+        self.delay = delay;
+        self.sent.clear();
+        for _ in 0..self.memory {
+            self.sent.extend(&self.targets);
+        }
     }
 
     /// Turns an action, clipped to [-1, 1], into targets. Targets that are due take effect.
@@ -45,36 +52,33 @@ impl Servos {
             let asked = low + (f64::from(*action) + 1.0) / 2.0 * (high - low);
             *target = (alpha * asked + (1.0 - alpha) * *target).clamp(low, high);
         }
-        self.under_way.extend(&self.targets);
+        self.sent.extend(&self.targets);
+        let due = (self.memory - self.delay) * self.targets.len();
         self.due
             .iter_mut()
-            .zip(self.under_way.drain(..self.targets.len()))
-            .for_each(|(due, target)| *due = target);
+            .zip(self.sent.range(due..))
+            .for_each(|(due, target)| *due = *target);
+        self.sent.drain(..self.targets.len());
     }
 
-    /// `count` sets of targets: those under way and, in front of them, the oldest one again.
-    pub fn under_way(&self, count: usize) -> impl Iterator<Item = f64> {
-        let actuators = self.targets.len();
-        let missing = (count * actuators).saturating_sub(self.under_way.len());
-        let oldest = (0..missing).map(move |i| i % actuators);
-        let oldest = oldest.map(|i| *self.under_way.get(i).unwrap_or(&self.targets[i]));
-        oldest.chain(self.under_way.iter().copied())
+    /// The targets of the last `count` control steps, the oldest first.
+    pub fn last(&self, count: usize) -> Vec<f64> {
+        self.sent
+            .range(self.sent.len() - count * self.targets.len()..)
+            .copied()
+            .collect()
     }
 
-    /// Resumes with these last targets and the newest `delay` sets that [`Self::under_way`] returned. If there are fewer, because
-    /// a fork has a longer delay than its parent, the oldest one is repeated.
-    pub fn restore(&mut self, last: &[f64], under_way: &[f64], delay: usize) {
-        let oldest = if under_way.is_empty() {
-            last
-        } else {
-            &under_way[..last.len()]
-        };
-        self.reset(last.iter().copied(), 0);
-        let wanted = delay * last.len();
-        for _ in 0..wanted.saturating_sub(under_way.len()) / last.len() {
-            self.under_way.extend(oldest);
+    /// Resumes with these last targets, and with what was remembered. If that is less, because a fork has a longer memory than its
+    /// parent, the oldest targets are repeated.
+    pub fn restore(&mut self, last: &[f64], sent: &[f64], delay: usize) {
+        self.reset(last.iter().copied(), delay);
+        let oldest = sent.get(..last.len()).unwrap_or(last);
+        self.sent.clear();
+        for _ in sent.len() / last.len()..self.memory {
+            self.sent.extend(oldest);
         }
-        self.under_way
-            .extend(&under_way[under_way.len().saturating_sub(wanted)..]);
+        self.sent
+            .extend(&sent[sent.len().saturating_sub(self.memory * last.len())..]);
     }
 }

@@ -7,6 +7,7 @@ use anyhow::{Context, Result, ensure};
 
 use super::mirror::Mirror;
 use super::physics::Physics;
+use super::prediction::Predictor;
 use super::sensing::NoiseStd;
 use super::{Hand, Record};
 use crate::config::{Config, EnvConfig, FARTHEST};
@@ -36,6 +37,8 @@ pub struct Task {
     pub(super) symmetry: Vec<usize>,
     /// What turns observations into observations of the policy's hand, if that is on the other side.
     pub(super) mirror: Option<Mirror>,
+    /// What predicts the observations of the policy, if they are predicted.
+    pub(super) predictor: Option<Arc<Predictor>>,
     /// Where the policy does not fit well.
     pub warnings: Vec<String>,
 }
@@ -84,7 +87,7 @@ impl Task {
         let noise = NoiseStd::new(&config.noise, &hand.layout).context("env.noise")?;
         let bias = NoiseStd::new(&config.bias, &hand.layout).context("env.bias")?;
         let symmetry = scene.symmetry(hand.object.body);
-        Ok(Arc::new(Self {
+        let task = Self {
             scene,
             compilation,
             hand,
@@ -93,8 +96,19 @@ impl Task {
             bias,
             symmetry,
             mirror: None,
+            predictor: None,
             warnings: Vec::new(),
-        }))
+        };
+        Ok(Arc::new(task.predicting().with_context(|| origin(file))?))
+    }
+
+    /// The same task, predicting with its own physics, if it predicts.
+    fn predicting(mut self) -> Result<Self> {
+        if self.config.prediction > 0 {
+            let predictor = Predictor::new(&self.scene, &self.hand, &self.config)?;
+            self.predictor = Some(Arc::new(predictor));
+        }
+        Ok(self)
     }
 
     /// Loads the same task in a scene for display.
@@ -134,6 +148,13 @@ impl Task {
             .iter()
             .map(|_| "the policy is for the hand on the other side: it plays mirrored".to_owned());
         let mut notes: Vec<String> = mirrored.collect();
+        let prediction = self.config.prediction;
+        if prediction > 0 {
+            let delay = self.config.action_delay;
+            notes.push(format!(
+                "{prediction} control steps are predicted; actions take effect {delay} control steps late"
+            ));
+        }
         let Some(file) = self.config.model_file() else {
             return notes;
         };
@@ -265,6 +286,20 @@ impl Task {
         self.mirror
             .as_ref()
             .map(|mirror| mirror.matrix(self.hand.layout.size))
+    }
+
+    /// The same task, whose observations are predicted by the physics of another one.
+    #[must_use]
+    pub fn predicted_by(&self, model: &Self) -> Arc<Self> {
+        Arc::new(Self {
+            predictor: model.predictor.clone(),
+            ..self.clone()
+        })
+    }
+
+    /// The settings of the model that predicts its observations, if they are predicted.
+    pub fn predicted_with(&self) -> Option<&EnvConfig> {
+        self.predictor.as_ref().map(|predictor| &predictor.config)
     }
 
     /// Where the goal is shown.

@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::constants::*;
-use super::{Actuator, Body, Frame, Mocap, Scene};
+use super::{Actuator, Body, Frame, FreeJoint, Mocap, Scene};
 use crate::quat::{self, Quat};
 
 /// MuJoCo's name for everything that the next step depends on.
@@ -58,6 +58,20 @@ impl Simulation {
             }
         }
         false
+    }
+
+    /// Takes `substeps` physics steps as [`Simulation::step`] does. After the last one, only the poses and the velocities of the bodies are
+    /// up to date, and the next step needs a [`Simulation::refresh`].
+    #[must_use]
+    pub fn step_to_observe(&mut self, substeps: usize) -> bool {
+        if self.step(substeps - 1) {
+            return true;
+        }
+        self.data.step2();
+        self.data.kinematics();
+        self.data.com_pos();
+        self.data.com_vel();
+        self.diverged()
     }
 
     /// Takes `substeps` steps of plain `mj_step`: the physics alone, for comparison. The bodies are one substep behind the joints.
@@ -166,6 +180,30 @@ impl Simulation {
         Velocity {
             linear: [x, y, z],
             angular: [wx, wy, wz],
+        }
+    }
+
+    /// The pose of a body with a free joint.
+    pub fn free_pose(&self, joint: &FreeJoint) -> Pose {
+        let [x, y, z, orientation @ ..] = *self.qpos()[joint.qpos..]
+            .first_chunk::<7>()
+            .expect("a free joint");
+        Pose {
+            position: [x, y, z],
+            orientation,
+        }
+    }
+
+    /// The velocity of a body with a free joint.
+    pub fn free_velocity(&self, joint: &FreeJoint) -> Velocity {
+        let [x, y, z, spin @ ..] = *self.qvel()[joint.dof..]
+            .first_chunk::<6>()
+            .expect("a free joint");
+        // MuJoCo stores the angular velocity of a free joint in the body's frame.
+        let angular = quat::rotate(self.free_pose(joint).orientation, spin);
+        Velocity {
+            linear: [x, y, z],
+            angular,
         }
     }
 

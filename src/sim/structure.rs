@@ -7,7 +7,7 @@ use mujoco_rs::prelude::{MjtObjBase, MjtWrap};
 use serde::{Deserialize, Serialize};
 
 use super::constants::*;
-use super::{Actuator, Scene};
+use super::{Actuator, FreeJoint, Hinge, Scene};
 use crate::os::shortened;
 
 /// The names of what a task uses in a scene. What is empty is found by structure.
@@ -255,6 +255,22 @@ impl Scene {
             0..self.model.njnt() as usize,
             &mut Problems::new(),
         )
+    }
+
+    /// The joints besides these hinges and the joint of this object, by name or number.
+    pub fn joints_besides(&self, hinges: &[Hinge], object: &FreeJoint) -> Vec<String> {
+        let known: Vec<usize> = hinges
+            .iter()
+            .map(|hinge| hinge.qpos)
+            .chain([object.qpos])
+            .collect();
+        let unknown = |joint: &usize| !known.contains(&(self.model.jnt_qposadr()[*joint] as usize));
+        let joints = (0..self.model.njnt() as usize).filter(unknown);
+        let name = |joint| match self.model.id_to_name(mjOBJ_JOINT, joint) {
+            Some(name) => format!("joint `{name}`"),
+            None => format!("joint {joint}"),
+        };
+        joints.map(name).collect()
     }
 
     /// The names of all actuators that have one.

@@ -14,7 +14,7 @@ use crate::config::{EnvConfig, scene_option};
 
 use crate::os::{self, Requests, Status, StatusLine, say};
 use crate::ppo::{Checkpoint, Rise};
-use crate::repose::{HEADLINE, Score, divergence, measure};
+use crate::repose::{HEADLINE, Score, divergence, measure, unpredicted};
 use crate::run::Report;
 
 /// The factor by which, and the iterations for which, the KL divergence must lie beyond its target for a warning.
@@ -112,7 +112,9 @@ impl Lead {
             ..
         } = outcome;
         self.diverged += steps.diverged;
-        let warning = divergence(steps.diverged, steps.steps).or_else(|| evaluation.divergence());
+        let warning = divergence(steps.diverged, steps.steps)
+            .or_else(|| unpredicted(steps.unpredicted, steps.steps))
+            .or_else(|| evaluation.divergence());
         if let Some(warning) = warning.filter(|_| !self.warned) {
             self.warned = true;
             self.report.progress.warn(&warning);

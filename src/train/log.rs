@@ -212,6 +212,7 @@ mod tests {
             training,
             turned: 0.32,
             diverged: 28,
+            unpredicted: 0,
         };
         let episode = |reward, length, goals| EpisodeStats {
             length,

@@ -185,6 +185,73 @@ fn a_varied_hand_moves_in_python_as_it_does_here() {
 }
 
 #[test]
+fn what_python_predicts_of_a_late_hand_in_its_own_or_another_world_is_what_the_policy_saw_here() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let deploy = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/deploy/deploy.py");
+    succeeded(program(folder.path(), &["export", "--ckpt", "builtin"]));
+    let play = [
+        "play",
+        "--ckpt",
+        "builtin",
+        "--json",
+        "--episodes",
+        "1",
+        "--out",
+        "trace.jsonl",
+    ];
+    let late = ["--set", "env.action_delay=2", "--set", "env.prediction=2"];
+    for world in [
+        &[][..],
+        &[
+            "--set",
+            "env.friction_scale=0.7",
+            "--set",
+            "env.sim_dt=0.005",
+        ],
+    ] {
+        succeeded(program(folder.path(), &[&play[..], &late, world].concat()));
+        runs(
+            &python,
+            folder.path(),
+            &[deploy, "policy.onnx", "--check", "trace.jsonl"],
+        );
+    }
+    // A model with another physics predicts something else.
+    succeeded(program(
+        folder.path(),
+        &[
+            "export",
+            "--ckpt",
+            "builtin",
+            "--set",
+            "env.friction_scale=0.7",
+        ],
+    ));
+    let check = [deploy, "policy.onnx", "--check", "trace.jsonl"];
+    let output = Command::new(&python)
+        .args(check)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert!(
+        !output.status.success() && stderr(&output).contains("predicted with env.friction_scale"),
+        "{}",
+        stderr(&output)
+    );
+    let episode = ["--episodes", "1"];
+    succeeded(program(
+        folder.path(),
+        &[&["export", "--ckpt", "builtin"], &late[..]].concat(),
+    ));
+    runs(
+        &python,
+        folder.path(),
+        &[&[deploy, "policy.onnx"], &episode[..]].concat(),
+    );
+}
+
+#[test]
 fn an_own_object_is_resized_in_python_as_it_is_here() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
@@ -240,7 +307,7 @@ for key in ('obs', 'action'):
     open(key, 'w').write('\\n'.join([header, records[0], json.dumps(record), *records[2:]]))
 open('cut', 'w').write('\\n'.join([header, *records])[:-50])
 open('empty', 'w').close()
-open('other', 'w').write('\\n'.join([header.replace('\"action_delay\":0', '\"action_delay\":2'), *records]))
+open('other', 'w').write('\\n'.join([header.replace('\"vel_obs_scale\":0.2', '\"vel_obs_scale\":0.5'), *records]))
 ";
 
 #[test]
@@ -293,7 +360,10 @@ fn the_check_in_python_fails_on_what_is_not_a_number_and_on_the_trace_of_another
             ["policy.onnx", "--check", "action"],
             "action has a value that is not finite",
         ),
-        (["policy.onnx", "--check", "other"], "env.action_delay = 2"),
+        (
+            ["policy.onnx", "--check", "other"],
+            "env.vel_obs_scale = 0.5",
+        ),
         (["policy.onnx", "--check", "cut"], "not a complete trace"),
         (["policy.onnx", "--check", "empty"], "not a complete trace"),
         (["policy.onnx", "--episodes", "0"], "at least 1"),

@@ -26,6 +26,7 @@ mod permissions;
 mod pictures;
 mod point_mass;
 mod pool;
+mod prediction;
 mod randomization;
 mod ranks;
 mod resume;

@@ -27,6 +27,7 @@ const CHANGES: &[(&str, &[&str])] = &[
     ("env.gravity=[0,1,0]", &[]),
     ("env.cone=elliptic", &[]),
     ("env.action_delay=2", &[]),
+    ("env.prediction=2", &[]),
     ("env.noise.joint_pos=0.1", &[]),
     ("env.bias.joint_pos=0.1", &[]),
     ("env.max_episode_seconds=0.1", &[]),

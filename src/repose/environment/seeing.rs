@@ -3,23 +3,18 @@
 use super::Repose;
 use crate::quat;
 use crate::repose::observation::Writer;
-use crate::sim::{Pose, Velocity};
+use crate::sim::{Pose, Simulation, Velocity};
 
 impl Repose {
     /// The pose of the object.
     pub fn object(&self) -> Pose {
-        let at = self.task.hand.object.qpos;
-        let q = self.sim.qpos();
-        Pose {
-            position: [q[at], q[at + 1], q[at + 2]],
-            orientation: [q[at + 3], q[at + 4], q[at + 5], q[at + 6]],
-        }
+        self.sim.free_pose(&self.task.hand.object)
     }
 
     /// Records what the rewards of a step depend on, after its physics.
     pub fn measure(&mut self, rot_dist_before: f64) {
         let object = self.object();
-        let object_velocity = self.object_velocity();
+        let object_velocity = self.sim.free_velocity(&self.task.hand.object);
         let task = &self.task;
         let last = &mut self.last;
         let qpos = self.sim.qpos();
@@ -41,33 +36,55 @@ impl Repose {
         }
     }
 
-    /// The velocity of the object, in the world frame.
-    fn object_velocity(&self) -> Velocity {
-        let [vx, vy, vz, spin @ ..] = self.sim.qvel()[self.task.hand.object.dof..]
-            .first_chunk::<6>()
-            .expect("a free joint");
-        // MuJoCo stores the angular velocity of a free joint in the body's frame.
-        let angular = quat::rotate(self.object().orientation, *spin);
-        Velocity {
-            linear: [*vx, *vy, *vz],
-            angular,
-        }
-    }
-
-    /// Writes the observation of the current state as the policy sees it: mirrored, if its hand is on the other side.
-    pub fn show(&self, observation: &mut [f32]) {
+    /// Writes the observation of the current state as the policy sees it: predicted, if the task asks for it, and mirrored, if its hand is
+    /// on the other side.
+    pub fn show(&mut self, observation: &mut [f32]) {
         self.observe(observation);
+        self.predict(observation);
         if let Some(mirror) = &self.task.mirror {
             mirror.apply(observation);
         }
     }
 
-    /// Writes the observation of the current state, in the order of the hand's layout.
+    /// Replaces what was measured by what will be there after the last targets. If the prediction diverges, it stays as it is.
+    fn predict(&mut self, observation: &mut [f32]) {
+        let task = &self.task;
+        let Some(predictor) = &task.predictor else {
+            return;
+        };
+        let targets = self.servos.last(task.config.prediction as usize);
+        let goal = Pose {
+            position: task.goal_place(),
+            orientation: self.goal,
+        };
+        match predictor.run(
+            &task.hand,
+            task.config.vel_obs_scale,
+            observation,
+            goal,
+            &targets,
+        ) {
+            Some(sim) => {
+                self.write(&sim, observation);
+                predictor.give_back(sim);
+            }
+            None => self.sums.unpredicted += 1,
+        }
+    }
+
+    /// Writes the observation of the current state as it is measured, in the order of the hand's layout.
     pub fn observe(&self, observation: &mut [f32]) {
+        self.write(&self.sim, observation);
+        self.conditions
+            .disturb(&self.rng, self.episode.length, &self.task, observation);
+    }
+
+    /// Writes the observation of a simulation under the current goal.
+    fn write(&self, sim: &Simulation, observation: &mut [f32]) {
         let hand = &self.task.hand;
         let config = &self.task.config;
-        let qpos = self.sim.qpos();
-        let qvel = self.sim.qvel();
+        let qpos = sim.qpos();
+        let qvel = sim.qvel();
         let mut cells = Writer::new(&hand.layout, observation);
         cells.put(
             "joint_pos",
@@ -83,8 +100,8 @@ impl Repose {
         let Pose {
             position,
             orientation,
-        } = self.object();
-        let Velocity { linear, angular } = self.object_velocity();
+        } = sim.free_pose(&hand.object);
+        let Velocity { linear, angular } = sim.free_velocity(&hand.object);
         cells.put("cube_pos", position);
         cells.put("cube_quat", quat::canonical(orientation));
         cells.put("cube_linvel", linear);
@@ -100,8 +117,8 @@ impl Repose {
             let Pose {
                 position,
                 orientation,
-            } = self.sim.pose(tip);
-            let Velocity { linear, angular } = self.sim.velocity(tip);
+            } = sim.pose(tip);
+            let Velocity { linear, angular } = sim.velocity(tip);
             cells.put("fingertips", position);
             cells.put("fingertips", orientation);
             cells.put("fingertips", linear);
@@ -112,7 +129,5 @@ impl Repose {
             self.last.action.iter().copied().map(f64::from),
         );
         cells.finish();
-        self.conditions
-            .disturb(&self.rng, self.episode.length, &self.task, observation);
     }
 }
