@@ -76,12 +76,16 @@ pub fn steps(text: &str) -> Result<u64, String> {
 }
 
 pub fn time(text: &str) -> Result<Duration, String> {
-    let time = text
-        .parse::<jiff::SignedDuration>()
-        .ok()
+    // Slurm writes days before a hyphen: 1-12:00:00.
+    let span = text.replacen('-', "d ", 1).parse::<jiff::Span>().ok();
+    let time = span
+        .and_then(|span| {
+            span.to_duration(jiff::SpanRelativeTo::days_are_24_hours())
+                .ok()
+        })
         .and_then(|time| Duration::try_from(time).ok());
     time.filter(|time| !time.is_zero())
-        .ok_or_else(|| "must be a time above 0, e.g. 3h50m, 90m or 30s".into())
+        .ok_or_else(|| "must be a time above 0, e.g. 2d, 3h50m, 90m, 30s or 1-12:00:00".into())
 }
 
 pub fn quality() -> impl TypedValueParser<Value = Quality> {
@@ -105,4 +109,26 @@ pub fn seconds(text: &str) -> Result<f64, String> {
         .ok()
         .filter(|seconds| (0.0..=3600.0).contains(seconds));
     seconds.ok_or_else(|| "must be a number of seconds from 0 to 3600".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_has_the_units_of_a_user_or_the_form_of_slurm() {
+        let hours = |text: &str| time(text).ok().map(|time| time.as_secs_f64() / 3600.0);
+        for (text, expected) in [
+            ("2d", 48.0),
+            ("1-00:00:00", 24.0),
+            ("1-12:30:00", 36.5),
+            ("3h50m", 3.0 + 5.0 / 6.0),
+            ("90m", 1.5),
+        ] {
+            assert_eq!(hours(text), Some(expected), "{text}");
+        }
+        for text in ["", "0s", "-5s", "soon", "1-2-3", "1mo"] {
+            assert_eq!(hours(text), None, "{text}");
+        }
+    }
 }
