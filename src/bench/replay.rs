@@ -76,7 +76,8 @@ impl RecordingEnv {
                 let scene = self
                     .randomization
                     .as_ref()
-                    .map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand));
+                    .map(|all| all.scene_of(draw.as_ref(), &self.env.task.hand))
+                    .map(|(scene, changes)| scene.varied(&changes));
                 self.drawn = (
                     draw.clone(),
                     scene.unwrap_or_else(|| self.env.task.scene.clone()),
@@ -100,7 +101,7 @@ impl RecordingEnv {
     /// Continues from the recorded state after this number of steps, if there is one.
     fn go_on(&mut self, steps: usize) {
         if let Some(i) = self.starts.iter().position(|start| start.after == steps) {
-            self.bare.change_scene(&self.scenes[i]);
+            self.bare.change_scene(&self.scenes[i], &[]);
             self.bare
                 .restore(&self.starts[i].state)
                 .expect("a state of the same scene");

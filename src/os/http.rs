@@ -93,17 +93,16 @@ impl Request {
 
     /// The length of the body in bytes.
     fn length(&self) -> Result<usize, Refusal> {
-        let length = self
+        let digits = self
             .header("content-length")
-            .filter(|_| self.header("transfer-encoding").is_none());
-        match length.map(str::parse) {
-            Some(Ok(length @ ..=LONGEST_BODY)) => Ok(length),
-            Some(Ok(_)) => Err(("413 Content Too Large", "The body is too long.")),
-            _ => Err((
+            .filter(|text| !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit()))
+            .filter(|_| self.header("transfer-encoding").is_none())
+            .ok_or((
                 "411 Length Required",
                 "The length of the body is not given.",
-            )),
-        }
+            ))?;
+        let length = digits.parse().ok().filter(|length| *length <= LONGEST_BODY);
+        length.ok_or(("413 Content Too Large", "The body is too long."))
     }
 
     /// Checks that the address in the browser belongs to this machine: another host name may have been made to lead here.

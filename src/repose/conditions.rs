@@ -52,7 +52,8 @@ impl Conditions {
         let Some(randomization) = &self.randomization else {
             return;
         };
-        sim.change_scene(&randomization.scene_of(self.draw.as_ref(), &task.hand));
+        let (scene, changes) = randomization.scene_of(self.draw.as_ref(), &task.hand);
+        sim.change_scene(scene, &changes);
         if self.draw.as_ref().is_some_and(|draw| draw.has_bias) {
             let rng = &mut rng::beside(rng, "bias of randomization");
             sensing::combine(&mut self.bias, randomization.bias.draw(rng));

@@ -13,7 +13,7 @@ use super::sensing::NoiseStd;
 use super::task::Task;
 use crate::config::RandomizationConfig;
 use crate::rng::{self, Rng};
-use crate::sim::{Scene, origin};
+use crate::sim::{Change, Scene, origin};
 
 /// The random physics, noise and delays of a training run.
 pub struct Randomization {
@@ -128,17 +128,17 @@ impl Randomization {
         })
     }
 
-    /// The scene of an episode: with the physics that it has drawn, or the nominal one.
-    pub fn scene_of(&self, draw: Option<&EpisodePhysics>, hand: &Hand) -> Scene {
+    /// The scene of an episode, and what it has drawn changes in it: nothing in the nominal scene.
+    pub fn scene_of(&self, draw: Option<&EpisodePhysics>, hand: &Hand) -> (&Scene, Vec<Change>) {
         let Some(EpisodePhysics { physics, .. }) = draw else {
-            return self.nominal.clone();
+            return (&self.nominal, Vec::new());
         };
         let sized = self
             .scenes
             .iter()
             .find(|(size, _)| physics["cube_size"] == [*size]);
         let (_, scene) = sized.expect("a size that can be drawn, or the nominal one");
-        scene.varied(&physics.changes(hand))
+        (scene, physics.changes(hand))
     }
 
     /// The noise on the observations of an episode, if there is any.

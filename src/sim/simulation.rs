@@ -15,6 +15,8 @@ const EVERYTHING: u32 = mjSTATE_INTEGRATION as u32;
 /// The state of one world. Body positions, velocities and joints always belong to the same instant.
 pub struct Simulation {
     pub(super) data: MjData<Arc<MjModel>>,
+    /// A model of its own that it does not use at the moment.
+    pub(super) spare: Option<MjModel>,
 }
 
 impl Simulation {
@@ -22,15 +24,8 @@ impl Simulation {
     pub fn new(scene: &Scene) -> Self {
         Self {
             data: MjData::new(scene.model.clone()),
+            spare: None,
         }
-    }
-
-    /// Continues in another scene. The state must be reset after it.
-    ///
-    /// # Panics
-    /// Panics if the structure of the scene is another one.
-    pub fn change_scene(&mut self, scene: &Scene) {
-        self.data.swap_model(scene.model.clone());
     }
 
     /// Resets to the default state and clears warm start and warnings. Call [`Simulation::refresh`] after changing the state.

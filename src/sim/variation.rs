@@ -5,15 +5,17 @@
 
 #![expect(
     unsafe_code,
-    reason = "a value that the wrapper does not let change; the comment says why it is sound"
+    reason = "two things that the wrapper does not let do; each comment says why it is sound"
 )]
 
+use std::cell::RefCell;
 use std::sync::Arc;
 
+use mujoco_rs::mujoco_c::mj_copyModel;
 use mujoco_rs::prelude::{MjData, MjModel};
 
 use super::placing::frames_within;
-use super::{Actuator, Body, Hinge, Scene};
+use super::{Actuator, Body, Hinge, Scene, Simulation};
 
 /// A change of the physics of a scene.
 #[derive(Clone, Copy)]
@@ -77,17 +79,10 @@ impl Change {
 }
 
 impl Scene {
-    /// This scene with these changes, and with what MuJoCo derives from masses at compile time.
+    /// This scene with these changes.
     pub fn varied(&self, changes: &[Change]) -> Self {
-        let mut model = (*self.model).clone();
-        changes.iter().for_each(|change| change.apply(&mut model));
-        if changes.iter().any(Change::is_structural) {
-            let mut workspace = MjData::new(Box::new(model));
-            workspace.set_const();
-            model = workspace.model().clone();
-        }
         Self {
-            model: Arc::new(model),
+            model: Arc::new(changed((*self.model).clone(), changes)),
             ..*self
         }
     }
@@ -98,11 +93,80 @@ impl Scene {
     }
 }
 
+impl Simulation {
+    /// Continues in a scene with these changes. The state must be reset after it. A scene with meshes is large, so the simulation
+    /// overwrites its own model rather than making another one in each episode.
+    ///
+    /// # Panics
+    /// Panics if the structure of the scene is another one.
+    pub fn change_scene(&mut self, scene: &Scene, changes: &[Change]) {
+        let before = self.data.swap_model(scene.model.clone());
+        self.spare = Arc::into_inner(before).or_else(|| self.spare.take());
+        if changes.is_empty() {
+            return;
+        }
+        let mut model = match self.spare.take() {
+            Some(model) => model,
+            None => (*scene.model).clone(),
+        };
+        // SAFETY: MuJoCo copies one model over another of the same sizes. It checks the sizes of their buffers itself, and ends the
+        // process if they differ. Both have been models of this simulation, which takes no others.
+        unsafe { mj_copyModel(model.ffi_mut(), scene.model.ffi()) };
+        self.data.swap_model(Arc::new(changed(model, changes)));
+    }
+}
+
+thread_local! {
+    /// What updates the constants of a model, from the last time.
+    static WORKSPACE: RefCell<Option<MjData<Box<MjModel>>>> = const { RefCell::new(None) };
+}
+
+/// A model with these changes, and with what MuJoCo derives from masses at compile time.
+fn changed(mut model: MjModel, changes: &[Change]) -> MjModel {
+    changes.iter().for_each(|change| change.apply(&mut model));
+    if !changes.iter().any(Change::is_structural) {
+        return model;
+    }
+    WORKSPACE.with_borrow_mut(|kept| {
+        let fits = |data: &MjData<Box<MjModel>>| data.model().is_compatible_with_model(&model);
+        let workspace = match kept.take().filter(fits) {
+            Some(workspace) => kept.insert(workspace),
+            None => kept.insert(MjData::new(Box::new(model.clone()))),
+        };
+        let between = workspace.swap_model(Box::new(model));
+        workspace.set_const();
+        *workspace.swap_model(between)
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::compilation::BUILTIN;
     use super::super::{Compilation, Cone};
     use super::*;
+
+    #[test]
+    fn a_simulation_overwrites_its_own_model_in_each_varied_episode() {
+        let scene = Scene::load(None, &Compilation::plain(0.01, Cone::Scene)).unwrap();
+        let cube = scene.body("cube").unwrap();
+        let mut simulation = Simulation::new(&scene);
+        let mut places = Vec::new();
+        for factor in [2.0, 1.0, 0.5, 2.0] {
+            let changes = [Change::Mass(cube, factor), Change::Friction(factor)];
+            let drawn = if factor == 1.0 { &[][..] } else { &changes };
+            simulation.change_scene(&scene, drawn);
+            let model = simulation.data.model();
+            let own = Scene {
+                model: Arc::new(model.clone()),
+                ..scene
+            };
+            assert_eq!(own.fingerprint(), scene.varied(drawn).fingerprint());
+            places.push(std::ptr::from_ref(model.ffi()));
+        }
+        let shared = std::ptr::from_ref(scene.model.ffi());
+        assert_eq!(places, [places[0], shared, places[0], places[0]]);
+        assert_ne!(places[0], shared);
+    }
 
     #[test]
     fn the_boxes_of_a_shifted_body_are_those_that_mujoco_compiles() {

@@ -745,6 +745,16 @@ fn a_slider_moves_an_actuator_and_only_the_page_can_move_it() {
     ] {
         assert_eq!(post(more, body), expected, "{more}{body:.20}");
     }
+    for (length, expected) in [
+        ("+7", "411"),
+        ("", "411"),
+        ("7777777777777777777777", "413"),
+    ] {
+        let request = format!(
+            "POST /controls HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n{own}\r\n[[3,9]]"
+        );
+        assert_eq!(status(&live.ask(request.as_bytes())), expected, "{length}");
+    }
     assert_eq!(
         events.next("controls")[3].as_f64().unwrap(),
         high,
